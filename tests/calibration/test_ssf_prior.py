@@ -72,6 +72,29 @@ def test_the_paper_plan_gives_widths_from_half_a_step_to_a_quarter_of_the_span()
     assert len(prior.table_rows()) == 6
 
 
+@pytest.mark.parametrize("lost", ["every other row", "all but one end", "two scans of longer steps"])
+def test_rows_without_a_reading_say_nothing_of_what_the_scans_resolve(lost: str) -> None:
+    """The same as of a recording in which they are not."""
+    whole = _edge_recording()
+    x_mm, scan = whole.plan.x_mm, whole.plan.scan
+    used = {
+        "every other row": np.arange(len(whole)) % 2 == 0,
+        "all but one end": np.abs(x_mm) < 20,
+        "two scans of longer steps": scan < 2,
+    }[lost]
+    plan = replace(whole.plan, x_mm=np.where(scan < 2, x_mm, 3 * x_mm))
+    with_gaps = _recording(plan, np.where(used, whole.readings, np.nan))
+    without = _recording(plan.take(np.flatnonzero(used)), whole.readings[used])
+    assert scan_geometry(with_gaps) == scan_geometry(without)
+
+
+def test_a_recording_that_is_usable_at_one_place_alone_is_refused() -> None:
+    plan = paper_plan().take([0, 50, 100])
+    plan = replace(plan, x_mm=np.array([5.0, 5.0, 90.0]))
+    with pytest.raises(ParameterError, match="every usable reading taken at one place"):
+        scan_geometry(_recording(plan, np.array([3.0, 4.0, np.nan])))
+
+
 def test_the_prior_scales_with_the_recording() -> None:
     near, far = default_prior(_edge_recording(), 1), default_prior(_edge_recording(0.05), 1)
     u = np.random.default_rng(4).random((100, 8))

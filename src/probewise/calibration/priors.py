@@ -235,13 +235,14 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     moves: list[FloatArray] = []
     lengths: list[float] = []
     for rows in plan.rows_by_scan():
-        steps = np.hypot(*np.diff(place[rows], axis=0).T)
+        places = place[rows[usable[rows]]]
+        steps = np.hypot(*np.diff(places, axis=0).T)
         if (steps > 0).any():
             moves.append(steps[steps > 0])
-            lengths.append(float(np.hypot(*np.ptp(place[rows], axis=0))))
-    extent = float(np.hypot(*np.ptp(place, axis=0)))
+            lengths.append(float(np.hypot(*np.ptp(places, axis=0))))
+    extent = float(np.hypot(*np.ptp(place[usable], axis=0)))
     if not lengths and extent == 0:
-        raise ParameterError("recording", "every reading taken at one place", "scans that move over an edge")
+        raise ParameterError("recording", "every usable reading taken at one place", "scans that move over an edge")
     span = float(np.median(lengths)) if lengths else extent
     # Places far apart, such as those a robot chooses, do not bound the footprint from below: use a factor of 50.
     step = min(float(np.median(np.concatenate(moves))) if moves else span, span / 50)

@@ -33,8 +33,8 @@ def predict(
     Mean and sd are those of a new reading that is not lost, with parameter uncertainty and noise. The
     density is a mixture over the posterior samples of each sample's noise distribution: normal with the
     pooled sd, modified by the sensor's effects on the noise (outliers, losses, signal dependence). If
-    the plan or the sensor has a quantisation step, the density is the mass of the reading's cell divided
-    by the step. Each row is scored by its marginal density. New patterns, scans and angles are
+    the plan declares a rounding step, or else the sensor's calibration did, the density is the mass of the
+    reading's cell divided by the step. Each row is scored by its marginal density. New patterns, scans and angles are
     predicted like any other; effects of single scans are left out (see `FittedSensor.chain`).
 
     Parameters
@@ -87,7 +87,7 @@ def predict(
     if doubt:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     scored = Recording(plan, recorded).usable
-    step = plan.instrumentation.step
+    step = sensor.instrumentation.step if plan.instrumentation.step is None else plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
     model = chain if sensor.effects else DeduplicatedModel(chain, plan)
     for effect in sensor.effects_on_new_scans:

@@ -12,8 +12,14 @@ from nested_sampling.problems import problem
 from scipy.stats import chi2, norm
 
 from probewise._arrays import FloatArray
-from probewise.nested import NestedResult, Weighted, refine, run, update
-from probewise.nested.importance import _bridge_sampling_estimate, with_error_of_lost_parts
+from probewise.nested import FunctionProblem, NestedResult, Weighted, refine, run, update
+from probewise.nested.evaluate import Evaluator
+from probewise.nested.importance import (
+    HeldOutSamples,
+    _bridge_sampling_estimate,
+    draw_and_weigh,
+    with_error_of_lost_parts,
+)
 from probewise.nested.proposal import find_disconnected_clusters, fit_wide_and_narrow_proposals, mixture_of_proposals
 from probewise.nested.space import unbounded_space_of
 from probewise.priors import Normal, Product
@@ -80,6 +86,22 @@ def test_a_part_followed_by_few_lines_of_descent_may_be_lost() -> None:
     hopeless = with_error_of_lost_parts(found, 0.5, space, rng)
     assert not hopeless.sound
     assert "may be lost" in hopeless.summary()
+
+
+@pytest.mark.parametrize("prior_share", [0.0, 0.3, 0.9999])
+def test_any_share_of_draws_from_the_prior_gives_the_evidence(prior_share: float) -> None:
+    """Also one that rounds to all draws; the truth by the closed form of a Gaussian likelihood and prior."""
+    rng = np.random.default_rng(6)
+    likelihood = FunctionProblem(
+        lambda theta: norm.logpdf(theta[:, 0], 1.0, 0.5), Product({"x": Normal(0, 1)}), vectorized=True
+    )
+    space = unbounded_space_of(likelihood.prior)
+    proposal = fit_wide_and_narrow_proposals(space.enter(0.8 + 0.45 * rng.standard_normal((200, 1))), rng=rng)[-1]
+    evaluate = Evaluator(likelihood)
+    found = draw_and_weigh(proposal, prior_share, HeldOutSamples.empty(), space, evaluate, n_draws=2000, rng=rng)
+    assert evaluate.n_calls == 2000
+    assert found.log_z == pytest.approx(norm.logpdf(1.0, 0.0, math.hypot(1.0, 0.5)), abs=4.5 * found.log_z_error)
+    assert found.log_z_error < 0.05
 
 
 def test_joined_proposals_get_their_shares_of_the_draws_and_of_the_density() -> None:

@@ -304,7 +304,8 @@ def draw_and_weigh(
 
     `held`: posterior samples that correct the evidence by bridge sampling; `tail` as for `pareto_k`.
     """
-    n_prior = round(prior_share * n_draws)
+    # At least one draw is the proposal's: a share below 1, such as 0.9999 of 2000, may round to all of them.
+    n_prior = min(round(prior_share * n_draws), n_draws - 1)
 
     def log_proposal(x: FloatArray, log_density: FloatArray) -> FloatArray:
         """Return the log density of the mixture from which the draws come; `log_density` is the prior's."""

@@ -11,12 +11,14 @@ from probewise.arm import (
     LegoArm,
     Pose,
     Reading,
+    SimulatedArm,
     carry_out,
     read_geometry,
     readings_of_recording,
     recording_of,
     shipped_geometry_path,
 )
+from probewise.arm.carry_out import duration_s
 from probewise.errors import ParameterError, ReachError
 from probewise.recordings import paper_plan, read_recording, two_way_plan, write_recording
 
@@ -54,6 +56,14 @@ def test_the_papers_plan_asks_for_four_turns_and_five_patterns(told):
     assert patterns == ["boundary", "quadrant_a", "quadrant_b", "quadrant_c", "quadrant_d"]
     turns = [text.split(" degrees")[0].split()[-1] for text in told.asked if text.startswith("turn")]
     assert turns == ["90", "180", "270", "0"]
+
+
+def test_a_whole_turn_takes_no_time():
+    plan = thinned(paper_plan())
+    turned = dataclasses.replace(plan, orientation_rad=plan.orientation_rad + math.tau * (np.arange(len(plan)) % 2))
+    arm = SimulatedArm(lambda pose, time_s, height_mm: 10.0)
+    with arm:
+        assert duration_s(arm, turned, origin_mm=ORIGIN) == duration_s(arm, plan, origin_mm=ORIGIN)
 
 
 def test_a_sensor_that_an_earlier_plan_left_turned_is_turned_back(told):

@@ -38,6 +38,7 @@ from probewise.effects import (
     ScanMisplacement,
     StickSlip,
 )
+from probewise.effects.motion import orientation_deg
 from probewise.effects.patches import distinct_scan_lines
 from probewise.effects.vocabulary import value_with_sd
 from probewise.errors import ParameterError
@@ -227,6 +228,24 @@ def test_effects_of_a_mounting_may_sit_in_each_mounting_and_each_scan():
         assert [scans for scans in found if len(scans) == 1] == [(name,) for name in names]
         assert len(found) == len(set(found)) == len(names) + 4
     assert [v.scans for v in ScanMisplacement.for_extent(EXTENT).variants()] == [(name,) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("written_deg", "as_deg"), [((0, 90, 360, -90), (0, 90, 0, -90)), ((180, 0, -180, 270), (-180, 0, -180, 270))]
+)
+def test_orientations_a_whole_turn_apart_are_one_mounting(written_deg, as_deg):
+    plan = replace(paper_plan(), orientation_rad=np.zeros(408))
+    names = plan.scan_names
+    turned = replace(plan, orientation_rad=np.radians(np.array(written_deg, dtype=float))[plan.scan % 4])
+    np.testing.assert_array_equal(orientation_deg(turned), np.array(as_deg, dtype=float)[plan.scan % 4])
+    together = tuple(name for k, name in enumerate(names) if k % 4 in (0, 2))
+    for kind in (ScanAngleError, HeightOffset):
+        groups = [variant.scans for variant in kind.for_extent(Extent(10.0, 60.0, turned)).variants()]
+        assert together in groups
+        assert len(groups) == len(set(groups))
+    once = replace(plan, orientation_rad=np.where(plan.scan == 1, 2 * np.pi, 0.0))
+    every = [variant.scans for variant in ScanAngleError.for_extent(Extent(10.0, 60.0, once)).variants()]
+    assert every == [(name,) for name in names]  # all scans together are no mounting that could be off
 
 
 def test_effects_of_one_scan_leave_the_others_alone():

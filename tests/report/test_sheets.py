@@ -156,6 +156,9 @@ def test_a_sheet_is_as_large_as_its_readings_need():
     sheets = {sheet.name: sheet for sheet in plan_sheets(plan.patterns, plan)}
     assert (sheets["boundary"].low_mm, sheets["boundary"].high_mm) == ((-90.0, -40.0), (90.0, 40.0))
     assert np.degrees(sheets["boundary"].orientations_rad) == pytest.approx([0, 90, 180, 270])
+    turned = dataclasses.replace(plan, orientation_rad=plan.orientation_rad + 2 * np.pi * (plan.scan % 2))
+    again = plan_sheets(plan.patterns, turned)
+    assert [sheet.orientations_rad for sheet in again] == [sheet.orientations_rad for sheet in sheets.values()]
     assert set(sheets) == set(plan.pattern_names)
 
 

@@ -131,7 +131,8 @@ def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], f
     for place in places:
         seconds += float(arm.travel_s(Pose(*here[0].tolist()), place[None, :])[0])
         here = place[None, :]
-    by_hand = 1 + np.count_nonzero(np.diff(lying)) + np.count_nonzero(np.abs(np.diff(turns)) > _SAME_TURN_RAD)
+    turned_rad = np.abs(np.angle(np.exp(1j * np.diff(turns))))  # 0 for a whole turn
+    by_hand = 1 + np.count_nonzero(np.diff(lying)) + np.count_nonzero(turned_rad > _SAME_TURN_RAD)
     return seconds + BY_HAND_S * float(by_hand)
 
 

@@ -21,7 +21,7 @@ from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Estimated, Informed, Known
 from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
-from probewise.effects.motion import scan_indicator, sign_of_motion
+from probewise.effects.motion import orientation_deg, scan_indicator, sign_of_motion
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
 from probewise.effects.noise_distribution import FittedReadings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
@@ -202,6 +202,7 @@ __all__ = [
     "lattice_step_sd",
     "log_density",
     "name_of_first_copy",
+    "orientation_deg",
     "public_name",
     "scan_indicator",
     "sign_of_motion",

@@ -25,6 +25,18 @@ def scan_indicator(plan: Plan, names: tuple[str, ...]) -> FloatArray:
     return np.asarray(member[plan.scan])
 
 
+def orientation_deg(plan: Plan) -> FloatArray:
+    """Return the orientation of each reading to 1e-6 degrees, (n_points,); of those whole turns apart, the least.
+
+    So 0 and 360 degrees are one orientation, and so are -180 and 180.
+    """
+    recorded = np.round(np.degrees(plan.orientation_rad), 6)
+    _, which = np.unique(recorded % 360.0, return_inverse=True)
+    least = np.full(which.max(initial=-1) + 1, np.inf)
+    np.minimum.at(least, which, recorded)
+    return np.asarray(least[which], dtype=np.float64)
+
+
 def candidate_scan_groups(plan: Plan) -> tuple[tuple[str, ...], ...]:
     """List candidate groups of scans: each mounting (the scans that share an orientation) and each single scan.
 
@@ -32,8 +44,9 @@ def candidate_scan_groups(plan: Plan) -> tuple[tuple[str, ...], ...]:
     sensor turns belongs to no mounting.
     """
     by_angle: dict[float, list[str]] = {}
+    turned_deg = orientation_deg(plan)
     for name, rows in zip(plan.scan_names, plan.rows_by_scan(), strict=True):
-        angles = np.unique(np.round(plan.orientation_rad[rows], 9))
+        angles = np.unique(turned_deg[rows])
         if len(angles) == 1:
             by_angle.setdefault(float(angles[0]), []).append(name)
     groups = [tuple(dict.fromkeys(names)) for names in by_angle.values()]

@@ -7,6 +7,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.effects import orientation_deg
 from probewise.report.words import unit_name
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
@@ -82,7 +83,7 @@ def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, st
         case "direction":
             return {-1.0: "backwards", 1.0: "forwards"}
         case "orientation":
-            angles = np.unique(np.round(np.degrees(diagnosis.recording.plan.orientation_rad), 6))
+            angles = np.unique(orientation_deg(diagnosis.recording.plan))
             return {float(angle): f"{angle:g}°" for angle in angles} if len(angles) <= 24 else None
         case _:
             return None

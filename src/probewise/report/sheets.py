@@ -12,6 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.arm.marks import choose_mark_places
+from probewise.effects import orientation_deg
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.recordings.plan import Plan
@@ -169,7 +170,7 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
             if not rows.size:
                 continue
             places = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
-            turns = tuple(dict.fromkeys(plan.orientation_rad[rows].tolist()))
+            turns = tuple(dict.fromkeys(np.radians(orientation_deg(plan)[rows]).tolist()))
         else:
             places = np.concatenate([places, _extreme_points_of_pattern(pattern)])
         low = np.floor((places.min(axis=0) - AROUND_MM) / _ROUND_MM) * _ROUND_MM

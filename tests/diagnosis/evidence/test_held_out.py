@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from probewise.diagnosis.evidence.held_out import hold_out_each_part
@@ -34,5 +36,9 @@ def test_many_scans_side_by_side_are_kept_back_by_pattern_and_orientation():
     assert len(names) == 2
     assert names[0].endswith("0 degrees")
     np.testing.assert_array_equal(parts, np.round(many.orientation_rad / (np.pi / 2)).astype(int) - int(parts[0] != 0))
+    a_turn_more = replace(many, orientation_rad=many.orientation_rad + 2 * np.pi * (many.scan % 2))
+    again, names_again = held_out_parts(Recording(a_turn_more, np.zeros(len(many))))
+    np.testing.assert_array_equal(again, parts)
+    assert names_again == names
     held = hold_out_each_part(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
     assert dict(held.by_scan) == {names[0]: 1.0, names[1]: -1.0}

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from probewise.diagnosis.light_sensor.candidate_scans import rows_of_distinct_scans
+from probewise.diagnosis.light_sensor.covariates import varying_covariates
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.recordings import two_way_plan
 
@@ -31,6 +33,27 @@ def test_a_sensor_that_only_a_hand_can_turn_stays_as_it_is():
     last_rad = plan.orientation_rad[np.argmax(plan.time_s)]
     for scan in LightSensor(hands=False).candidate_measurements(plan):
         np.testing.assert_allclose(scan.plan.orientation_rad, last_rad)
+
+
+def test_a_scan_that_returns_after_a_whole_turn_is_the_same_scan_at_the_same_orientation():
+    """It is neither offered twice, nor a value of the covariate `orientation`."""
+    plan = two_way_plan()
+    turned = replace(plan, orientation_rad=plan.orientation_rad - 2 * np.pi * (plan.scan % 2))
+    assert [scan.tolist() for scan in rows_of_distinct_scans(turned)] == [
+        scan.tolist() for scan in rows_of_distinct_scans(plan)
+    ]
+    level, everything = np.linspace(0.0, 1.0, len(plan)), np.arange(len(plan))
+
+    def orientations(of):
+        found = varying_covariates(of, everything, level, level)
+        return next(
+            np.unique(covariate.values, return_inverse=True)[1]
+            for covariate in found
+            if covariate.name == "orientation"
+        )
+
+    kinds = orientations(plan)
+    assert len(set(zip(kinds, orientations(turned), strict=True))) == kinds.max() + 1
 
 
 def test_a_sensor_that_the_arm_can_turn_may_be_turned():

@@ -14,6 +14,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
 from probewise.diagnosis.scheduling import MOST_READINGS
+from probewise.effects import orientation_deg
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
@@ -158,11 +159,12 @@ def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
     Scans with few rows are left out too.
     """
     seen: dict[tuple[object, ...], IntArray] = {}
+    turned_deg = orientation_deg(plan)
     for rows in plan.rows_by_scan():
         if rows.size < _LEAST_ROWS or not plan.direction_of_motion[rows].any():
             continue
         places = ((round(float(plan.x_mm[r]), 3), round(float(plan.y_mm[r]), 3)) for r in (rows[0], rows[-1]))
-        key = (int(plan.pattern[rows[0]]), round(float(plan.orientation_rad[rows[0]]), 4), *sorted(places))
+        key = (int(plan.pattern[rows[0]]), round(float(turned_deg[rows[0]]), 2), *sorted(places))
         seen.setdefault(key, rows)
     return list(seen.values())[:_MOST_SCANS]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.effects import NamedEffect, sign_of_motion
+from probewise.effects import NamedEffect, orientation_deg, sign_of_motion
 from probewise.recordings.plan import Plan
 from probewise.scene import edge_distance, region_of
 
@@ -48,7 +48,7 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
     sign = sign_of_motion(plan)[usable]
     moving = np.flatnonzero(sign != 0)
     scan = plan.scan[usable]
-    degrees = np.asarray(np.round(np.degrees(plan.orientation_rad[usable]), 6), dtype=np.float64)
+    degrees = orientation_deg(plan)[usable]
     pooled: Mapping[str, FloatArray] = {
         "time": plan.time_s[usable],
         "level": level,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from probewise.diagnosis.evidence.held_out import LEAST_ROWS, MOST_PARTS, Parts
+from probewise.effects import orientation_deg
 from probewise.recordings.plan import Recording
 
 
@@ -17,10 +18,10 @@ def held_out_parts(recording: Recording) -> Parts:
     plan, usable = recording.plan, recording.usable
     scan = plan.scan[usable]
     if np.sum(np.bincount(scan) >= LEAST_ROWS) > MOST_PARTS:
-        views = np.stack([plan.pattern[usable].astype(np.float64), np.round(plan.orientation_rad[usable], 6)])
+        views = np.stack([plan.pattern[usable].astype(np.float64), orientation_deg(plan)[usable]])
         kinds, part = np.unique(views, axis=1, return_inverse=True)
         if kinds.shape[1] > 1:
             return part.reshape(-1), tuple(
-                f"{plan.pattern_names[int(code)]}, {np.degrees(turn):.0f} degrees" for code, turn in kinds.T
+                f"{plan.pattern_names[int(code)]}, {turn:.0f} degrees" for code, turn in kinds.T
             )
     return scan, plan.scan_names

@@ -417,6 +417,9 @@ def test_joined_recordings_keep_scans_and_patterns_apart():
     assert joined.plan.pattern_names == ("edge", "edge (2)")
     np.testing.assert_array_equal(joined.plan.pattern, [0] * 8 + [1] * 6 + [0] * 8)
     assert joined.plan.patterns["edge (2)"] == Uniform(1.0)
+    assert joined.plan.sessions == (0, 0, 1, 1, 2, 2)
+    assert join([joined, line(2)]).plan.sessions == (0, 0, 1, 1, 2, 2, 3, 3)
+    assert joined.plan.take(joined.plan.scan == 3).sessions == (1,)
     assert join([first]) is first
 
 

@@ -248,6 +248,27 @@ def test_orientations_a_whole_turn_apart_are_one_mounting(written_deg, as_deg):
     assert every == [(name,) for name in names]  # all scans together are no mounting that could be off
 
 
+def test_a_mounting_of_one_of_several_recordings_may_be_off_alone():
+    """At an orientation of two recordings the sensor may have been mounted anew: 0 degrees of the first one alone."""
+    plan = paper_plan()
+    later = plan.take(np.arange(202))  # edge_0 and edge_90 again, as a second recording
+    both = replace(
+        plan,
+        **{name: np.append(getattr(plan, name), getattr(later, name)) for name in ("x_mm", "y_mm", "orientation_rad")},
+        time_s=np.append(plan.time_s, later.time_s + 1000.0),
+        scan=np.append(plan.scan, later.scan + len(plan.scan_names)),
+        scan_names=(*plan.scan_names, "later_0", "later_90"),
+        pattern=np.append(plan.pattern, later.pattern),
+        covariates={},
+        sessions=(0,) * len(plan.scan_names) + (1, 1),
+    )
+    for kind in (ScanAngleError, HeightOffset):
+        groups = [variant.scans for variant in kind.for_extent(Extent(10.0, 60.0, both)).variants()]
+        at_0 = tuple(name for name in plan.scan_names if name in ("edge_0", "quadrants"))
+        assert {at_0, (*at_0, "later_0"), plan.scan_names, ("later_0", "later_90")} <= set(groups)
+        assert len(groups) == len(set(groups))
+
+
 def test_effects_of_one_scan_leave_the_others_alone():
     """Turned, raised or moved in one scan: the readings of all others are those of the plain chain."""
     plain = base().predict(np.zeros((1, 0)), PLAN)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -48,8 +48,9 @@ def join(recordings: Sequence[Recording]) -> Recording:
             found = f"{_recording_label(one, i)} (number {i + 1}) and {_recording_label(other, j)} (number {j + 1})"
             raise ParameterError("recordings", found, "recordings that differ; these are the same")
     notes = [note for recording in recordings for note in recording.notes]
+    plan = join_plans([recording.plan for recording in recordings])
     return Recording(
-        join_plans([recording.plan for recording in recordings]),
+        replace(plan, sessions=_sessions([recording.plan for recording in recordings])),
         np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
         " + ".join(r.source for r in recordings if r.source),
         (*notes, *_notes_on_missing_covariates(recordings), *_notes_on_other_instrumentation(recordings)),
@@ -95,6 +96,15 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         covariates={name: _joined_covariate(plans, name) for name in sorted({*first.covariates, *commanded})},
         instrumentation=first.instrumentation,
     )
+
+
+def _sessions(plans: Sequence[Plan]) -> tuple[int, ...]:
+    """Return the number of the recording that each of the joined scans is from."""
+    found: list[int] = []
+    for plan in plans:
+        before = max(found, default=-1) + 1
+        found += [before + session for session in plan.sessions or (0,) * len(plan.scan_names)]
+    return tuple(found)
 
 
 def last_known_value(values: FloatArray, otherwise: float = math.nan) -> float:

@@ -40,16 +40,24 @@ def orientation_deg(plan: Plan) -> FloatArray:
 def candidate_scan_groups(plan: Plan) -> tuple[tuple[str, ...], ...]:
     """List candidate groups of scans: each mounting (the scans that share an orientation) and each single scan.
 
-    A group of all scans is left out, since nothing remains to compare it with. A scan in which the
-    sensor turns belongs to no mounting.
+    Of several recordings that were joined, each mounting of each recording and each whole recording are candidates too:
+    who comes back later may have mounted the sensor anew, or may not. A group of all scans is left out, since nothing
+    remains to compare it with. A scan in which the sensor turns belongs to no mounting.
     """
-    by_angle: dict[float, list[str]] = {}
+    by_angle: dict[tuple[int | None, float], list[str]] = {}
+    by_session: dict[int, list[str]] = {}
     turned_deg = orientation_deg(plan)
-    for name, rows in zip(plan.scan_names, plan.rows_by_scan(), strict=True):
+    sessions = plan.sessions or (0,) * len(plan.scan_names)
+    for name, rows, session in zip(plan.scan_names, plan.rows_by_scan(), sessions, strict=True):
+        by_session.setdefault(session, []).append(name)
         angles = np.unique(turned_deg[rows])
         if len(angles) == 1:
-            by_angle.setdefault(float(angles[0]), []).append(name)
-    groups = [tuple(dict.fromkeys(names)) for names in by_angle.values()]
+            for which in (None, session):
+                by_angle.setdefault((which, float(angles[0])), []).append(name)
+    mountings = [tuple(dict.fromkeys(names)) for (which, _), names in by_angle.items() if which is None]
+    of_session = [tuple(dict.fromkeys(names)) for (which, _), names in by_angle.items() if which is not None]
+    recordings = [tuple(dict.fromkeys(names)) for names in by_session.values()]
     singles = [(name,) for name in dict.fromkeys(plan.scan_names)]
     every = set(plan.scan_names)
-    return tuple(group for group in dict.fromkeys([*groups, *singles]) if set(group) != every)
+    found = dict.fromkeys([*mountings, *singles, *of_session, *recordings])
+    return tuple(group for group in found if set(group) != every)

@@ -79,7 +79,8 @@ class Plan:
 
     All arrays have shape (n_points,). `scan` numbers the scans from 0 in the order they are taken
     (a name that returns later is a new scan); `pattern` indexes `pattern_names`. A pattern
-    name may be missing from `patterns` only where a hypothesis takes its place.
+    name may be missing from `patterns` only where a hypothesis takes its place. `sessions` numbers the recording that
+    each scan is from, where several were joined; empty for one recording.
     """
 
     x_mm: FloatArray
@@ -93,8 +94,12 @@ class Plan:
     patterns: Mapping[str, Pattern] = field(default_factory=dict)
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
     instrumentation: Instrumentation = field(default_factory=Instrumentation)
+    sessions: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        if len(self.sessions) not in (0, len(self.scan_names)):
+            allowed = f"one number per scan ({len(self.scan_names)}), or none"
+            raise ParameterError("sessions", self.sessions, allowed)
         for name in ("scan_names", "pattern_names"):
             names: object = getattr(self, name)
             if isinstance(names, str) or not all(isinstance(n, str) for n in getattr(self, name)):
@@ -264,6 +269,7 @@ class Plan:
             patterns=self.patterns,
             covariates={name: values[rows] for name, values in self.covariates.items()},
             instrumentation=self.instrumentation,
+            sessions=tuple(self.sessions[k] for k in kept) if self.sessions else (),
         )
 
 

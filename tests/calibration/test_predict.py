@@ -1,17 +1,20 @@
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from probewise._arrays import FloatArray
-from probewise.calibration import FittedSensor, predict
-from probewise.errors import DoubtfulResultWarning, ShapeError
-from probewise.recordings import Disc, Instrumentation, Plan, Recording, paper_plan
+from probewise.calibration import FittedSensor, predict, read_sensor, write_sensor
+from probewise.effects import Origin
+from probewise.errors import DoubtfulResultWarning, FileError, ShapeError
+from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, DiscreteSSF, FixedLevels, FreeLevels, FreeMixture
 
@@ -115,6 +118,40 @@ def test_effects_that_carry_over_act_on_the_prediction(
     plan = paper_plan().take(np.arange(101))
     shifted = replace(plan, x_mm=plan.x_mm - 1.0)
     np.testing.assert_allclose(predict(loose, plan).mean, predict(sensor, shifted).mean, rtol=1e-12)
+
+
+def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(
+    make_sensor: Callable[..., FittedSensor], tmp_path: Path
+) -> None:
+    """A sensor of times in seconds since 1970, from its file, predicts as one of the same times from 0."""
+    columns = {"gain_drift.frac": 0.2, "gain_drift.tau_s": 30.0, "position_scale.x": 0.05, "position_scale.y": 0.0}
+    from_0 = make_sensor(effects=("gain_drift", "position_scale"), extra=columns)
+    since_1970 = replace(from_0, origin=Origin(time_s=1.7e9, x_mm=2e4))
+    write_sensor(since_1970, tmp_path / "sensor.json")
+    back = read_sensor(tmp_path / "sensor.json")
+    assert back.origin == since_1970.origin
+    plan = paper_plan().take(np.arange(101))
+    edge = plan.patterns["boundary"]
+    assert isinstance(edge, HalfPlane)
+    far = replace(
+        plan,
+        time_s=plan.time_s + 1.7e9,
+        x_mm=plan.x_mm + 2e4,
+        patterns={"boundary": replace(edge, offset_mm=edge.offset_mm + 2e4)},
+    )
+    np.testing.assert_allclose(predict(back, far).mean, predict(from_0, plan).mean, atol=1e-6)
+    with pytest.warns(DoubtfulResultWarning, match="lie before 1700000000 s, from which gain_drift counts"):
+        predict(back, replace(far, time_s=plan.time_s))
+
+
+def test_a_sensor_file_of_before_counts_from_0(make_sensor: Callable[..., FittedSensor]) -> None:
+    drifting = make_sensor(effects=("offset_drift",), extra={"offset_drift.per_hour": 2.0})
+    document = json.loads(replace(drifting, origin=Origin(time_s=3.0)).to_json())
+    document.pop("origin")
+    assert FittedSensor.from_json(json.dumps(document)).origin == Origin()
+    for damaged in ({"time_s": "noon"}, {"hours": 3.0}, 3):
+        with pytest.raises(FileError):
+            FittedSensor.from_json(json.dumps(document | {"origin": damaged}))
 
 
 def test_effects_of_single_scans_do_not_carry_over(make_sensor: Callable[..., FittedSensor]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import Diagnosis, Improvement, diagnose, diagnosis_json, diagnosis_schema
-from probewise.effects import VOCABULARY, Extent
+from probewise.effects import VOCABULARY, Extent, Origin
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
 from probewise.sensor import N_FREE_FORM, Stage
@@ -142,6 +142,23 @@ def test_backlash_is_named_measured_located_and_repaired():
     sensor = found.repaired.fitted_sensor(found.recording, rng=np.random.default_rng(0))
     assert sensor.effects == ("backlash",)
     assert sensor.names[-1] == "backlash.width_mm"
+
+
+@pytest.mark.slow
+def test_a_recording_far_from_0_is_diagnosed_as_one_at_0():
+    """Times in seconds since 1970: the lamp warms up from the first reading on, and its sensor knows since when."""
+    near = recording("paper", hidden.GainDrift(-0.1, 100.0), seed=3)
+    near = dataclasses.replace(near, plan=dataclasses.replace(near.plan, time_s=near.plan.time_s - near.plan.time_s[0]))
+    far = dataclasses.replace(near, plan=dataclasses.replace(near.plan, time_s=near.plan.time_s + 1.7e9))
+    found, there = (diagnose(each, rng=np.random.default_rng(0)) for each in (near, far))
+    assert there.combination == found.combination == ("gain_drift",)
+    assert there.p_value == pytest.approx(found.p_value, rel=1e-3)
+    assert there.improvement.log_evidence == pytest.approx(found.improvement.log_evidence, abs=0.1)
+    (sentence,) = (effect.sentence for effect in there.effects if effect.name == "gain_drift")
+    assert sentence.endswith("the lamp warms up (time counts from 1700000000 s)")
+    assert there.repaired.fitted_sensor(far, rng=np.random.default_rng(0)).origin == Origin(time_s=1.7e9)
+    for one, other in zip(found.effects[0].parameters, there.effects[0].parameters, strict=True):
+        assert abs(one.mean - other.mean) < 0.5 * one.sd  # 500 samples each
 
 
 @pytest.mark.slow

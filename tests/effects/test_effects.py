@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from itertools import permutations
 
@@ -39,8 +40,9 @@ from probewise.effects import (
     StickSlip,
 )
 from probewise.effects.motion import orientation_deg
+from probewise.effects.origin import CountsFromOrigin, Origin
 from probewise.effects.patches import distinct_scan_lines
-from probewise.effects.vocabulary import value_with_sd
+from probewise.effects.vocabulary import sentence_from_samples, value_with_sd
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
@@ -267,6 +269,88 @@ def test_a_mounting_of_one_of_several_recordings_may_be_off_alone():
         at_0 = tuple(name for name in plan.scan_names if name in ("edge_0", "quadrants"))
         assert {at_0, (*at_0, "later_0"), plan.scan_names, ("later_0", "later_90")} <= set(groups)
         assert len(groups) == len(set(groups))
+
+
+FAR = Origin(time_s=1.7e9, x_mm=2e4, y_mm=-3e5)
+
+
+def moved_by(plan: Plan, time_s: float, x_mm: float, y_mm: float) -> Plan:
+    """The same plan with its patterns at another place, and on another clock."""
+
+    def moved(pattern):
+        if isinstance(pattern, HalfPlane):
+            along_normal = x_mm * np.cos(pattern.normal_rad) + y_mm * np.sin(pattern.normal_rad)
+            return replace(pattern, offset_mm=pattern.offset_mm + along_normal)
+        if isinstance(pattern, Quadrant):
+            return replace(pattern, corner_mm=(pattern.corner_mm[0] + x_mm, pattern.corner_mm[1] + y_mm))
+        if isinstance(pattern, Disc):
+            return replace(pattern, center_mm=(pattern.center_mm[0] + x_mm, pattern.center_mm[1] + y_mm))
+        return pattern
+
+    return replace(
+        plan,
+        x_mm=plan.x_mm + x_mm,
+        y_mm=plan.y_mm + y_mm,
+        time_s=plan.time_s + time_s,
+        patterns={name: moved(pattern) for name, pattern in plan.patterns.items()},
+    )
+
+
+def over(plan: Plan) -> Chain:
+    return replace(base(), scene=KnownScene(plan.patterns))
+
+
+FROM_ORIGIN = [name for name, kind in EFFECTS.items() if issubclass(kind, CountsFromOrigin)]
+
+
+@pytest.mark.parametrize("name", FROM_ORIGIN)
+def test_an_effect_means_the_same_on_a_recording_far_from_0(name):
+    """Its prior, its bank and what each entry does to the readings, as on the recording with clock and place at 0."""
+    first_s = PLAN.time_s.min()
+    x_mm, y_mm = ((axis.min() + axis.max()) / 2 for axis in (PLAN.x_mm, PLAN.y_mm))
+    at_0, there = moved_by(PLAN, -first_s, -x_mm, -y_mm), moved_by(PLAN, *dataclasses.astuple(FAR))
+    near, far = (EFFECTS[name].for_extent(Extent(10.0, 60.0, plan)) for plan in (at_0, there))
+    assert near.origin == Origin()
+    assert dataclasses.astuple(far.origin) == pytest.approx((FAR.time_s + first_s, FAR.x_mm + x_mm, FAR.y_mm + y_mm))
+    np.testing.assert_allclose(far.bank(), near.bank(), rtol=1e-6)
+    u = np.random.default_rng(0).random((50, len(near.prior.names)))
+    np.testing.assert_allclose(far.prior.from_unit_cube(u), near.prior.from_unit_cube(u), rtol=1e-6)
+    entries = near.bank().reshape(-1, len(near.prior.names))[:40]
+    found = over(there).with_effects(far).predict(entries, there)
+    np.testing.assert_allclose(found, over(at_0).with_effects(near).predict(entries, at_0), atol=1e-4)
+    said, plainly = (sentence_from_samples(effect, entries[:1]) for effect in (far, near))
+    assert said.startswith(plainly)
+    assert said.removeprefix(plainly).startswith(" (time" if "time" in far.covariates else " (X and Y")
+
+
+@pytest.mark.parametrize("name", [name for name in EFFECTS if name not in FROM_ORIGIN])
+def test_no_other_effect_on_the_mean_counts_from_0(name):
+    """On the far recording the readings of its bank are the same; parameters that are times and places move along."""
+    if EFFECTS[name].stage is Stage.NOISE:
+        return
+    there = moved_by(PLAN, *dataclasses.astuple(FAR))
+    near, far = (EFFECTS[name].for_extent(Extent(10.0, 60.0, plan)) for plan in (PLAN, there))
+    one, other = near.variants()[0], far.variants()[0]
+    entries, theirs = (each.bank().reshape(-1, len(near.prior.names))[:20] for each in (one, other))
+    found = over(there).with_effects(other).predict(theirs, there)
+    np.testing.assert_allclose(found, over(PLAN).with_effects(one).predict(entries, PLAN), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "start_mm", "origin"),
+    [
+        (0.0, -50.0, Origin()),
+        (-999.0, 999.0, Origin()),
+        (1001.0, 0.0, Origin(time_s=1001.0)),
+        (0.0, 1001.0, Origin(x_mm=1051.0)),
+        (-1001.0, -1101.0, Origin(time_s=-1001.0, x_mm=-1051.0)),
+    ],
+)
+def test_a_recording_within_ten_of_its_lengths_of_0_counts_from_0(start_s, start_mm, origin):
+    plan = paper_plan().take(np.arange(101))
+    plan = replace(plan, time_s=start_s + np.arange(101.0), x_mm=start_mm + np.arange(101.0), y_mm=np.full(101, 7.0))
+    assert Origin.of(plan) == origin
+    assert Origin.of(plan.take([3])) == Origin()  # one reading has no length
 
 
 def test_effects_of_one_scan_leave_the_others_alone():

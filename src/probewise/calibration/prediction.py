@@ -11,6 +11,7 @@ from probewise._arrays import FloatArray, floats
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_sensor
 from probewise.effects import PredictiveMixture
+from probewise.effects.origin import CountsTimeFromOrigin
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
@@ -64,7 +65,7 @@ def predict(
     -----
     DoubtfulResultWarning
         If the plan's unit or height is not that of the calibration, the plan commands heights but its description
-        gives none, or it lacks a column that an effect reads.
+        gives none, it lacks a column that an effect reads, or it lies before the time from which an effect counts.
     """
     require_sensor(sensor, "in the order predict(sensor, plan)")
     if isinstance(plan, Recording):
@@ -94,6 +95,13 @@ def predict(
         for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
             warnings.warn(
                 f"the plan has no column {column}, which {effect.name} reads: predicted as for its reference value",
+                DoubtfulResultWarning,
+                stacklevel=2,
+            )
+        if isinstance(effect, CountsTimeFromOrigin) and (plan.time_s < effect.origin.time_s).all():
+            warnings.warn(
+                f"the plan's times, up to {plan.time_s.max():.12g} s, lie before {effect.origin.time_s:.12g} s, "
+                f"from which {effect.name} counts: is it another clock?",
                 DoubtfulResultWarning,
                 stacklevel=2,
             )

@@ -26,7 +26,7 @@ from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
-from probewise.effects import EFFECTS, EdgeShadow
+from probewise.effects import EFFECTS, CountsFromOrigin, EdgeShadow, Origin
 from probewise.errors import FileError, ParameterError, ProbewiseError, shown
 from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
@@ -102,6 +102,8 @@ class FittedSensor(NamedSamples):
     absent
         By effect, the samples without it, (n_samples,), where a diagnosis is uncertain whether it is present; other
         effects act in all samples.
+    origin
+        Time and place from which the effects count: 0, or that of a recording far from it.
     scan_noise
         Noise of each scan of the recording.
     fingerprint, source
@@ -125,6 +127,7 @@ class FittedSensor(NamedSamples):
     effects: tuple[str, ...] = ()
     patterns: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     absent: Mapping[str, BoolArray] = dataclasses.field(default_factory=dict)
+    origin: Origin = dataclasses.field(default=Origin())
     scan_noise: tuple[ScanNoise, ...] = ()
     fingerprint: str = ""
     source: str = ""
@@ -163,11 +166,13 @@ class FittedSensor(NamedSamples):
     @property
     def effects_on_new_scans(self) -> tuple[AnyEffect, ...]:
         """The effects that also apply to new scans."""
-        return tuple(
-            _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else EFFECTS[name]()
-            for name in self.effects
-            if name not in BOUND_TO_SCANS
-        )
+        return tuple(self._effect(name) for name in self.effects if name not in BOUND_TO_SCANS)
+
+    def _effect(self, name: str) -> AnyEffect:
+        kind: type[AnyEffect] = EFFECTS[name]
+        if issubclass(kind, CountsFromOrigin):
+            return cast(AnyEffect, kind(origin=self.origin))
+        return _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else kind()
 
     @property
     def samples_for_new_scans(self) -> FloatArray:
@@ -285,6 +290,7 @@ class FittedSensor(NamedSamples):
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),
             "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},
+            "origin": asdict(self.origin),
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {
                 "model": self._noise_in_words(),
@@ -345,6 +351,7 @@ class FittedSensor(NamedSamples):
                 effects=tuple(read.texts("effects")),
                 patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
                 absent={name: read.mask(len(samples), "absent", name) for name in document.get("absent", {})},
+                origin=Origin(**{key: read.number("origin", key) for key in document.get("origin", {})}),
                 scan_noise=tuple(
                     _dataclass_of_item(read, ScanNoise, s, "noise.scans") for s in read.objects("noise", "scans")
                 ),

@@ -37,7 +37,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictRepor
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
 from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
 from probewise.effects import VOCABULARY, NamedEffect
-from probewise.effects.vocabulary import require_effect_classes
+from probewise.effects.vocabulary import require_effect_classes, sentence_from_samples
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
@@ -170,7 +170,7 @@ def _facts_for_reason(
         least_readings=prepared.least_readings,
         form=searched.nulls[max(orders, key=lambda n: orders[n])].form,
         sentences={effect.name: effect.sentence for effect in found},
-        like=tuple(e.sentence(own.mean(axis=0), own.std(axis=0)) for e, own in zip(formulas, columns, strict=True)),
+        like=tuple(sentence_from_samples(e, own) for e, own in zip(formulas, columns, strict=True)),
         family=max(shares, key=lambda family: shares[family], default=""),
         beside=beside.names if beside else (),
         shows_in=tuple(place.covariate for place in where),

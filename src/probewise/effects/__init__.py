@@ -25,6 +25,7 @@ from probewise.effects.motion import orientation_deg, scan_indicator, sign_of_mo
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
 from probewise.effects.noise_distribution import FittedReadings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
+from probewise.effects.origin import CountsFromOrigin, Origin
 from probewise.effects.pose import Backlash, PositionScale
 from probewise.effects.predictive_mixture import PredictiveMixture
 from probewise.effects.rails import BentRails, MissingTooth
@@ -154,6 +155,7 @@ __all__ = [
     "BatterySag",
     "BentRails",
     "CorrelatedNoise",
+    "CountsFromOrigin",
     "DriftingNoise",
     "Dropouts",
     "EdgeBlur",
@@ -182,6 +184,7 @@ __all__ = [
     "Nonlinearity",
     "OffsetDrift",
     "OrientationError",
+    "Origin",
     "Outliers",
     "PeriodicPositionError",
     "PositionScale",

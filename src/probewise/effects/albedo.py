@@ -16,6 +16,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
+from probewise.effects.origin import CountsPlaceFromOrigin, Origin
 from probewise.effects.patches import PatchEffect, distinct_scan_lines, gaussian_bump
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
@@ -28,8 +29,11 @@ _STEP = 1e-3  # of a standard deviation, for the central difference: its error i
 
 
 @dataclass(frozen=True)
-class AlbedoGradient(LinearEffect[SceneView]):
-    """Paper or illumination that is uneven across the table: S (1 + per_mm_x X + per_mm_y Y), lab frame."""
+class AlbedoGradient(CountsPlaceFromOrigin, LinearEffect[SceneView]):
+    """Paper or illumination that is uneven across the table: S (1 + per_mm_x X + per_mm_y Y).
+
+    X and Y are those of the lab frame, from `origin`.
+    """
 
     typical_per_mm: float = 2e-4
 
@@ -43,13 +47,11 @@ class AlbedoGradient(LinearEffect[SceneView]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical slope to 2 % over the longest scan."""
-        return cls(typical_per_mm=0.02 / extent.length_mm)
+        return cls(typical_per_mm=0.02 / extent.length_mm, origin=extent.origin)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return replace(
-            value,
-            regions={name: RegionWithGradient(r, theta) for name, r in _regions_with_readings(value, plan).items()},
-        )
+        regions = _regions_with_readings(value, plan)
+        return replace(value, regions={name: RegionWithGradient(r, theta, self.origin) for name, r in regions.items()})
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -94,10 +96,11 @@ class AlbedoPatch(PatchEffect[SceneView]):
 
 @dataclass(frozen=True, eq=False)
 class RegionWithGradient:
-    """A region whose albedo is multiplied by 1 + per_mm . (X, Y); `per_mm` has shape (n_samples, 2)."""
+    """A region whose albedo is multiplied by 1 + per_mm . (X, Y), from `origin`; `per_mm` has shape (n_samples, 2)."""
 
     region: Region
     per_mm: FloatArray
+    origin: Origin
 
     @property
     def n_regions(self) -> int:
@@ -113,7 +116,7 @@ class RegionWithGradient:
         return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._brightness_factor(centers_mm)
 
     def _brightness_factor(self, points_mm: FloatArray) -> FloatArray:
-        return np.asarray(1 + self.per_mm @ points_mm.T)
+        return np.asarray(1 + self.per_mm @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
 
 
 @mean_albedo_under_one.register
@@ -132,7 +135,9 @@ def _mean_albedo_over_gradient(region: RegionWithGradient, gaussian: LabGaussian
         return mean_albedo_under_one(region.region, moved, n_nodes)
 
     ahead, behind = mean_albedo_at_shift(1.0), mean_albedo_at_shift(-1.0)
-    field = 1 + a * (gaussian.x_mm + gaussian.dx_mm) + b * (gaussian.y_mm + gaussian.dy_mm)
+    from_x = gaussian.x_mm + gaussian.dx_mm - region.origin.x_mm
+    from_y = gaussian.y_mm + gaussian.dy_mm - region.origin.y_mm
+    field = 1 + a * from_x + b * from_y
     return np.asarray(field * (ahead + behind) / 2 + rise * (ahead - behind) / (2 * _STEP))
 
 

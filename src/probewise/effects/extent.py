@@ -8,6 +8,7 @@ from typing import Self
 
 import numpy as np
 
+from probewise.effects.origin import Origin
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 
@@ -59,6 +60,11 @@ class Extent:
     def span(self) -> float:
         """Largest minus least usable reading."""
         return self.high - self.low
+
+    @cached_property
+    def origin(self) -> Origin:
+        """Time and place from which effects on this recording count."""
+        return Origin.of(self.plan)
 
     @cached_property
     def length_mm(self) -> float:

@@ -12,6 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
+from probewise.effects.origin import CountsTimeFromOrigin
 from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
@@ -22,8 +23,8 @@ _REFERENCE_MV = 8000.0
 
 
 @dataclass(frozen=True)
-class GainDrift(NamedEffect[FloatArray]):
-    """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's `time_s`."""
+class GainDrift(CountsTimeFromOrigin, NamedEffect[FloatArray]):
+    """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since `origin`."""
 
     typical: float = 0.02
     shortest_s: float = 5.0
@@ -38,7 +39,8 @@ class GainDrift(NamedEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search time constants from a hundredth of the recording's duration to twice the duration."""
-        return cls(shortest_s=0.01 * extent.duration_s, longest_s=2 * extent.duration_s)
+        duration_s = extent.duration_s
+        return cls(shortest_s=0.01 * duration_s, longest_s=2 * duration_s, origin=extent.origin)
 
     @cached_property
     def prior(self) -> Product:
@@ -46,7 +48,7 @@ class GainDrift(NamedEffect[FloatArray]):
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         # A negative time would let the exponential overflow.
-        fade = np.exp(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
+        fade = np.exp(-np.maximum(self.origin.seconds(plan), 0.0) / theta[:, 1:2])
         return np.asarray(value * (1 + theta[:, :1] * fade))
 
     def bank(self) -> FloatArray:

@@ -9,6 +9,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_words
 from probewise.effects.motion import candidate_scan_groups, scan_indicator
+from probewise.effects.origin import CountsPlaceFromOrigin
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import footprint_at_added_height
@@ -18,11 +19,11 @@ _USUAL_MM = 14.0  # the height assumed where a recording gives none
 
 
 @dataclass(frozen=True)
-class HeightGradient(LinearEffect[Footprint]):
+class HeightGradient(CountsPlaceFromOrigin, LinearEffect[Footprint]):
     """A table that slopes: mm_per_mm X adds to the height; footprint x h/h0, signal x (h0/h)^2.
 
     h = h0 + mm_per_mm X with h0 of the recording's description, or 14 mm where it gives none; where a height is
-    commanded, h is that height + mm_per_mm X.
+    commanded, h is that height + mm_per_mm X. X counts from `origin`.
     """
 
     typical: float = 0.001
@@ -37,10 +38,12 @@ class HeightGradient(LinearEffect[Footprint]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical slope to 1 % of the height over the longest scan."""
-        return cls(typical=0.01 * _nominal_height_mm(extent.plan) / extent.length_mm)
+        typical = 0.01 * _nominal_height_mm(extent.plan) / extent.length_mm
+        return cls(typical=typical, origin=extent.origin)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_added_height(value, theta[:, :1] * plan.x_mm / _nominal_height_mm(plan), plan)
+        added = theta[:, :1] * (plan.x_mm - self.origin.x_mm) / _nominal_height_mm(plan)
+        return footprint_at_added_height(value, added, plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "grows" if mean[0] > 0 else "shrinks"

@@ -12,14 +12,15 @@ from probewise._arrays import FloatArray
 from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
+from probewise.effects.origin import CountsPlaceFromOrigin, CountsTimeFromOrigin
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
 
 @dataclass(frozen=True)
-class AmbientGradient(LinearEffect[FloatArray]):
-    """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame."""
+class AmbientGradient(CountsPlaceFromOrigin, LinearEffect[FloatArray]):
+    """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame, from `origin`."""
 
     typical_per_mm: float = 0.005
     unit: str = field(default="", kw_only=True)
@@ -36,10 +37,12 @@ class AmbientGradient(LinearEffect[FloatArray]):
         """Set the typical slope to 1 % of the readings' range over the longest scan; None where nothing moves."""
         if np.ptp(extent.plan.x_mm) == np.ptp(extent.plan.y_mm) == 0:
             return None
-        return cls(typical_per_mm=0.01 * extent.span / extent.length_mm, unit=extent.reading_unit)
+        typical = 0.01 * extent.span / extent.length_mm
+        return cls(typical_per_mm=typical, unit=extent.reading_unit, origin=extent.origin)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * plan.x_mm + theta[:, 1:2] * plan.y_mm)
+        x_mm, y_mm = plan.x_mm - self.origin.x_mm, plan.y_mm - self.origin.y_mm
+        return np.asarray(value + theta[:, :1] * x_mm + theta[:, 1:2] * y_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -50,8 +53,8 @@ class AmbientGradient(LinearEffect[FloatArray]):
 
 
 @dataclass(frozen=True)
-class OffsetDrift(LinearEffect[FloatArray]):
-    """A slow drift: reading + per_hour t, t the plan's time in hours."""
+class OffsetDrift(CountsTimeFromOrigin, LinearEffect[FloatArray]):
+    """A slow drift: reading + per_hour t, t the plan's time since `origin` in hours."""
 
     typical_per_hour: float = 1.0
     unit: str = field(default="", kw_only=True)
@@ -66,10 +69,11 @@ class OffsetDrift(LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical drift to 1 % of the readings' range over the recording."""
-        return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600), unit=extent.reading_unit)
+        typical = 0.01 * extent.span / (extent.duration_s / 3600)
+        return cls(typical_per_hour=typical, unit=extent.reading_unit, origin=extent.origin)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * (plan.time_s / 3600))
+        return np.asarray(value + theta[:, :1] * self.origin.hours(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > 0 else "falls"

@@ -10,6 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
+from probewise.effects.origin import CountsPlaceFromOrigin
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
@@ -57,8 +58,8 @@ _LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
 
 
 @dataclass(frozen=True)
-class PositionScale(LinearEffect[Poses]):
-    """Motor steps of the wrong length: X (1 + x), Y (1 + y)."""
+class PositionScale(CountsPlaceFromOrigin, LinearEffect[Poses]):
+    """Motor steps of the wrong length: X (1 + x), Y (1 + y), from `origin`."""
 
     typical: float = 0.01
 
@@ -71,11 +72,16 @@ class PositionScale(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the default for every recording: 1 % is a typical error; a wrong wheel size makes tens of percent."""
-        return cls()
+        """Keep the default scale: 1 % is a typical error; a wrong wheel size makes tens of percent."""
+        return cls(origin=extent.origin)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return replace(value, x_mm=value.x_mm * (1 + theta[:, :1]), y_mm=value.y_mm * (1 + theta[:, 1:2]))
+        x_mm, y_mm = self.origin.x_mm, self.origin.y_mm
+        return replace(
+            value,
+            x_mm=x_mm + (value.x_mm - x_mm) * (1 + theta[:, :1]),
+            y_mm=y_mm + (value.y_mm - y_mm) * (1 + theta[:, 1:2]),
+        )
 
     def bank(self) -> FloatArray:
         """Return five entries, (5, 2, 2): a small one, which the SSF's width may absorb, and four large ones."""

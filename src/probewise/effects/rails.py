@@ -13,6 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
+from probewise.effects.origin import CountsPlaceFromOrigin
 from probewise.effects.vocabulary import NamedEffect, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
@@ -23,8 +24,11 @@ _MOST_PLACES = 160
 
 
 @dataclass(frozen=True)
-class BentRails(LinearEffect[Poses]):
-    """Quadratic and cubic position error of each axis: X + x2_mm (X / 10 mm)^2 + x3_mm (X / 10 mm)^3, likewise Y."""
+class BentRails(CountsPlaceFromOrigin, LinearEffect[Poses]):
+    """Quadratic and cubic position error of each axis: X + x2_mm (X / 10 mm)^2 + x3_mm (X / 10 mm)^3, likewise Y.
+
+    In the powers X and Y count from `origin`.
+    """
 
     typical_mm: float = 0.1
 
@@ -38,10 +42,11 @@ class BentRails(LinearEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical quadratic error to 0.5 % of the longest scan's length L, at X = L / 2 or 10 mm if more."""
-        return cls(typical_mm=0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2)
+        typical_mm = 0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2
+        return cls(typical_mm=typical_mm, origin=extent.origin)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        x, y = plan.x_mm / _UNIT_MM, plan.y_mm / _UNIT_MM
+        x, y = (plan.x_mm - self.origin.x_mm) / _UNIT_MM, (plan.y_mm - self.origin.y_mm) / _UNIT_MM
         return replace(
             value,
             x_mm=value.x_mm + theta[:, :1] * x**2 + theta[:, 1:2] * x**3,

@@ -13,6 +13,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_mapping
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import FittedReadings
+from probewise.effects.origin import CountsFromOrigin
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseParameters
@@ -210,6 +211,13 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
     def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
         """Draw parameters about sampled nodes, both (n_samples, n_params); None where the nodes are dense enough."""
         return None
+
+
+def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
+    """Describe an effect by samples of its parameters, (n_samples, n_params), and say from where it counts if not 0."""
+    sentence = effect.sentence(samples.mean(axis=0), samples.std(axis=0))
+    counted_from = effect.counted_from if isinstance(effect, CountsFromOrigin) else ""
+    return f"{sentence} ({counted_from})" if counted_from else sentence
 
 
 def single_column_bank(*parameters: ArrayLike) -> FloatArray:

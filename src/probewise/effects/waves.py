@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
+from probewise.effects.origin import CountsPlaceFromOrigin, CountsTimeFromOrigin
 from probewise.effects.vocabulary import NamedEffect, V, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -52,8 +53,8 @@ class _WaveEffect(NamedEffect[V]):
 
 
 @dataclass(frozen=True)
-class Flicker(_WaveEffect[FloatArray]):
-    """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase).
+class Flicker(CountsTimeFromOrigin, _WaveEffect[FloatArray]):
+    """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase), t the time since `origin`.
 
     The mains frequency aliased by the sampling, or a slow lamp: any frequency up to half the rate of readings.
     """
@@ -78,7 +79,8 @@ class Flicker(_WaveEffect[FloatArray]):
             return None
         wanted = 2 * (highest - cls.lowest_hz) * extent.duration_s
         n_frequencies = int(np.clip(np.ceil(wanted), 8, _MOST_FREQUENCIES))
-        return cls(0.01 * extent.span, cls.lowest_hz, highest, n_frequencies, unit=extent.reading_unit)
+        typical, unit = 0.01 * extent.span, extent.reading_unit
+        return cls(typical, cls.lowest_hz, highest, n_frequencies, unit=unit, origin=extent.origin)
 
     @cached_property
     def prior(self) -> Product:
@@ -86,7 +88,7 @@ class Flicker(_WaveEffect[FloatArray]):
         return Product({"amp": HeavyTailedPrior(self.typical, positive=True), "alias_hz": frequency, "phase": PHASE})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        wave = np.sin(2 * np.pi * theta[:, 1:2] * plan.time_s + theta[:, 2:3])
+        wave = np.sin(2 * np.pi * theta[:, 1:2] * self.origin.seconds(plan) + theta[:, 2:3])
         return np.asarray(value + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
@@ -102,8 +104,8 @@ class Flicker(_WaveEffect[FloatArray]):
 
 
 @dataclass(frozen=True)
-class PeriodicPositionError(_WaveEffect[Poses]):
-    """A gear or lead screw that is not round: X + amp_mm sin(2 pi X / period_mm + phase)."""
+class PeriodicPositionError(CountsPlaceFromOrigin, _WaveEffect[Poses]):
+    """A gear or lead screw that is not round: X + amp_mm sin(2 pi X / period_mm + phase), X in it from `origin`."""
 
     typical_mm: float = 0.3
     shortest_mm: float = 3.0
@@ -120,7 +122,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search periods from three steps of X to twice its range; None where X takes fewer than eight positions."""
         shortest, reach = _shortest_period_and_range_mm(extent.plan)
-        return cls(0.003 * extent.length_mm, shortest, 2 * reach) if reach > 0 else None
+        return cls(0.003 * extent.length_mm, shortest, 2 * reach, origin=extent.origin) if reach > 0 else None
 
     @cached_property
     def prior(self) -> Product:
@@ -128,7 +130,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
         return Product({"amp_mm": amp, "period_mm": LogUniform(self.shortest_mm, self.longest_mm), "phase": PHASE})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        wave = np.sin(2 * np.pi / theta[:, 1:2] * value.x_mm + theta[:, 2:3])
+        wave = np.sin(2 * np.pi / theta[:, 1:2] * (value.x_mm - self.origin.x_mm) + theta[:, 2:3])
         return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
@@ -146,8 +148,8 @@ class PeriodicPositionError(_WaveEffect[Poses]):
 
 
 @dataclass(frozen=True)
-class StickSlip(NamedEffect[Poses]):
-    """Stick-slip of the slide: X + amp_mm saw(X / period_mm + phase), a sawtooth from 1 to -1."""
+class StickSlip(CountsPlaceFromOrigin, NamedEffect[Poses]):
+    """Stick-slip of the slide: X + amp_mm saw(X / period_mm + phase), a sawtooth from 1 to -1 of X from `origin`."""
 
     typical_mm: float = 0.3
     shortest_mm: float = 3.0
@@ -165,7 +167,9 @@ class StickSlip(NamedEffect[Poses]):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search periods from three steps of X to a quarter of its range; None where that is empty."""
         shortest, reach = _shortest_period_and_range_mm(extent.plan)
-        return cls(0.003 * extent.length_mm, shortest, 0.25 * reach) if 0.25 * reach > shortest else None
+        if 0.25 * reach <= shortest:
+            return None
+        return cls(0.003 * extent.length_mm, shortest, 0.25 * reach, origin=extent.origin)
 
     @cached_property
     def prior(self) -> Product:
@@ -174,7 +178,7 @@ class StickSlip(NamedEffect[Poses]):
         return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        turns = 2 * np.pi * (value.x_mm / theta[:, 1:2] + theta[:, 2:3])
+        turns = 2 * np.pi * ((value.x_mm - self.origin.x_mm) / theta[:, 1:2] + theta[:, 2:3])
         saw = sum(share * np.sin(order * turns) for order, share in zip(_ORDERS, _SHARES, strict=True))
         return replace(value, x_mm=value.x_mm + theta[:, :1] * saw)
 

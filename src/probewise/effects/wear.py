@@ -10,6 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
+from probewise.effects.origin import CountsTimeFromOrigin
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import footprint_at_added_height
@@ -17,8 +18,8 @@ from probewise.sensor.stages import Footprint, Poses, Stage
 
 
 @dataclass(frozen=True)
-class SlowTurn(LinearEffect[Poses]):
-    """The sensor turns in its holder: orientation + deg_per_hour t."""
+class SlowTurn(CountsTimeFromOrigin, LinearEffect[Poses]):
+    """The sensor turns in its holder: orientation + deg_per_hour t, t the time since `origin`."""
 
     typical_deg_per_hour: float = 2.0
 
@@ -32,10 +33,10 @@ class SlowTurn(LinearEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical rate to two degrees over the recording."""
-        return cls(typical_deg_per_hour=2.0 / (extent.duration_s / 3600))
+        return cls(typical_deg_per_hour=2.0 / (extent.duration_s / 3600), origin=extent.origin)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        turn = np.deg2rad(theta[:, :1]) * (plan.time_s / 3600)
+        turn = np.deg2rad(theta[:, :1]) * self.origin.hours(plan)
         return replace(value, orientation_rad=value.orientation_rad + turn)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -43,8 +44,11 @@ class SlowTurn(LinearEffect[Poses]):
 
 
 @dataclass(frozen=True)
-class SlowSinking(LinearEffect[Footprint]):
-    """The sensor sinks or rises: per_hour t h0 adds to the height; footprint x h/h0, signal x (h0/h)^2."""
+class SlowSinking(CountsTimeFromOrigin, LinearEffect[Footprint]):
+    """The sensor sinks or rises: per_hour t h0 adds to the height; footprint x h/h0, signal x (h0/h)^2.
+
+    t is the time since `origin`.
+    """
 
     typical_per_hour: float = 0.1
 
@@ -58,10 +62,10 @@ class SlowSinking(LinearEffect[Footprint]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical rate to 1 % of the height over the recording."""
-        return cls(typical_per_hour=0.01 / (extent.duration_s / 3600))
+        return cls(typical_per_hour=0.01 / (extent.duration_s / 3600), origin=extent.origin)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_added_height(value, theta[:, :1] * (plan.time_s / 3600), plan)
+        return footprint_at_added_height(value, theta[:, :1] * self.origin.hours(plan), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > 0 else "sinks"

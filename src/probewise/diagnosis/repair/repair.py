@@ -18,6 +18,7 @@ from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import NamedEffect
+from probewise.effects.vocabulary import sentence_from_samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +84,7 @@ class Repair:
             marks = self.model.absent.get(effect.name)
             held = values if marks is None else values[~marks]
             if effect.name not in stated and len(held):
-                sentence = effect.sentence(held.mean(axis=0), held.std(axis=0))
-                out.append((effect.name, len(held) / len(values), sentence))
+                out.append((effect.name, len(held) / len(values), sentence_from_samples(effect, held)))
         return tuple(out)
 
     carried_beside = unstated_effects

@@ -96,6 +96,7 @@ class ModelSamples:
             effects=self.effects,
             patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
             absent=self.absent,
+            origin=Extent.of(recording).origin,
             scan_noise=scan_noise,
             fingerprint=fingerprint(recording),
             source=PurePath(recording.source).name,

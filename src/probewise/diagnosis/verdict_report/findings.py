@@ -20,6 +20,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
 from probewise.diagnosis.verdict_report.words import with_unit_of_reading
 from probewise.effects import NamedEffect, NoiseEffect
+from probewise.effects.vocabulary import sentence_from_samples
 from probewise.recordings.plan import Plan
 
 _LEAST_PROBABILITY = 1e-3
@@ -108,7 +109,7 @@ def effects_found(
                 name,
                 min(p, 1.0),
                 size,
-                effect.sentence(values.mean(axis=0), values.std(axis=0)),
+                sentence_from_samples(effect, values),
                 (*parameters_found(effect, values, unit), *_scan_numbers_found(effect, plan)),
                 effect.scans,
             )

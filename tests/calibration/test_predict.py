@@ -189,17 +189,28 @@ def test_another_unit_is_warned_of(sensor: FittedSensor) -> None:
         predict(sensor, plan)
 
 
-def test_heights_that_are_not_those_of_the_calibration_are_warned_of(sensor: FittedSensor) -> None:
+def test_heights_without_one_in_the_description_are_warned_of(sensor: FittedSensor) -> None:
     calibrated = replace(sensor, instrumentation=replace(sensor.instrumentation, height_mm=14.0))
     raised = replace(_disc_plan(), covariates={"height_mm": np.full(21, 28.0)})
     with pytest.warns(DoubtfulResultWarning, match="gives no height_mm of the sensor: predicted as at the height of"):
         predict(calibrated, raised)
-    with pytest.warns(DoubtfulResultWarning, match="readings at 28 mm are predicted as at 14 mm"):
-        predict(calibrated, replace(raised, instrumentation=Instrumentation(height_mm=28.0)))
     predict(calibrated, replace(raised, covariates={"height_mm": np.full(21, 14.0)}))
     predict(replace(sensor, instrumentation=Instrumentation()), raised)
     lower = predict(calibrated, replace(raised, instrumentation=Instrumentation(height_mm=14.0)))
     assert np.ptp(lower.mean) < 0.5 * np.ptp(predict(calibrated, _disc_plan()).mean)
+
+
+def test_a_plan_that_declares_another_height_is_predicted_at_it(sensor: FittedSensor) -> None:
+    """As a plan of the calibration's height that commands it; rows that command one of their own keep it."""
+    calibrated = replace(sensor, instrumentation=replace(sensor.instrumentation, height_mm=14.0))
+    at_14, at_28 = (replace(_disc_plan(), instrumentation=Instrumentation(height_mm=h)) for h in (14.0, 28.0))
+    for column in (np.full(21, np.nan), np.where(np.arange(21) < 5, 10.0, np.nan)):
+        found = predict(calibrated, replace(at_28, covariates={"height_mm": column}))
+        told = replace(at_14, covariates={"height_mm": np.where(np.isfinite(column), column, 28.0)})
+        np.testing.assert_array_equal(found.mean, predict(calibrated, told).mean)
+    assert found.plan.instrumentation.height_mm == 28.0
+    np.testing.assert_array_equal(predict(calibrated, at_28).mean[5:], found.mean[5:])
+    np.testing.assert_array_equal(predict(sensor, at_28).mean, predict(sensor, at_14).mean)  # calibrated at no height
 
 
 def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_sensor: Callable[..., FittedSensor]) -> None:

@@ -489,6 +489,36 @@ def test_a_range_or_height_that_a_later_recording_declares_in_another_way_is_tol
     assert join([low, replace(low, readings=low.readings + 0.1)]).notes == ()
 
 
+def test_recordings_of_other_heights_are_joined_each_at_its_own():
+    """The second as a plan of the first's height that commands 20 mm, except where it commands a height itself."""
+    first, second = line(4), line(3)
+    lifted = np.where(np.arange(len(second)) < 4, 25.0, np.nan)
+    low, high = (
+        Recording(
+            replace(
+                own.plan,
+                instrumentation=replace(own.plan.instrumentation, height_mm=height),
+                covariates={} if column is None else {"height_mm": column},
+            ),
+            own.readings,
+            name,
+        )
+        for own, height, column, name in ((first, 14.0, None, "one.csv"), (second, 20.0, lifted, "two.csv"))
+    )
+    joined = join([low, high])
+    assert joined.plan.instrumentation.height_mm == 14.0
+    np.testing.assert_array_equal(
+        joined.plan.covariates["height_mm"],
+        np.concatenate([np.full(len(first), np.nan), np.where(np.isnan(lifted), 20.0, lifted)]),
+    )
+    told = "two.csv declares 20 for height_mm, one.csv 14: readings are taken to be at the height of each"
+    assert joined.notes == (told,)
+    other_way = join([high, low]).plan
+    assert other_way.instrumentation.height_mm == 20.0
+    np.testing.assert_array_equal(other_way.covariates["height_mm"][len(second) :], 14.0)
+    assert "height_mm" not in join([low, replace(low, readings=low.readings + 0.1)]).plan.covariates
+
+
 def test_recordings_of_other_units_are_not_joined():
     with pytest.raises(ParameterError, match="volt"):
         join([line(), line(unit="volt")])

@@ -17,6 +17,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
 from probewise.recordings.plan import require_described, require_plan
 from probewise.scene import KnownScene
+from probewise.sensor import with_declared_height_commanded
 
 # Numbers held in memory by one block of samples: about 30 MB.
 _BLOCK = 4_000_000
@@ -36,7 +37,8 @@ def predict(
     pooled sd, modified by the sensor's effects on the noise (outliers, losses, signal dependence). If
     the plan declares a rounding step, or else the sensor's calibration did, the density is the mass of the
     reading's cell divided by the step. Each row is scored by its marginal density. New patterns, scans and angles are
-    predicted like any other; effects of single scans are left out (see `FittedSensor.chain`).
+    predicted like any other; effects of single scans are left out (see `FittedSensor.chain`). Where the plan declares
+    another height than the calibration, its readings are those at its own.
 
     Parameters
     ----------
@@ -64,8 +66,8 @@ def predict(
     Warns
     -----
     DoubtfulResultWarning
-        If the plan's unit or height is not that of the calibration, the plan commands heights but its description
-        gives none, it lacks a column that an effect reads, or it lies before the time from which an effect counts.
+        If the plan's unit is not that of the calibration, the plan commands heights but its description gives none, it
+        lacks a column that an effect reads, or it lies before the time from which an effect counts.
     """
     require_sensor(sensor, "in the order predict(sensor, plan)")
     if isinstance(plan, Recording):
@@ -90,7 +92,8 @@ def predict(
     scored = Recording(plan, recorded).usable
     step = sensor.instrumentation.step if plan.instrumentation.step is None else plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
-    model = chain if sensor.effects else DeduplicatedModel(chain, plan)
+    there = with_declared_height_commanded(plan, sensor.instrumentation.height_mm)
+    model = chain if sensor.effects else DeduplicatedModel(chain, there)
     for effect in sensor.effects_on_new_scans:
         for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
             warnings.warn(
@@ -113,24 +116,18 @@ def predict(
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = slice(first, first + per_block)
-        noise = chain.noise_parameters(theta[block], plan, sensor.noise_sd[block, None])
-        mixture.add(model.predict(theta[block], plan), noise)
+        noise = chain.noise_parameters(theta[block], there, sensor.noise_sd[block, None])
+        mixture.add(model.predict(theta[block], there), noise)
     return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)
 
 
 def _doubt_of_height_in_words(sensor: FittedSensor, plan: Plan) -> str:
     """Say why a plan's heights may not be those at which its readings are predicted; "" if they are."""
-    usual_mm, calibrated_mm = plan.instrumentation.height_mm, sensor.instrumentation.height_mm
-    if usual_mm is None:
-        column = plan.covariates.get("height_mm", np.empty(0))
-        commanded_mm = column[np.isfinite(column)]
-        said = "the plan has a column height_mm, but its description gives no height_mm of the sensor"
-        # Where all are the height of the calibration, or may be, nothing is lost.
-        elsewhere = commanded_mm != (commanded_mm[:1] if calibrated_mm is None else calibrated_mm)
-        return f"{said}: predicted as at the height of the calibration" if elsewhere.any() else ""
-    if calibrated_mm is None or usual_mm == calibrated_mm:
+    if plan.instrumentation.height_mm is not None:
         return ""
-    return (
-        f"the plan's description gives a height of {usual_mm:g} mm, the sensor was calibrated at {calibrated_mm:g} mm: "
-        f"readings at {usual_mm:g} mm are predicted as at {calibrated_mm:g} mm"
-    )
+    calibrated_mm, column = sensor.instrumentation.height_mm, plan.covariates.get("height_mm", np.empty(0))
+    commanded_mm = column[np.isfinite(column)]
+    said = "the plan has a column height_mm, but its description gives no height_mm of the sensor"
+    # Where all are the height of the calibration, or may be, nothing is lost.
+    elsewhere = commanded_mm != (commanded_mm[:1] if calibrated_mm is None else calibrated_mm)
+    return f"{said}: predicted as at the height of the calibration" if elsewhere.any() else ""

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Plan, Recording, require_recording
-from probewise.sensor import COMMANDED
+from probewise.sensor import COMMANDED, with_declared_height_commanded
 from probewise.systems.joining import unused_name
 
 
@@ -21,8 +21,8 @@ def join(recordings: Sequence[Recording]) -> Recording:
     """Concatenate recordings: scans remain distinct, and so do patterns of one name with different descriptions.
 
     A covariate of the first, such as battery voltage, keeps its last known value in recordings that lack it; one that
-    the first lacks is left out. The range, step and height that the first declares count for all; notes say so. Times
-    are unchanged.
+    the first lacks is left out. The range and step that the first declares count for all; readings of a recording that
+    declares another height than the first are at that height, if both declare one. Notes say so. Times are unchanged.
 
     Raises
     ------
@@ -60,9 +60,11 @@ def join(recordings: Sequence[Recording]) -> Recording:
 def join_plans(plans: Sequence[Plan]) -> Plan:
     """Concatenate plans, with the covariates of the first and commanded columns (LED, height) of all.
 
-    Commanded columns are NaN (as at calibration) where a plan lacks them; other covariates keep their last known value.
+    Commanded columns are NaN (as at calibration) where a plan lacks them, unless it declares another height than the
+    first; other covariates keep their last known value.
     """
     first = plans[0]
+    plans = [with_declared_height_commanded(plan, first.instrumentation.height_mm) for plan in plans]
     patterns: dict[str, Pattern] = {}
     names: list[str] = []
     scan_names: list[str] = []
@@ -143,8 +145,13 @@ def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str
     for k, other in enumerate(recordings[1:], 1):
         for name in ("min", "max", "step", "height_mm"):
             own, taken = (getattr(recording.plan.instrumentation, name) for recording in (other, first))
-            if own != taken:
-                label, value = _recording_label(other, k), "no value" if own is None else f"{own:g}"
+            if own == taken:
+                continue
+            label, value = _recording_label(other, k), "no value" if own is None else f"{own:g}"
+            if name == "height_mm" and own is not None and taken is not None:
+                as_taken = f"{_recording_label(first, 0)} {taken:g}: readings are taken to be at the height of each"
+                out.append(f"{label} declares {value} for height_mm, {as_taken}")
+            else:
                 as_first = "none, as" if taken is None else f"{taken:g}, that of"
                 out.append(f"{label} declares {value} for {name}: taken is {as_first} {_recording_label(first, 0)}")
     return out

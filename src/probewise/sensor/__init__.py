@@ -5,7 +5,12 @@ Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_m
 """
 
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
-from probewise.sensor.commanded import COMMANDED, footprint_at_height_ratio, raised
+from probewise.sensor.commanded import (
+    COMMANDED,
+    footprint_at_height_ratio,
+    raised,
+    with_declared_height_commanded,
+)
 from probewise.sensor.discrete import mean_albedo_by_pixels, seen_discrete
 from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bends_of, free_form_parameters, is_free_form
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians, seen
@@ -74,6 +79,7 @@ __all__ = [
     "response",
     "seen",
     "seen_discrete",
+    "with_declared_height_commanded",
 ]
 
 footprint_at_height = footprint_at_height_ratio

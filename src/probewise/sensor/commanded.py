@@ -48,6 +48,22 @@ def height_ratio(plan: Plan) -> FloatArray | None:
     return None if (ratio == 1.0).all() else ratio
 
 
+def with_declared_height_commanded(plan: Plan, calibrated_mm: float | None) -> Plan:
+    """Return a plan described at the height of a calibration, its own declared height as a command where it differs.
+
+    Rows that command a height keep theirs. The plan itself is returned where one of both heights is unknown.
+    """
+    own_mm = plan.instrumentation.height_mm
+    if own_mm is None or calibrated_mm is None or own_mm == calibrated_mm:
+        return plan
+    column = plan.covariates.get("height_mm", np.full(len(plan), np.nan))
+    return replace(
+        plan,
+        covariates={**plan.covariates, "height_mm": np.where(np.isfinite(column), column, own_mm)},
+        instrumentation=replace(plan.instrumentation, height_mm=calibrated_mm),
+    )
+
+
 def _require_none_beyond(name: str, values: FloatArray, beyond: BoolArray, allowed: str) -> None:
     """Raise ParameterError that names the first of the values of a column that are `beyond` what is allowed."""
     if beyond.any():

@@ -15,7 +15,7 @@ from probewise.diagnosis.fitting.coordinates import CalibratedSensor, GaussianMi
 from probewise.diagnosis.fitting.free_form import FreeFormSensor, free_form_to_natural
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
-from probewise.sensor import is_free_form
+from probewise.sensor import is_free_form, with_declared_height_commanded
 
 
 def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
@@ -83,6 +83,13 @@ def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
         own = sensor.instrumentation.unit
     if own and unit and own != unit:
         raise ParameterError("sensor", f"one that reads in {own!r}", f"one in {unit!r}, as the recording")
+
+
+def plan_at_height_of(sensor: SensorPrior, plan: Plan) -> Plan:
+    """Return a plan described at the height of a sensor's calibration: another one that it declares is a command."""
+    if not isinstance(sensor, FittedSensor):
+        return plan
+    return with_declared_height_commanded(plan, sensor.instrumentation.height_mm)
 
 
 def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:

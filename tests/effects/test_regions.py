@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from probewise.effects import Origin
 from probewise.effects.albedo import RegionWithGradient, RegionWithPatch
 from probewise.scene import edge_distance
 from probewise.scene.regions import (
@@ -25,6 +26,11 @@ CHANGED = {
     "graded": (
         RegionWithGradient(EDGE, np.array([[0.004, -0.006], [0.0, 0.01]])),
         lambda x, y: np.stack([1 + 0.004 * x - 0.006 * y, 1 + 0.01 * y]),
+        lambda s, change: s * change,
+    ),
+    "graded from a place of its own": (
+        RegionWithGradient(EDGE, np.array([[0.004, -0.006], [0.0, 0.01]]), Origin(x_mm=30.0, y_mm=-20.0)),
+        lambda x, y: np.stack([1 + 0.004 * (x - 30) - 0.006 * (y + 20), 1 + 0.01 * (y + 20)]),
         lambda s, change: s * change,
     ),
     "patched": (

@@ -8,7 +8,7 @@ For a Gaussian patch it is the integral of a product of two Gaussians.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -100,7 +100,7 @@ class RegionWithGradient:
 
     region: Region
     per_mm: FloatArray
-    origin: Origin
+    origin: Origin = field(default=Origin())
 
     @property
     def n_regions(self) -> int:
@@ -137,8 +137,8 @@ def _mean_albedo_over_gradient(region: RegionWithGradient, gaussian: LabGaussian
     ahead, behind = mean_albedo_at_shift(1.0), mean_albedo_at_shift(-1.0)
     from_x = gaussian.x_mm + gaussian.dx_mm - region.origin.x_mm
     from_y = gaussian.y_mm + gaussian.dy_mm - region.origin.y_mm
-    field = 1 + a * from_x + b * from_y
-    return np.asarray(field * (ahead + behind) / 2 + rise * (ahead - behind) / (2 * _STEP))
+    factor = 1 + a * from_x + b * from_y
+    return np.asarray(factor * (ahead + behind) / 2 + rise * (ahead - behind) / (2 * _STEP))
 
 
 @dataclass(frozen=True, eq=False)

@@ -157,7 +157,7 @@ def test_laws_of_the_noise_are_densities(law):
     assert total == pytest.approx(1.0, abs=0.01)
 
 
-NOISE_ON_A_SCALE = DeclaredNoise(sd=2.0, step=1.0, low=4.0, high=36.0)
+NOISE_ON_A_SCALE = DeclaredNoise.of(Rounded(sd=2.0, step=1.0, low=4.0, high=36.0))
 
 
 @pytest.mark.parametrize(
@@ -179,9 +179,9 @@ def test_readings_at_an_end_of_the_scale_cover_everything_beyond(law):
 
 def test_readings_at_an_end_of_the_scale_show_no_lattice():
     """A bright field reads 100 again and again: as likely under coarser rounding as without it."""
-    noise = DeclaredNoise(sd=1.0, step=1.0, low=0.0, high=100.0)
-    readings, level = np.full(6, 100.0), np.full((1, 6), 101.0)
     plain = Rounded(sd=1.0, step=1.0, low=0.0, high=100.0)
+    noise = DeclaredNoise.of(plain)
+    readings, level = np.full(6, 100.0), np.full((1, 6), 101.0)
     assert LatticeLikelihood(noise).log_prob(readings, level)[0] == pytest.approx(
         plain.log_prob(readings, level)[0], abs=1e-3
     )

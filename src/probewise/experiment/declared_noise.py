@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.effects.density import log_cell_density, log_gaussian_density
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
+from probewise.inference.rounded import ScaleEnds
 
 
 @dataclass(frozen=True)
 class DeclaredNoise:
-    """Gaussian noise of sd `sd`, rounded to `step` (0: not rounded) and clipped to `low` and `high`.
+    """Gaussian noise of sd `sd`, clipped to a scale and rounded to `step` within it (0: not rounded).
 
     Methods return the log density of each reading, (n_samples, n_points). Of rounded readings they return the log
     probability of the rounding cell, and of a reading at an end of the scale that of everything beyond it.
@@ -25,21 +25,22 @@ class DeclaredNoise:
 
     sd: float
     step: float = 0.0
-    low: float = -math.inf
-    high: float = math.inf
+    ends: ScaleEnds | None = None
 
     @classmethod
     def of(cls, likelihood: Likelihood) -> Self | None:
         """Return the noise of a likelihood with one known sd; None for any other."""
         if isinstance(likelihood, Rounded):
-            return cls(likelihood.sd, likelihood.step, likelihood.low, likelihood.high)
+            return cls(likelihood.sd, likelihood.step, likelihood.ends)
         if isinstance(likelihood, GaussianKnown) and np.ndim(likelihood.sd) == 0:
             return cls(float(np.asarray(likelihood.sd)))
         return None
 
     def is_inside(self, readings: FloatArray) -> BoolArray:
         """Return which readings, (n_points,), lie between the ends of the scale."""
-        return np.asarray((readings > self.low) & (readings < self.high))
+        if self.ends is None:
+            return np.ones(len(readings), dtype=np.bool_)
+        return ~(self.ends.at_low(readings) | self.ends.at_high(readings))
 
     def log_density(
         self,
@@ -55,9 +56,9 @@ class DeclaredNoise:
         """
         sd, step = self.sd if sd is None else sd, self.step if step is None else step
         if not step:
-            return self._with_ends(readings, predicted, sd, step, log_gaussian_density(readings, predicted, sd))
+            return self._with_ends(readings, predicted, sd, log_gaussian_density(readings, predicted, sd))
         within = log_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
-        return self._with_ends(readings, predicted, sd, step, within)
+        return self._with_ends(readings, predicted, sd, within)
 
     def quick_log_density(self, readings: FloatArray, predicted: FloatArray, *, sd: float) -> FloatArray:
         """Return the same as `log_density`, faster if the noise is wider than the rounding cell.
@@ -67,27 +68,22 @@ class DeclaredNoise:
         if sd < self.step:
             return self.log_density(readings, predicted, sd=sd)
         within = log_gaussian_density(readings, predicted, math.hypot(sd, self.step / math.sqrt(12.0)))
-        return self._with_ends(readings, predicted, sd, self.step, within + (math.log(self.step) if self.step else 0.0))
+        return self._with_ends(readings, predicted, sd, within + (math.log(self.step) if self.step else 0.0))
 
     def log_uniform_density(self, readings: FloatArray, low: float, high: float) -> FloatArray:
         """Return the log density of readings, (n_points,), that are uniform from `low` to `high`; -inf beyond."""
         width = np.full(len(readings), self.step or 1.0)
-        width = np.where(readings <= self.low, self.low + 0.5 * self.step - low, width)
-        width = np.where(readings >= self.high, high - self.high + 0.5 * self.step, width)
+        if self.ends is not None:
+            width = np.where(self.ends.at_low(readings), self.ends.lowest_cell + 0.5 * self.step - low, width)
+            width = np.where(self.ends.at_high(readings), high - self.ends.highest_cell + 0.5 * self.step, width)
         possible = (readings >= low) & (readings <= high) & (width > 0)
         return np.log(np.where(possible, width, 1.0) / (high - low)) + np.where(possible, 0.0, -np.inf)
 
     def _with_ends(
-        self,
-        readings: FloatArray,
-        predicted: FloatArray,
-        sd: float | FloatArray,
-        step: float,
-        within: FloatArray,
+        self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, within: FloatArray
     ) -> FloatArray:
         """Replace the log densities of readings at an end of the scale by the log probability of all beyond it."""
         inside = self.is_inside(readings)
-        if inside.all():
+        if self.ends is None or inside.all():
             return within
-        inward = np.where(readings >= self.high, predicted - readings, readings - predicted)
-        return np.where(inside, within, log_ndtr((inward + 0.5 * step) / sd))
+        return np.where(inside, within, self.ends.log_probability_beyond(readings, predicted, sd))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from scipy.special import log_ndtr
 
-from probewise._arrays import FloatArray, floats
+from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import checked_number
 from probewise.effects.density import log_mass_between
 from probewise.errors import ParameterError
@@ -17,6 +18,45 @@ from probewise.inference._residuals import residuals
 
 _FAR = 200.0  # sds from the prediction that the table covers
 _PER_SD = 50.0  # table entries per sd: linear interpolation errs by less than 1e-4
+
+
+@dataclass(frozen=True)
+class ScaleEnds:
+    """Outermost readings of a scale: each covers everything beyond the inner edge of its rounding cell.
+
+    `low` and `high` are the readings, `lowest_cell` and `highest_cell` the centres of their cells, `step` their width.
+    """
+
+    low: float
+    high: float
+    lowest_cell: float
+    highest_cell: float
+    step: float
+
+    @classmethod
+    def of(cls, low: float, high: float, step: float, *, whole_steps: bool = True) -> Self:
+        """Return the ends of a scale from `low` to `high`, rounded to multiples of `step` if `whole_steps`."""
+        lowest, highest = (
+            round(end / step) * step if whole_steps and math.isfinite(end) else end for end in (low, high)
+        )
+        return cls(max(lowest, low), min(highest, high), lowest, highest, step)
+
+    def at_low(self, readings: FloatArray) -> BoolArray:
+        """Return which readings are the lowest possible one."""
+        return np.asarray(readings <= self.low + self._slack)
+
+    def at_high(self, readings: FloatArray) -> BoolArray:
+        """Return which readings are the highest possible one."""
+        return np.asarray(readings >= self.high - self._slack)
+
+    def log_probability_beyond(self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray) -> FloatArray:
+        """Return the log probability of readings at an end, (n_points,), given predictions, (n_samples, n_points)."""
+        inward = np.where(self.at_high(readings), predicted - self.highest_cell, self.lowest_cell - predicted)
+        return np.asarray(log_ndtr((inward + 0.5 * self.step) / sd))
+
+    @property
+    def _slack(self) -> float:
+        return 1e-9 * self.step  # a multiple of a step such as 0.1 is not exact
 
 
 @dataclass(frozen=True)
@@ -57,25 +97,17 @@ class Rounded:
         """Return the log probability of the readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
-        lowest, highest = self._end_cells
-        slack = 1e-9 * self.step  # a multiple of a step such as 0.1 is not exact
-        at_low, at_high = readings <= max(lowest, self.low) + slack, readings >= min(highest, self.high) - slack
-        at_end = at_low | at_high
+        at_end = self.ends.at_low(readings) | self.ends.at_high(readings)
         if at_end.any():
             within = self._log_cell_probability(away[:, ~at_end]).sum(axis=1)
-            inward = np.where(at_high, predicted - highest, lowest - predicted)[:, at_end]
-            # Everything beyond the inner edge of the end cell.
-            return np.asarray(within + log_ndtr((inward + 0.5 * self.step) / self.sd).sum(axis=1))
+            beyond = self.ends.log_probability_beyond(readings[at_end], predicted[:, at_end], self.sd)
+            return np.asarray(within + beyond.sum(axis=1))
         return np.asarray(self._log_cell_probability(away).sum(axis=1))
 
     @cached_property
-    def _end_cells(self) -> tuple[float, float]:
-        """Centres of the outermost cells: the multiples of the step to which the ends of the scale are rounded."""
-        low, high = (
-            round(end / self.step) * self.step if self.whole_steps and math.isfinite(end) else end
-            for end in (self.low, self.high)
-        )
-        return low, high
+    def ends(self) -> ScaleEnds:
+        """The outermost readings of the scale."""
+        return ScaleEnds.of(self.low, self.high, self.step, whole_steps=self.whole_steps)
 
     def _log_cell_probability(self, away: FloatArray) -> FloatArray:
         """Interpolate the log probability of readings' cells from a table, by distance from the prediction in sds."""

@@ -15,6 +15,7 @@ from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, Form, Say, mean_with_sd
 from probewise.systems.forms.modulations import max_n_trial_frequencies, trial_frequencies
+from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
 from probewise.systems.table import RunTable
 
@@ -103,7 +104,8 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
             )
     if time is not None:
         says = partial(_fill_sentence, "the true time is the recorded time times (1 + a), a = {}")
-        yield from _linear_form(about, "clock_drift", _column_changer(time, _scaled_column), 1e-5, "1", says, "time")
+        clock = _column_changer(time, _clock_at_rate(time_origin(table)))
+        yield from _linear_form(about, "clock_drift", clock, 1e-5, "1", says, "time")
 
 
 def _fill_sentence(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
@@ -116,6 +118,11 @@ def _column_with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> Fl
 
 def _scaled_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(c * (1 + theta[:, :1]))
+
+
+def _clock_at_rate(origin: float) -> Change:
+    """Return the function of a clock that runs fast or slow, and is right at the origin."""
+    return lambda c, theta, table: np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
 
 
 def _column_changer(name: str, change: Change) -> Act:
@@ -188,9 +195,10 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     values = about.table.covariates[name]
     if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
         return
+    origin = origin_of_column(values)
 
     def add_wave(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-        return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
+        return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * (c - origin) / theta[:, 1:2] + theta[:, 2:3]))
 
     act = _column_changer(name, add_wave)
     frequencies = trial_frequencies(
@@ -217,6 +225,7 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         lambda m, s: (
             f"{name} has a periodic error with an amplitude of {mean_with_sd(m[0], s[0], '')} "
             f"and a period of {mean_with_sd(m[1], s[1], '')}, both in units of {name}"
+            f"{origin_in_words(origin, '')}"
         ),
         joined=starting_point_of_wave,
     )

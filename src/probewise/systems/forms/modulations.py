@@ -13,6 +13,7 @@ from probewise.effects import HeavyTailedPrior
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import ChangePoints, mean_with_sd
+from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.table import RunTable
 
 _MOST_MOMENTS = 512
@@ -44,9 +45,10 @@ def _single_entry(size: float) -> FloatArray:
 
 
 def linear_drift(table: RunTable, time_unit: str) -> Modulation:
-    """Return a linear drift in time as recorded: a t."""
+    """Return a linear drift in time as recorded: a t, with t from `time_origin`."""
+    origin = time_origin(table)
     return Modulation(
-        at_rows=lambda theta, rows: theta[:, :1] * rows.time_s,
+        at_rows=lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
         marginals=lambda a: {"a": a},
         entries=_single_entry,
         units=lambda unit: (f"{unit}/{time_unit}",),
@@ -152,11 +154,12 @@ def frequency_prior(frequencies: FloatArray) -> LogUniform:
 
 
 def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
-    """Return a sinusoid in time: a sin(2 pi hz t + phase)."""
+    """Return a sinusoid in time: a sin(2 pi hz t + phase), with t from `time_origin`."""
+    origin = time_origin(table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan())
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
-        return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * rows.time_s + theta[:, 2:3]))
+        return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))
 
     return Modulation(
         at_rows=at_rows,
@@ -169,7 +172,7 @@ def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
             f"{what} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], unit)} and a period of "
-            f"{1 / mean[1]:.4g} {time_unit}"
+            f"{1 / mean[1]:.4g} {time_unit}{origin_in_words(origin, time_unit)}"
         ),
         covariates=("time",),
         joined=starting_point_of_wave,

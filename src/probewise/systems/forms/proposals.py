@@ -18,6 +18,7 @@ from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, ChangePoints, Form, mean_with_sd
+from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
 from probewise.systems.forms.proposals_in_time import proposals_in_time
 from probewise.systems.forms.proposals_of_columns import proposals_of_columns
 from probewise.systems.motion import Motion
@@ -43,7 +44,8 @@ class _ScaledVariable:
     def text(self) -> str:
         if self.middle == 0.0:
             return self.name
-        return f"({self.name} {'-' if self.middle > 0 else '+'} {abs(self.middle):.4g})"
+        middle = text_rounded_to_spread(abs(self.middle), self.scale)
+        return f"({self.name} {'-' if self.middle > 0 else '+'} {middle})"
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def _varying_covariates(about: ReferenceFit) -> dict[str, FloatArray]:
 
 
 def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _ScaledVariable:
-    middle = float(f"{np.mean(values):.6g}") if centred else 0.0
+    middle = rounded_to_spread(float(np.mean(values)), float(np.std(values)), 6) if centred else 0.0
     return _ScaledVariable(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0)
 
 

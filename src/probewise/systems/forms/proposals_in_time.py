@@ -13,6 +13,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Form, mean_with_sd
 from probewise.systems.forms.modulations import frequency_prior, trial_frequencies
+from probewise.systems.forms.origins import origin_in_words, text_rounded_to_spread, time_origin
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
 from probewise.systems.table import RunTable
 
@@ -33,12 +34,12 @@ def proposals_in_time(about: ReferenceFit) -> Iterator[Form]:
 
 def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
-    own, table = about.system.simulator, about.table
+    own, table, origin = about.system.simulator, about.table, time_origin(about.table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         a, hz, phase, share, edge = (theta[:, k : k + 1] for k in range(5))
-        inside = np.cos(2 * np.pi * (hz * rows.time_s + phase)) - np.cos(np.pi * share)
+        inside = np.cos(2 * np.pi * (hz * (rows.time_s - origin) + phase)) - np.cos(np.pi * share)
         return np.asarray(value + 0.5 * a * (1 + np.tanh(inside / edge)))
 
     phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
@@ -48,7 +49,8 @@ def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     if typical is None:
         return
     entries[:, :, 0] = typical
-    text = f"while |({table.time} / period + phase) mod 1| < share / 2"
+    since = f"({table.time} - {origin:.12g})" if origin else table.time
+    text = f"while |({since} / period + phase) mod 1| < share / 2"
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
@@ -66,8 +68,8 @@ def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
         (0,),
         lambda mean, sd: (
             f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} during "
-            f"{mean_with_sd(mean[3], sd[3], '')} of every {1 / mean[1]:.4g} {about.time_unit}: "
-            "a proposal, not a known effect"
+            f"{mean_with_sd(mean[3], sd[3], '')} of every {1 / mean[1]:.4g} {about.time_unit}"
+            f"{origin_in_words(origin, about.time_unit)}: a proposal, not a known effect"
         ),
         expression=f"a {text}",
     )
@@ -94,7 +96,8 @@ def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     if typical is None:
         return
     entries[:, :, 0] = typical
-    text = f"sin(2 pi hz (u + sweep u^2 / (2 {half:.4g})) + phase), u = {table.time} - {middle:.4g}"
+    turned = f"2 pi hz (u + sweep u^2 / (2 {half:.4g})) + phase"
+    text = f"sin({turned}), u = {table.time} - {text_rounded_to_spread(middle, half)}"
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,

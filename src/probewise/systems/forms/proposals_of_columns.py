@@ -12,6 +12,7 @@ from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Form, mean_with_sd
+from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
 from probewise.systems.table import RunTable
 
 INTEGRAL_OVER = "integral over"
@@ -45,7 +46,9 @@ def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArr
     typical = about.typical_amplitude(Stage.OFFSET, act, about.sd * entries, about.sd)
     if typical is None:
         return
-    text = f"(a + b z + c z^2) ({name} - {centre:.4g}) / {spread:.4g}, z = ({own.reading} - {middle:.4g}) / {half:.4g}"
+    scaled = f"({name} - {text_rounded_to_spread(centre, spread)}) / {spread:.4g}"
+    z = f"({own.reading} - {text_rounded_to_spread(middle, half)}) / {half:.4g}"
+    text = f"(a + b z + c z^2) {scaled}, z = {z}"
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
@@ -68,8 +71,11 @@ def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArr
 def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
     """Yield a change of the reading that saturates with the column's integral (dose) since the start of the run."""
     own, table = about.system.simulator, about.table
-    centre = float(f"{np.mean(values):.6g}")
-    each: dict[str, Callable[[FloatArray], FloatArray]] = {f"|{name} - {centre:.4g}|": lambda c: np.abs(c - centre)}
+    spread = float(np.std(values))
+    centre = rounded_to_spread(float(np.mean(values)), spread, 6)
+    each: dict[str, Callable[[FloatArray], FloatArray]] = {
+        f"|{name} - {text_rounded_to_spread(centre, spread)}|": lambda c: np.abs(c - centre)
+    }
     if values.min() >= 0 or values.max() <= 0:
         each[f"|{name}|"] = np.abs
     summed = f"{INTEGRAL_OVER} {table.time}" if table.has_varying_time else "sum over rows"

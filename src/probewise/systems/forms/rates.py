@@ -16,6 +16,7 @@ from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, mean_with_sd
 from probewise.systems.forms.modulations import frequency_prior, max_n_trial_frequencies, trial_frequencies
+from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.motion import Limit, Motion
 
 _N_SIZES = 9
@@ -115,12 +116,12 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
 
 def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
     table = about.table
-    time = table.time
+    time, origin = table.time, time_origin(table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), max_n_trial_frequencies(len(table)))
 
     def act(value: Motion, theta: FloatArray, rows: Any) -> Motion:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
-        return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * u[str(time)] + phase))
+        return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[str(time)] - origin) + phase))
 
     guess = 1e-5 * _rms_rate(about, state)
     typical = about.typical_amplitude(Stage.RATE, act, sine_and_cosine_entries(guess, frequencies), guess)
@@ -143,6 +144,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
+            f"{origin_in_words(origin, about.time_unit)}"
         ),
         joined=starting_point_of_wave,
     )

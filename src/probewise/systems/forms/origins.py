@@ -1,0 +1,48 @@
+"""Origins from which times and columns are counted, and numbers rounded no coarser than the spread about them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.systems.table import RunTable
+
+_ALL = 17  # digits of a number in double precision
+_FAR = 10.0  # ranges of a column, from 0 to its least value, beyond which it is not counted from 0
+
+
+def origin_of_column(values: FloatArray) -> float:
+    """Return the origin from which an effect counts a column, (n_points,), in its unit: 0 unless that is far away.
+
+    Where the column's least value is more than ten of its ranges from 0, as a time in seconds of the epoch is, the
+    origin is that value. Counted from 0, a drift would be a constant, and a phase would turn with the last digit of a
+    frequency.
+    """
+    least, reach = float(np.nanmin(values)), float(np.nanmax(values) - np.nanmin(values))
+    return least if reach > 0 and abs(least) > _FAR * reach else 0.0
+
+
+def time_origin(table: RunTable) -> float:
+    """Return the origin from which drifts and waves count the time of a recording, as `origin_of_column` does.
+
+    Effects keep the origin of the recording that they are bound about, for whatever table they predict.
+    """
+    return origin_of_column(table.time_s)
+
+
+def origin_in_words(origin: float, unit: str) -> str:
+    """Return what to add to a sentence about a wave: the origin of its phase, "" if that is 0."""
+    return f", its phase counted from {origin:.12g} {unit}".rstrip() if origin else ""
+
+
+def rounded_to_spread(value: float, spread: float, least: int) -> float:
+    """Return a number rounded to `least` digits, or to more if that would move it by a twentieth of the spread."""
+    return float(text_rounded_to_spread(value, spread, least))
+
+
+def text_rounded_to_spread(value: float, spread: float, least: int = 4) -> str:
+    """Return the text of a number rounded as by `rounded_to_spread`."""
+    beyond = math.ceil(math.log10(abs(value) / spread)) if value and spread > 0 else 0
+    return f"{value:.{min(max(least, 2 + beyond), _ALL)}g}"

@@ -1,0 +1,166 @@
+"""Times and columns far from 0, as seconds of the epoch are: effects are what they are on a clock that starts at 0."""
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import diagnose_system
+from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
+from probewise.systems.forms import ReferenceFit, forms_of
+from probewise.systems.forms.origins import origin_of_column, rounded_to_spread, text_rounded_to_spread, time_origin
+from probewise.systems.forms.proposals import proposals
+from probewise.systems.forms.rebinding import extract_recorded
+
+EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
+FAR = 2.0**21  # of a column
+N_ROWS = 60
+_T = np.tile(0.125 * np.arange(N_ROWS // 2), 2)
+_DRIVE = np.round(512 * (np.sin(_T) + 0.3 * np.sin(3.1 * _T))) / 512
+
+
+def _table(shift, far=0.0):
+    return RunTable(
+        {
+            "t_s": _T + shift,
+            "run": np.repeat([1.0, 2.0], N_ROWS // 2),
+            "drive": _DRIVE + far,
+            "y": 1.0 + 2.0 * _DRIVE,
+        },
+        time="t_s",
+        run="run",
+    )
+
+
+def _function(far):
+    return {"simulate": lambda p, u: p["offset"] + p["gain"] * (u["drive"] - far)}
+
+
+def _law(far):
+    law = Law({"s": "offset"}, lambda s, p, u: {"s": p["gain"] * (u["drive"] - far) - s["s"]})
+    return {"law": law}
+
+
+def _about(shift, far, how):
+    simulator = Simulator(
+        reading="y",
+        unit="V",
+        parameters={"offset": (-5, 5), "gain": (0, 4)},
+        time="t_s",
+        run="run",
+        **how(far),
+    )
+    table = _table(shift, far)
+    system = System.of(simulator, table)
+    return ReferenceFit(system, table, np.zeros(system.n_params), 0.01)
+
+
+def _readings(about, form, setting):
+    theta = np.concatenate([about.theta[0], setting])[None, :]
+    return about.system.chain(about.table, [form]).predict(theta, about.table)[0]
+
+
+def test_a_recording_that_begins_within_ten_of_its_lengths_is_counted_from_0():
+    assert origin_of_column(np.array([9.9, 10.9])) == 0.0
+    assert origin_of_column(np.array([-10.0, -9.0])) == 0.0
+    assert origin_of_column(np.array([10.5, 11.5])) == 10.5
+    assert origin_of_column(np.array([-20.0, np.nan, -19.0])) == -20.0
+    assert origin_of_column(np.array([7.0, 7.0])) == 0.0
+    assert time_origin(_table(0.0)) == 0.0
+    assert time_origin(_table(EPOCH)) == EPOCH
+
+
+@pytest.mark.parametrize("how", [_function, _law])
+def test_every_form_of_a_recording_by_the_epoch_is_that_of_the_same_recording_from_0(how):
+    near, later = (_about(shift, 0.0, how) for shift in (0.0, EPOCH))
+    expected, found = forms_of(near), forms_of(later)
+    assert found.keys() == expected.keys()
+    for name, form in expected.items():
+        setting = form.bank()[len(form.bank()) // 3, 0]
+        if name.startswith(("offset_step", "gain_step", "steps")):  # in time as printed
+            assert found[name].change_points.at == tuple(at + EPOCH for at in form.change_points.at)
+            continue
+        clock = name == "clock_drift"  # its trial changes of times are a hundred times the precision of such times
+        np.testing.assert_allclose(found[name].bank(), form.bank(), rtol=1e-2 if clock else 1e-6, err_msg=name)
+        readings = _readings(later, found[name], setting)
+        np.testing.assert_allclose(readings, _readings(near, form, setting), atol=1e-5, err_msg=name)
+
+
+def test_every_formula_of_a_recording_by_the_epoch_is_that_of_the_same_recording_from_0():
+    near, later = (_about(shift, 0.0, _function) for shift in (0.0, EPOCH))
+    expected, found = (list(proposals(about)) for about in (near, later))
+    assert len(found) == len(expected)
+    for one, other in zip(expected, found, strict=True):
+        setting = one.bank()[len(one.bank()) // 3, 0]
+        readings = _readings(later, other, setting)
+        np.testing.assert_allclose(readings, _readings(near, one, setting), atol=0.1 * 0.01, err_msg=one.name)
+
+
+def test_a_periodic_error_of_a_column_far_from_0_has_its_phase_from_there():
+    near, away = (_about(0.0, far, _function) for far in (0.0, FAR))
+    form, found = forms_of(near)["periodic_error:drive"], forms_of(away)["periodic_error:drive"]
+    least = _DRIVE.min()
+    for setting in ([0.1, 0.7, 0.4], [0.05, 0.31, -1.0]):
+        shifted = [*setting[:2], setting[2] - 2 * np.pi * least / setting[1]]  # that from 0 has it at 0
+        np.testing.assert_allclose(_readings(away, found, setting), _readings(near, form, shifted), atol=1e-8)
+    assert f"its phase counted from {FAR + least:.12g}" in found.sentence(np.array(setting), np.array([0.01] * 3))
+    assert "phase" not in form.sentence(np.array(setting), np.array([0.01] * 3))
+
+
+def test_a_mean_is_rounded_no_coarser_than_the_spread_about_it():
+    assert rounded_to_spread(1.7e9 + 600.25, 350.0, 6) == pytest.approx(1.7e9 + 600.25, abs=0.05 * 350)
+    assert rounded_to_spread(12.3456789, 3.0, 6) == 12.3457
+    assert text_rounded_to_spread(12.3456789, 3.0) == "12.35"
+    assert text_rounded_to_spread(1006.13, 0.25) == "1006.13"
+    assert text_rounded_to_spread(0.0, 1.0) == "0"
+    assert float(text_rounded_to_spread(1.7e9, 1e-12)) == 1.7e9
+
+
+def test_a_model_keeps_the_origin_of_its_recording_for_other_tables_and_through_its_file():
+    about = _about(EPOCH, 0.0, _function)
+    names = ("interference", "offset_drift")
+    forms = forms_of(about)
+    columns = [*about.system.prior.names, *(f"{n}.{p}" for n in names for p in forms[n].prior.names)]
+    theta = np.array([1.0, 2.0, 0.5, 0.3, 0.4, 0.1])
+    model = FittedSystem(
+        about.system.simulator,
+        names=tuple(columns),
+        samples=np.tile(theta, (500, 1)),
+        noise_sd=np.full(500, 0.01),
+        effects=names,
+        known=extract_recorded(about),
+    )
+    later = _table(EPOCH + 1e5)  # its own origin would be another one
+    since = later.columns["t_s"] - EPOCH
+    expected = 1.0 + 2.0 * _DRIVE + 0.5 * np.sin(2 * np.pi * 0.3 * since + 0.4) + 0.1 * since
+    found = predict_system(model, later, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(found.mean, expected, rtol=1e-9)
+    read = FittedSystem.from_json(model.to_json(), about.system.simulator)
+    again = predict_system(read, later, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(again.mean, found.mean)
+    np.testing.assert_array_equal(again.log_density, found.log_density)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["drift", "wave"])
+def test_a_recording_by_the_epoch_has_the_diagnosis_of_the_same_recording_from_0(kind):
+    rng = np.random.default_rng(3)
+    t, u = 5.0 * np.arange(240), np.repeat(rng.uniform(1, 5, 24), 10)
+    lacks = 2e-4 * t if kind == "drift" else 0.06 * np.sin(2 * np.pi * t / 173 + 0.7)
+    y = 1.0 + 2.0 * u + lacks + 0.05 * rng.normal(size=240)
+    simulator = Simulator(
+        "y",
+        "V",
+        {"g": (0, 10), "o": (-5, 5)},
+        simulate=lambda p, d: p["g"] * d["u"] + p["o"],
+        time="t_s",
+        vectorized=True,
+    )
+    near, later = (
+        diagnose_system(simulator, {"t_s": t + shift, "u": u, "y": y}, rng=np.random.default_rng(1))
+        for shift in (0.0, EPOCH)
+    )
+    expected, found = ({h.effects: h.probability for h in d.judged.hypotheses} for d in (near, later))
+    assert later.verdict == near.verdict
+    assert {"drift": ("offset_drift",), "wave": ("interference",)}[kind] in list(found)[:2]
+    for effects, probability in expected.items():
+        if probability > 0.01:
+            assert found[effects] == pytest.approx(probability, abs=2e-3)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from heater import SIMULATOR, fitted, runs
 
+from probewise.diagnosis.system.commands import in_sequence, possible_run_commands
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.systems import FittedSystem, RunTable, Simulator, predict_system, write_system_prediction
-from probewise.systems.forms.rebinding import Recorded
+from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system, write_system_prediction
+from probewise.systems.forms import ReferenceFit, forms_of
+from probewise.systems.forms.rebinding import Recorded, extract_recorded
 
 RNG = 7
 
@@ -141,3 +143,48 @@ def test_a_model_with_a_lag_refuses_a_time_that_falls_within_a_run_and_one_witho
         predicted(model, again)
     drift, _ = _line_with("offset_drift", a=0.01)
     np.testing.assert_allclose(predicted(drift, again).mean, table.columns["y"] + 0.01 * again.time_s)
+
+
+_STEP_AT = 24.5
+
+
+def _model_with_a_step_at_a_row():
+    """A constant of 1 that jumps by 2 after row 24 of 40, of a recording without a time."""
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=40)
+    table = RunTable({"x": x, "y": 1.0 + x + 2.0 * (np.arange(40) > _STEP_AT)})
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"])
+    about = ReferenceFit(System.of(simulator, table), table, np.zeros(1), 0.1)
+    names = ("a", *(f"offset_step.{name}" for name in forms_of(about)["offset_step"].prior.names))
+    model = FittedSystem(
+        simulator,
+        names=names,
+        samples=np.tile([1.0, 2.0, _STEP_AT], (500, 1)),
+        noise_sd=np.full(500, 0.1),
+        effects=("offset_step",),
+        known=extract_recorded(about),
+    )
+    return model, table
+
+
+def test_a_step_at_a_row_is_there_in_the_recording_and_its_first_rows():
+    model, table = _model_with_a_step_at_a_row()
+    np.testing.assert_allclose(predicted(model, table).mean, table.columns["y"])
+    np.testing.assert_allclose(predicted(model, table.take(np.arange(30))).mean, table.columns["y"][:30])
+    both = RunTable({name: np.concatenate([v, v[:5]]) for name, v in table.columns.items()})
+    np.testing.assert_allclose(predicted(model, both).mean[40:], 3.0 + table.columns["x"][:5])
+
+
+def test_a_new_table_comes_after_the_step_at_a_row_of_the_recording():
+    """The machine jumped and stayed there; before, a new table began anew, ahead of the jump."""
+    model, table = _model_with_a_step_at_a_row()
+    x = np.random.default_rng(5).normal(size=30)
+    for new in ({"x": x, "y": x}, {"x": x}, {"x": table.columns["x"]}):
+        np.testing.assert_allclose(predicted(model, new).mean, 3.0 + new["x"])
+
+
+def test_a_run_that_could_be_recorded_next_comes_after_the_step_at_a_row():
+    _, table = _model_with_a_step_at_a_row()
+    commands = possible_run_commands(table, "y", ("x",), "s")
+    assert {command.table.first_row for command in commands} == {40}
+    assert in_sequence(commands[:2], table).row_number[0] == 40

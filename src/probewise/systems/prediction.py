@@ -110,7 +110,9 @@ def predict_system(
     The predictive distribution of a reading is the mixture, over posterior samples, of each sample's noise about its
     prediction, with all effects of the model. For a run outside the recording, each sample draws the parameters per
     run: a `per_run` parameter from its prior; an effect's value per run from a Student-t about the sample's values for
-    the recorded runs, with their scatter as its width, and one degree of freedom more than there are runs.
+    the recorded runs, with their scatter as its width, and one degree of freedom more than there are runs. Where no
+    time was recorded, a step at a row (`at_row`) counts the rows of the recording: those of a table that does not begin
+    with the recording's rows, readings included, come after its end.
 
     Parameters
     ----------
@@ -137,7 +139,7 @@ def predict_system(
     require_fitted_system(fitted)
     require_rng(rng)
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
-    own = cast(RunTable, recording.plan)
+    own = replace(cast(RunTable, recording.plan), first_row=_number_of_first_row(fitted, recording))
     system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
     chain = system.chain(own, bind_effects(fitted, own))
     theta, is_drawn = _samples_for_chain(fitted, chain, rng=rng)
@@ -176,6 +178,26 @@ def predict_system(
             stacklevel=2,
         )
     return SystemPrediction(own, recording.readings, mean, sd, scores, n_samples, n_failed)
+
+
+def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
+    """Return the number of a table's first row, counted from the first of the recording that the model was fitted to.
+
+    A table that begins with the recording's rows, or is a part from its beginning, is that recording; any other comes
+    after its end.
+    """
+    reading, known = fitted.simulator.reading, fitted.known
+    if known is None:
+        return 0
+    table, recorded = cast(RunTable, recording.plan), known.table
+    n = min(len(table), len(recorded))
+    if not np.array_equal(recording.readings[:n], recorded.columns[reading][:n], equal_nan=True):
+        return len(recorded)
+    for name in recorded.covariates.keys() & table.covariates.keys() - {reading}:
+        now, then = table.covariates[name][:n], recorded.covariates[name][:n]
+        if np.any((now != then) & np.isfinite(now)):  # a cell that it lacked was interpolated when it was fitted
+            return len(recorded)
+    return 0
 
 
 def _unpredictable_mask(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:

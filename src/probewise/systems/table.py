@@ -37,6 +37,9 @@ class RunTable:
         Unit, range and step of a reading.
     like
         Planned runs, each with the recorded run whose per-run parameters it is assumed to share.
+    first_row
+        Number of the first row, counted from that of the recording about which effects are bound: 0 for the recording
+        itself, its length for a table that follows it.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -44,6 +47,7 @@ class RunTable:
     run: str | None = None
     instrumentation: Instrumentation = field(default_factory=Instrumentation)
     like: Mapping[str, str] = field(default_factory=dict)
+    first_row: int = 0
 
     def __post_init__(self) -> None:
         if not hasattr(self.columns, "items"):
@@ -83,6 +87,11 @@ class RunTable:
     def time_s(self) -> FloatArray:
         """Time as recorded, in its own unit; the row's number if none was recorded, (n_points,)."""
         return read_only_floats(np.arange(float(len(self))) if self.time is None else self.columns[self.time])
+
+    @property
+    def row_number(self) -> FloatArray:
+        """Number of each row, counted from the first of the recording about which effects are bound, (n_points,)."""
+        return self.first_row + np.arange(float(len(self)))
 
     @cached_property
     def _run_of_row_and_names(self) -> tuple[IntArray, tuple[str, ...]]:

@@ -130,7 +130,13 @@ def _planned_run(
         changed[table.time] = begin + slower * (time - time[0])
     run = table.run or unused_name(_RUN, table.columns)
     changed[run] = np.full(len(rows), name)
-    return replace(taken, columns={**taken.columns, **changed}, run=run, like={name: table.like.get(like, like)})
+    return replace(
+        taken,
+        columns={**taken.columns, **changed},
+        run=run,
+        like={name: table.like.get(like, like)},
+        first_row=len(table),
+    )
 
 
 def _next_start_time(table: RunTable) -> float:

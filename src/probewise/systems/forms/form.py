@@ -43,7 +43,7 @@ class ChangePoints:
         """Return the column, row number or time that is compared with the change point, (n_points,)."""
         if self.column:
             return table.covariates[self.column]
-        return np.arange(float(len(table))) if self.by_row else table.time_s
+        return table.row_number if self.by_row else table.time_s
 
     def thinned(self) -> ChangePoints:
         """Return change points at a subset of the positions, at most 48 intervals, enough to detect a change."""

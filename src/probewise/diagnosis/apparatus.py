@@ -20,6 +20,7 @@ from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.scheduling import Command
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
+from probewise.systems.table import published_covariate
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class Words:
         """Return the name of a covariate in words."""
         if self.covariates is None:
             return name.replace("_", " ")
-        return self.covariates.get(name, name.replace("state:", "state "))
+        own = published_covariate(name)
+        return self.covariates.get(own, own.replace("state:", "state ").replace("column:", "column "))
 
 
 class Apparatus(Protocol):

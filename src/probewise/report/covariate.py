@@ -26,7 +26,8 @@ WORDS = {
 def covariate_words(name: str) -> str:
     """Return a covariate's name in words, without its unit: "battery" for battery_mv."""
     stem, _, suffix = name.rpartition("_")
-    return WORDS.get(name, (stem if stem and suffix in SUFFIXES else name).replace("_", " "))
+    own = stem if stem and suffix in SUFFIXES else name
+    return WORDS.get(name, own.replace("column:", "column ").replace("_", " "))
 
 
 def family_words(family: str) -> str:

@@ -27,11 +27,10 @@ from probewise.systems.forms.proposals_of_columns import INTEGRAL_OVER
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
-from probewise.systems.table import RunRecording, RunTable, relative_sds_of_column
+from probewise.systems.table import RunRecording, RunTable, covariate_of_column, relative_sds_of_column
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
-_NOT_COLUMNS = {"level", "time", "run"}  # where the residual of a formula is visible
 _SOME = 200  # samples used to estimate the scatter of predictions in each row
 
 
@@ -265,7 +264,7 @@ def _columns_of_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[s
     named = {part for name in known_names for part in name.removesuffix(AGAIN).split(":")[1:]}
     in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
     columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
-    return columns & (named | (in_formulas - _NOT_COLUMNS))
+    return columns & named | {name for name in columns if covariate_of_column(name) in in_formulas}
 
 
 def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -19,6 +19,10 @@ from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.table import csv_text, number_text, read_table
 
 _ONE_RUN = "all"
+_OF_COLUMN = "column:"
+# Covariates of a diagnosis that are no columns: of a table, and of a light sensor's recording, which it treats apart.
+_NOT_COLUMNS = frozenset({"time", "row", "run", "level", "previous"})
+_OF_LIGHT_SENSOR = frozenset({"scan", "place", "slope", "direction", "orientation", "edge_distance"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +188,18 @@ class RunRecording(Recording):
             return np.ones(len(self.plan))
         table = cast(RunTable, self.plan)
         return relative_sds_of_column(table, self.sd_column)
+
+
+def covariate_of_column(name: str) -> str:
+    """Return the name of the covariate that a column of a table is: its own, or "column:NAME" if that has a meaning."""
+    taken = name in _NOT_COLUMNS | _OF_LIGHT_SENSOR or name.startswith(("state:", _OF_COLUMN))
+    return f"{_OF_COLUMN}{name}" if taken else name
+
+
+def published_covariate(name: str) -> str:
+    """Return the name of a covariate as results have it: a column's own, unless it is a table's time, run, level ..."""
+    own = name.removeprefix(_OF_COLUMN)
+    return own if own in _OF_LIGHT_SENSOR else name
 
 
 def relative_sds_of_column(table: RunTable, column: str, typical: float | None = None) -> FloatArray:

@@ -33,6 +33,7 @@ from probewise.systems import RunTable, System
 from probewise.systems.forms import ReferenceFit, forms_of
 from probewise.systems.forms.proposals import proposals
 from probewise.systems.forms.stop import MeterStop
+from probewise.systems.table import covariate_of_column
 
 ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     SignalDependentNoise,
@@ -167,7 +168,8 @@ class SimulatorApparatus:
         """Return every covariate by name at each row, (n_points,), for predictions (n_points,); the run is last."""
         table, own = self.about.table, self.system.simulator
         out = {"time" if table.has_varying_time else "row": table.time_s, "level": predicted}
-        out |= {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
+        columns = {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
+        out |= {covariate_of_column(name): v for name, v in columns.items()}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}
         out["previous"] = _differences_within_runs(predicted, table)
         out["run"] = table.scan.astype(np.float64)

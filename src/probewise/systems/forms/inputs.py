@@ -17,7 +17,7 @@ from probewise.systems.forms.form import Act, Form, Say, mean_with_sd
 from probewise.systems.forms.modulations import max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, covariate_of_column
 
 _N_SIZES = 9
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
@@ -50,15 +50,21 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
     table, time = about.table, about.table.time
     for name in driving_columns(about):
-        values = table.covariates[name]
+        values, covariate = table.covariates[name], covariate_of_column(name)
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
         says = partial(_fill_sentence, f"the true {name} is the recorded {name} plus {{}}")
         yield from _linear_form(
-            about, f"input_offset:{name}", _column_changer(name, _column_with_offset), 1e-4 * spread, name, says, name
+            about,
+            f"input_offset:{name}",
+            _column_changer(name, _column_with_offset),
+            1e-4 * spread,
+            name,
+            says,
+            covariate,
         )
         says = partial(_fill_sentence, f"the true {name} is the recorded {name} times (1 + a), a = {{}}")
         yield from _linear_form(
-            about, f"input_gain:{name}", _column_changer(name, _scaled_column), 1e-4, "1", says, name
+            about, f"input_gain:{name}", _column_changer(name, _scaled_column), 1e-4, "1", says, covariate
         )
         yield from _clipped_column_form(about, name, low, high)
         says = partial(_fill_sentence, f"{name} has no effect within {{}} of 0")
@@ -71,7 +77,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
                 high - low,
                 name,
                 says,
-                name,
+                covariate,
             )
         if _moves_both_ways(values, table):
             says = partial(_fill_sentence, f"{name} has {{}} of play")
@@ -84,7 +90,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
                 name,
                 says,
                 "previous",
-                name,
+                covariate,
             )
         yield from _periodic_error_form(about, name)
         if table.has_varying_time:
@@ -100,7 +106,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
                 about.time_unit,
                 says,
                 "previous",
-                name,
+                covariate,
             )
     if time is not None:
         says = partial(_fill_sentence, "the true time is the recorded time times (1 + a), a = {}")
@@ -173,7 +179,7 @@ def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float
             Stage.INPUT,
             {"level": ends.prior},
             (name,),
-            (name,),
+            (covariate_of_column(name),),
             act,
             ends.trial_levels[:, None, None],
             (),
@@ -218,7 +224,7 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         Stage.INPUT,
         marginals,
         (name, name, "rad"),
-        (name,),
+        (covariate_of_column(name),),
         act,
         sine_and_cosine_entries(typical, 1 / frequencies),
         (0,),

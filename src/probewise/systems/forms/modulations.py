@@ -14,7 +14,7 @@ from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_poi
 from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import ChangePoints, mean_with_sd
 from probewise.systems.forms.origins import origin_in_words, time_origin
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_MOMENTS = 512
 _MOST_FREQUENCIES = 1024
@@ -71,7 +71,7 @@ def proportional_to_column(name: str, table: RunTable) -> Modulation:
         entries=_single_entry,
         units=lambda unit: (f"{unit} per {name}",),
         says=lambda what, unit, mean, sd: f"{what} changes by {mean_with_sd(mean[0], sd[0], unit)} per unit of {name}",
-        covariates=(name,),
+        covariates=(covariate_of_column(name),),
     )
 
 

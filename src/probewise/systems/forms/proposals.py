@@ -22,7 +22,7 @@ from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_s
 from probewise.systems.forms.proposals_in_time import proposals_in_time
 from probewise.systems.forms.proposals_of_columns import proposals_of_columns
 from probewise.systems.motion import Motion
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
 _THRESHOLDS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of a state beyond which a term may act
@@ -150,7 +150,7 @@ def _threshold_proposal(about: ReferenceFit, name: str) -> Iterator[Form]:
         Stage.OFFSET,
         {"a": about.amplitude_prior(typical), "at": Uniform(at[0], at[-1])},
         (own.unit, name),
-        (name,),
+        (covariate_of_column(name),),
         act,
         entry,
         (0,),
@@ -201,7 +201,8 @@ def _one_sided_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
 def _rate_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
     states = about.states
     variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if np.ptp(values) > 0]
-    variables += [_scaled_variable(name, values, centred=True) for name, values in _varying_covariates(about).items()]
+    columns = {name: values for name, values in _varying_covariates(about).items() if name not in states}
+    variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
     known: list[FloatArray] = []
     for term in _terms_of_variables(variables):
         if term.text == f"sign({state})":
@@ -231,14 +232,21 @@ def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
     return True
 
 
+def _covariate_of_variable(about: ReferenceFit, side: str, name: str) -> str:
+    """Return the name of the covariate that a variable of a term is."""
+    reading = about.system.simulator.reading
+    if name in about.states and (side == "rate" or name == reading):
+        return f"state:{name}"
+    return "level" if name == reading else "time" if name == about.table.time else covariate_of_column(name)
+
+
 def _term_proposal(about: ReferenceFit, side: str, target: str, stage: Stage, act: Act, term: _Term) -> Iterator[Form]:
     guess = about.sd if stage is Stage.OFFSET else 1e-6
     typical = about.typical_amplitude(stage, act, np.full((1, 1, 1), guess), guess)
     if typical is None or not np.isfinite(typical):
         return
     where = tuple(
-        f"state:{c}" if c in about.states else "level" if c == about.system.simulator.reading else c
-        for c in dict.fromkeys(variable.name for variable in term.variables)
+        _covariate_of_variable(about, side, c) for c in dict.fromkeys(variable.name for variable in term.variables)
     )
     text = f"a {term.text}"
     what = target if side == "reading" else f"the rate of {target}"

@@ -13,7 +13,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Form, mean_with_sd
 from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, covariate_of_column
 
 INTEGRAL_OVER = "integral over"
 """How the name of a formula says that it depends on earlier times of the run: a dose."""
@@ -54,7 +54,7 @@ def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArr
         Stage.OFFSET,
         dict.fromkeys("abc", about.amplitude_prior(typical)),
         (own.unit,) * 3,
-        (name, "level"),
+        (covariate_of_column(name), "level"),
         act,
         typical * entries,
         (0, 1, 2),
@@ -103,7 +103,7 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
             Stage.OFFSET,
             {"a": about.amplitude_prior(typical), "d": saturating},
             (own.unit, ""),
-            (name, "time", "run"),
+            (covariate_of_column(name), "time", "run"),
             act,
             single_column_bank(typical, tried),
             (0,),

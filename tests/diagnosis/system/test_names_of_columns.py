@@ -1,0 +1,85 @@
+"""A column may have any name, also that of a covariate that is no column: each keeps its own values."""
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import diagnose_system
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.verdict_report.document import diagnosis_json
+from probewise.systems import Law, Simulator, table_for
+from probewise.systems.forms import forms_of
+from probewise.systems.forms.proposals import proposals
+from probewise.systems.table import covariate_of_column, published_covariate
+
+_N = 60
+_T = 0.5 * np.arange(_N)
+_RNG = np.random.default_rng(8)
+_X = _RNG.normal(size=_N)
+_OWN = {name: _RNG.normal(size=_N) for name in ("level", "time", "run", "previous", "scan", "state:s", "room_c")}
+
+
+def _prepared(more, **options):
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"], time="t_s", **options)
+    y = 1.0 + _X + 0.1 * np.random.default_rng(9).normal(size=_N)
+    return prepare_system(simulator, table_for(simulator, {"t_s": _T, "x": _X, **more, "y": y}))
+
+
+def test_covariates_that_are_no_columns_keep_their_values_beside_columns_of_that_name():
+    prepared = _prepared({**_OWN, "days": np.repeat([1.0, 2.0], _N // 2)}, run="days")
+    predicted = np.linspace(0.0, 1.0, _N) ** 2
+    found = prepared.apparatus.covariates_by_row(predicted)
+    np.testing.assert_array_equal(found["level"], predicted)
+    np.testing.assert_array_equal(found["time"], _T)
+    np.testing.assert_array_equal(found["run"], np.repeat([0.0, 1.0], _N // 2))
+    np.testing.assert_allclose(found["previous"][1 : _N // 2], np.diff(predicted)[: _N // 2 - 1])
+    for name, values in _OWN.items():
+        np.testing.assert_array_equal(found[covariate_of_column(name)], values)
+    assert covariate_of_column("room_c") == "room_c"
+
+
+@pytest.mark.parametrize("name", ["level", "time", "run", "previous", "scan", "state:s", "room_c"])
+def test_every_effect_of_a_column_shows_in_it(name):
+    about = _prepared({name: _OWN[name]}).apparatus.about
+    known = set(_prepared({name: _OWN[name]}).apparatus.covariates_by_row(about.predicted))
+    for form in (forms_of(about)[f"sensitivity:{name}"], *(p for p in proposals(about) if name in p.name)):
+        assert covariate_of_column(name) in form.covariates or "time" in form.covariates
+        assert set(form.covariates) <= known
+
+
+def test_a_formula_of_time_shows_in_time():
+    about = _prepared({}).apparatus.about
+    (square,) = (
+        form for form in proposals(about) if form.expression.startswith("a (t_s - ") and "^2" in form.name[-3:]
+    )
+    assert square.covariates == ("time",)
+
+
+def test_results_name_a_column_as_it_is_unless_that_means_something_else():
+    assert published_covariate(covariate_of_column("scan")) == "scan"
+    assert published_covariate(covariate_of_column("level")) == "column:level"
+    assert published_covariate("level") == "level"
+    words = _prepared({}).apparatus.words
+    assert words.covariate_in_words("level") == "predicted y"
+    assert words.covariate_in_words("column:level") == "column level"
+    assert words.covariate_in_words("column:slope") == "slope"
+    assert words.covariate_in_words("state:s") == "state s"
+
+
+def test_a_column_with_the_name_of_a_state_is_no_second_variable_of_that_name():
+    law = Law({"s": 0.5}, lambda s, p, u: {"s": -p["a"] * s["s"]})
+    simulator = Simulator("y", "V", {"a": (0.01, 1)}, law=law, time="t_s")
+    y = 0.5 * np.exp(-0.1 * _T) + 0.001 * _X
+    about = prepare_system(simulator, table_for(simulator, {"t_s": _T, "s": 3.0 + _X, "y": y})).apparatus.about
+    of_rate = [form for form in proposals(about) if form.name.startswith("formula:rate")]
+    assert of_rate
+    assert all(set(form.covariates) <= {"state:s", "time"} for form in of_rate)
+
+
+@pytest.mark.slow
+def test_a_reading_that_depends_on_a_column_called_scan_is_found_in_it():
+    """Before, the column was taken for numbers of scans, and the diagnosis ended in an IndexError."""
+    scan = _RNG.normal(20, 2, _N)
+    y = 1.0 + _X + 0.2 * (scan - 20) + 0.1 * _RNG.normal(size=_N)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"], time="t_s")
+    found = diagnose_system(simulator, {"t_s": _T, "x": _X, "scan": scan, "y": y}, rng=np.random.default_rng(1))
+    assert diagnosis_json(found)["where"][0]["covariate"] == "scan"

@@ -41,7 +41,8 @@ def family_words(family: str) -> str:
 def covariate_unit(name: str, unit: str) -> str:
     """Return the unit of a covariate, "" if none is known; `unit` is the readings' unit."""
     known = {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}
-    return known.get(name, SUFFIXES.get(name.rpartition("_")[2], ""))
+    stem, _, suffix = name.rpartition("_")
+    return known.get(name, SUFFIXES.get(suffix, "") if stem else "")
 
 
 def covariate_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:

@@ -55,3 +55,21 @@ def test_a_walk_goes_on_from_run_to_run():
 
 def test_rounding_is_declared():
     assert _noise("quantised").step == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("name", ["random_walk", "signal_dependent_noise", "noise_per_run"])
+def test_the_size_of_a_noise_is_that_which_was_asked_for_or_what_its_largest_strength_has(name):
+    """At the limit of its strength, more makes no difference, and the recorded size is the same."""
+    assert _noise(name, wanted=6.0).size_lambda == 6.0
+    most, more = _noise(name, wanted=500.0), _noise(name, wanted=1000.0)
+    assert most.parameters == more.parameters
+    assert most.size_lambda == more.size_lambda
+    assert 6.0 < most.size_lambda < 500.0
+
+
+def test_the_recorded_size_of_noise_per_run_at_its_limit_is_its_mean_gain():
+    """Closed form: n ln(mean variance) - sum ln(variance) is lambda squared."""
+    noise = _noise("noise_per_run", wanted=1000.0)
+    variances = np.array(noise.parameters["values"])[DRAWN.diagnosed_table.run] ** 2
+    gain = len(variances) * np.log(variances.mean()) - np.log(variances).sum()
+    assert noise.size_lambda == pytest.approx(np.sqrt(gain))

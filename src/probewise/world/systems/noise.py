@@ -54,7 +54,7 @@ class SystemNoise:
 def noise_of_size(
     name: str, wanted: float, readings: FloatArray, rows: SystemTable, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
-    """Return a noise, as detectable as an effect of size `wanted` if its strength can be chosen.
+    """Return a noise, as detectable as an effect of size `wanted` if its strength can be chosen and is within its limit.
 
     The strengths of "white", "outliers", "dropouts", "t4" and "quantised" are fixed.
     """
@@ -68,30 +68,30 @@ def noise_of_size(
             return SystemNoise(name, lambda y, rows, rng: y + sd * _ar1_noise(rows, rho, rng), {"rho": rho}, wanted)
         case "random_walk":
             spectrum = _walk_covariance_eigenvalues(len(rows))
-            q = _strength_with_size(lambda a: _lambda_of_variances(1 + a**2 * spectrum), wanted, 1e-4, 1.0)
+            q, size = _strength_and_size(lambda a: _lambda_of_variances(1 + a**2 * spectrum), wanted, 1e-4, 1.0)
             return SystemNoise(
                 name,
                 lambda y, rows, rng: (
                     y + sd * (rng.standard_normal(len(y)) + q * np.cumsum(rng.standard_normal(len(y))))
                 ),
                 {"sd_per_row": q * sd},
-                wanted,
+                size,
             )
         case "signal_dependent_noise":
             share = (readings - readings.min()) / np.ptp(readings)
             low, span = float(readings.min()), float(np.ptp(readings))
-            ratio = _strength_with_size(lambda a: _lambda_of_variances(1 + a * share), wanted, 1e-3, 1e4)
+            ratio, size = _strength_and_size(lambda a: _lambda_of_variances(1 + a * share), wanted, 1e-3, 1e4)
             return SystemNoise(
                 name,
                 lambda y, rows, rng: (
                     y + sd * np.sqrt(1 + ratio * np.clip((y - low) / span, 0, None)) * rng.standard_normal(len(y))
                 ),
                 {"ratio": ratio},
-                wanted,
+                size,
             )
         case "noise_per_run":
             logs = rng.standard_normal(whole)
-            power = _strength_with_size(
+            power, size = _strength_and_size(
                 lambda a: _lambda_of_variances(np.exp(2 * a * logs)[rows.run]), wanted, 1e-2, 3.0
             )
             own = np.exp(power * logs)
@@ -99,7 +99,7 @@ def noise_of_size(
                 name,
                 lambda y, rows, rng: y + sd * own[rows.run] * rng.standard_normal(len(y)),
                 {"values": (sd * own).tolist()},
-                wanted,
+                size,
             )
         case "outliers":
             return SystemNoise(
@@ -150,11 +150,13 @@ def _lambda_of_variances(variances: FloatArray) -> float:
     return math.sqrt(max(n * math.log(variances.mean()) - float(np.log(variances).sum()), 0.0))
 
 
-def _strength_with_size(size: Callable[[float], float], wanted: float, low: float, high: float) -> float:
-    """Return the strength at which a size has the requested value, or the largest if it stays below."""
-    if size(high) <= wanted:
-        return high
-    return float(np.exp(brentq(lambda a: size(math.exp(a)) - wanted, math.log(low), math.log(high), xtol=1e-4)))
+def _strength_and_size(size: Callable[[float], float], wanted: float, low: float, high: float) -> tuple[float, float]:
+    """Return the strength of a requested size, and that size; or the largest strength and its size, if that is less."""
+    largest = size(high)
+    if largest <= wanted:
+        return high, largest
+    strength = float(np.exp(brentq(lambda a: size(math.exp(a)) - wanted, math.log(low), math.log(high), xtol=1e-4)))
+    return strength, wanted
 
 
 def _nearest_preferred_number(value: float) -> float:

@@ -23,7 +23,6 @@ from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
-from probewise.systems.forms.proposals_of_columns import INTEGRAL_OVER
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
@@ -221,10 +220,10 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
     """
     forms: Mapping[str, Any] = {}
     if fitted.known is not None:
-        if any(_asks_for_earlier_times(name) for name in fitted.effects):
-            table.require_rising_time()
         new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
         forms = rebind_forms(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
+        if any(form.needs_rising_time for form in forms.values()):
+            table.require_rising_time()
         lacking = _columns_of_effects(fitted, forms) - set(table.covariates)
         if lacking:
             name = min(lacking)
@@ -248,13 +247,6 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
         else:
             raise ParameterError("effects", name, "an effect that this version can bind again; diagnose anew with it")
     return cast(list[NamedEffect[Any]], out)
-
-
-def _asks_for_earlier_times(effect: str) -> bool:
-    """Return whether an effect depends on what was at earlier times of the run: lag, delays, and doses."""
-    if effect.startswith(PROPOSAL):
-        return INTEGRAL_OVER in effect
-    return effect.partition(":")[0] in ("lag", "delay", "input_delay")
 
 
 def _columns_of_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:

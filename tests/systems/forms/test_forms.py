@@ -349,3 +349,17 @@ def test_a_term_on_one_side_acts_beyond_its_threshold_alone():
     found = _read(form.name, -0.5, 2.0, about=about, forms={form.name: form})
     beyond = np.maximum(_T - 2.0, 0.0)
     np.testing.assert_allclose(found, np.minimum(_T, 2.0) + (1 - np.exp(-0.5 * beyond)) / 0.5, atol=1e-3)
+
+
+def test_a_form_that_looks_back_to_earlier_times_says_so():
+    """Route two: the time of one row is moved, and other rows change if and only if a form looks back."""
+    moved = _T.copy()
+    moved[10] += 0.05
+    later, others = TABLE.with_columns({"t_s": moved}), np.arange(N_ROWS) != 10
+    for form in (*FORMS.values(), *proposals(ABOUT)):
+        theta = np.concatenate([ABOUT.theta[0], form.bank()[len(form.bank()) // 2, 0]])[None, :]
+        chain = ABOUT.system.chain(TABLE, [form])
+        change = (chain.predict(theta, later) - chain.predict(theta, TABLE))[0]
+        assert form.needs_rising_time == bool(np.any(change[others] != 0)), form.name
+    named = {name.partition(":")[0] for name, form in FORMS.items() if form.needs_rising_time}
+    assert named == {"lag", "delay", "input_delay"}

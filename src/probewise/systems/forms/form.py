@@ -87,6 +87,8 @@ class Form:
         Mutually exclusive variants of this form, with other priors and entries; this form itself is another variant.
     fixed
         Names of parameters that are zero in this one of several alternatives; reports leave them out.
+    needs_rising_time
+        Whether it looks back to earlier times of a run, which time must then not fall within.
     """
 
     name: str
@@ -104,6 +106,7 @@ class Form:
     expression: str = ""
     alternatives: tuple[Form, ...] = ()
     fixed: tuple[str, ...] = ()
+    needs_rising_time: bool = False
 
     @cached_property
     def prior(self) -> Product:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -95,7 +96,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
         yield from _periodic_error_form(about, name)
         if table.has_varying_time:
             says = partial(_fill_sentence, f"{name} acts with a delay of {{}} {about.time_unit}")
-            yield from _log_uniform_form(
+            for form in _log_uniform_form(
                 about,
                 f"input_delay:{name}",
                 "tau_s",
@@ -107,7 +108,8 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
                 says,
                 "previous",
                 covariate,
-            )
+            ):
+                yield replace(form, needs_rising_time=True)
     if time is not None:
         says = partial(_fill_sentence, "the true time is the recorded time times (1 + a), a = {}")
         clock = _column_changer(time, _clock_at_rate(time_origin(table)))

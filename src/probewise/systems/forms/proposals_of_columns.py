@@ -15,9 +15,6 @@ from probewise.systems.forms.form import Form, mean_with_sd
 from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
 from probewise.systems.table import RunTable, covariate_of_column
 
-INTEGRAL_OVER = "integral over"
-"""How the name of a formula says that it depends on earlier times of the run: a dose."""
-
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
@@ -78,7 +75,7 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
     }
     if values.min() >= 0 or values.max() <= 0:
         each[f"|{name}|"] = np.abs
-    summed = f"{INTEGRAL_OVER} {table.time}" if table.has_varying_time else "sum over rows"
+    summed = f"integral over {table.time}" if table.has_varying_time else "sum over rows"
     for what, rate in each.items():
 
         def dose_at_rows(rows: RunTable, rate: Callable[[FloatArray], FloatArray] = rate) -> FloatArray:
@@ -113,6 +110,7 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
                 "not a known effect"
             ),
             expression=f"a ({text.split(',')[0]}),{text.split(',', 1)[1]}",
+            needs_rising_time=table.has_varying_time,
         )
 
 

@@ -173,6 +173,7 @@ def _lag_form(about: ReferenceFit) -> Iterator[Form]:
                 f"{mean_with_sd(mean[0], sd[0], time_unit)}"
             ),
             absent={0: 0.0},
+            needs_rising_time=True,
         )
 
 
@@ -193,6 +194,7 @@ def _delay_form(about: ReferenceFit) -> Iterator[Form]:
                 f"{about.system.simulator.reading} is delayed by {mean_with_sd(mean[0], sd[0], time_unit)}"
             ),
             absent={0: 0.0},
+            needs_rising_time=True,
         )
 
 

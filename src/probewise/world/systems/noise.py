@@ -54,7 +54,7 @@ class SystemNoise:
 def noise_of_size(
     name: str, wanted: float, readings: FloatArray, rows: SystemTable, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
-    """Return a noise, as detectable as an effect of size `wanted` if its strength can be chosen and is within its limit.
+    """Return a noise, as detectable as an effect of size `wanted` as far as its strength can be chosen.
 
     The strengths of "white", "outliers", "dropouts", "t4" and "quantised" are fixed.
     """

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from heater import SIMULATOR, fitted, runs
+from heater import ABOUT, SIMULATOR, fitted, runs
 
 from probewise.diagnosis.system.commands import in_sequence, possible_run_commands
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system, write_system_prediction
+from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system, write_system_prediction
 from probewise.systems.forms import ReferenceFit, forms_of
 from probewise.systems.forms.rebinding import Recorded, extract_recorded
 
@@ -188,3 +188,62 @@ def test_a_run_that_could_be_recorded_next_comes_after_the_step_at_a_row():
     commands = possible_run_commands(table, "y", ("x",), "s")
     assert {command.table.first_row for command in commands} == {40}
     assert in_sequence(commands[:2], table).row_number[0] == 40
+
+
+def _with_missing_power(table, *rows):
+    power = table.columns["power_w"].copy()
+    power[list(rows)] = np.nan
+    return table.with_columns({"power_w": power})
+
+
+@pytest.mark.parametrize("effect", ["lag", "delay", "hysteresis", "backlash:power_w", "input_delay:power_w"])
+def test_an_effect_with_a_memory_goes_on_after_a_row_that_lacks_an_input(effect):
+    """The power is on a straight line there, so that all other rows are as if it were there."""
+    table = runs().with_columns({"power_w": np.tile([1.0, 2, 3, 4, 5, 6, 7, 6, 5, 4, 3, 2], 3)})
+    about = dataclasses.replace(ABOUT, table=table)
+    form = forms_of(about)[effect]
+    model = fitted()
+    names = (*model.names, *(f"{effect}.{name}" for name in form.prior.names))
+    setting = np.tile(form.bank()[0, 0], (500, 1))
+    model = dataclasses.replace(
+        model,
+        names=names,
+        samples=np.concatenate([model.samples, setting], axis=1),
+        effects=(effect,),
+        known=extract_recorded(about),
+    )
+    whole = predicted(model, table).mean
+    with pytest.warns(DoubtfulResultWarning, match=r"1 rows .* first row 5"):
+        found = predicted(model, _with_missing_power(table, 3))
+    assert np.flatnonzero(np.isnan(found.mean)).tolist() == [3]
+    others = np.arange(len(table)) != 3
+    np.testing.assert_allclose(found.mean[others], whole[others], rtol=1e-12)
+    assert np.isfinite(found.log_density[others]).all()
+    assert np.isnan(found.table.columns["power_w"][3])
+
+
+def test_a_law_has_no_prediction_from_a_missing_input_to_the_end_of_its_run():
+    """Its state is not known there; the other run is predicted."""
+    law = Law({"temp_c": "start_c"}, lambda s, p, u: {"temp_c": p["gain"] * u["power_w"] - s["temp_c"] / p["tau_s"]})
+    simulator = dataclasses.replace(SIMULATOR, simulate=None, law=law)
+    model = dataclasses.replace(fitted(), simulator=simulator)
+    with pytest.warns(DoubtfulResultWarning):
+        found = predicted(model, _with_missing_power(runs(), 3))
+    assert np.flatnonzero(np.isnan(found.mean)).tolist() == list(range(3, 12))
+
+
+def test_a_missing_number_that_nothing_needs_is_no_matter():
+    table = runs()
+    room = table.columns["room_c"].copy()
+    room[:5] = np.nan
+    found = predicted(fitted(("lag",)), table.with_columns({"room_c": room}))
+    np.testing.assert_array_equal(found.mean, predicted(fitted(("lag",)), table).mean)
+
+
+def test_a_table_of_which_no_row_has_what_it_needs_is_refused():
+    table = runs((20.0,), names="1", n=4)
+    law = Law({"temp_c": "start_c"}, lambda s, p, u: {"temp_c": p["gain"] * u["power_w"] - s["temp_c"] / p["tau_s"]})
+    observed = dataclasses.replace(law, observe=lambda s, p, u: s["temp_c"] + 0.0 * u["power_w"])
+    model = dataclasses.replace(fitted(), simulator=dataclasses.replace(SIMULATOR, simulate=None, law=observed))
+    with pytest.raises(ParameterError, match=r"'power_w' is .*no number in row 2"):
+        predicted(model, _with_missing_power(table, 0))

@@ -110,7 +110,9 @@ def predict_system(
     run: a `per_run` parameter from its prior; an effect's value per run from a Student-t about the sample's values for
     the recorded runs, with their scatter as its width, and one degree of freedom more than there are runs. Where no
     time was recorded, a step at a row (`at_row`) counts the rows of the recording: those of a table that does not begin
-    with the recording's rows, readings included, come after its end.
+    with the recording's rows, readings included, come after its end. A row that lacks a number which the simulator or
+    an effect needs has no prediction (NaN), and with a law the rows after it in the run neither; effects that look back
+    to it, such as a lag, take the number interpolated within the run.
 
     Parameters
     ----------
@@ -127,29 +129,30 @@ def predict_system(
     Raises
     ------
     ParameterError
-        If a column is missing, or the simulator gives finite readings for no sample.
+        If a column is missing, no row has the numbers that it needs, or the simulator gives finite readings for no
+        sample.
 
     Warns
     -----
     DoubtfulResultWarning
-        If the simulator gives no finite readings for some samples.
+        If the simulator gives no finite readings for some samples, or some rows lack a number that they need.
     """
     require_fitted_system(fitted)
     require_rng(rng)
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = replace(cast(RunTable, recording.plan), first_row=_number_of_first_row(fitted, recording))
-    system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
+    system = replace(System.of(fitted.simulator, _interpolated(fitted.simulator, own)), max_step=fitted.max_step)
     chain = system.chain(own, bind_effects(fitted, own))
     theta, is_drawn = _samples_for_chain(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
-    lost = _unpredictable_mask(chain, theta, own)
+    given, lost = _table_without_gaps(chain, theta, own)
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed = 0
-    between = _kernel_width(chain, theta, own) if is_drawn else None
+    between = _kernel_width(chain, theta, given) if is_drawn else None
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
-        mean = np.where(lost, 0.0, chain.predict(block, own))
+        mean = np.where(lost, 0.0, chain.predict(block, given))
         there = np.isfinite(mean).all(axis=1)
         n_failed += int((~there).sum())
         if there.any():
@@ -171,7 +174,8 @@ def predict_system(
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
         warnings.warn(
-            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a column is missing",
+            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a number that they need "
+            "is missing; where an effect looks back to it, it is interpolated",
             DoubtfulResultWarning,
             stacklevel=2,
         )
@@ -198,15 +202,49 @@ def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
     return 0
 
 
-def _unpredictable_mask(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
-    """Return the mask of the rows that cannot be predicted because a value is missing, (n_points,)."""
-    missing = (
-        np.any([~np.isfinite(values) for values in table.covariates.values()], axis=0) if table.covariates else False
-    )
-    if not np.any(missing):
-        return np.zeros(len(table), dtype=np.bool_)
-    there = np.isfinite(chain.predict(theta[:_FEW], table))
-    return np.asarray(~there.any(axis=0) if there.any() else np.zeros(len(table), dtype=np.bool_))
+def _table_without_gaps(chain: SystemChain, theta: FloatArray, table: RunTable) -> tuple[RunTable, BoolArray]:
+    """Interpolate the missing cells that predictions need, and find the rows that cannot be predicted without them.
+
+    Returns
+    -------
+    The table with these cells interpolated within runs, for effects with a memory in the rows after, and the mask of
+    the rows without a prediction, (n_points,): those that lack a cell which the simulator or an effect needs, and those
+    for which the simulator alone gives none, as a law from there to the end of the run.
+
+    Raises
+    ------
+    ParameterError
+        If no row can be predicted.
+    """
+    few, lost = theta[:_FEW], np.zeros(len(table), dtype=np.bool_)
+    lacking = _inputs_with_gaps(chain.system.simulator, table)
+    whole = _interpolated(chain.system.simulator, table)
+    if not lacking or not np.isfinite(chain.predict(few, whole)).any():
+        return table, lost
+    bare, needed = chain.system.chain(table, ()), []
+    for name, values in lacking.items():
+        alone = whole.with_columns({name: values})
+        if np.isfinite(chain.predict(few, alone)).any(axis=0).all():
+            continue
+        needed.append(name)
+        lost |= ~np.isfinite(values)
+        lost |= ~np.isfinite(bare.predict(few[:, : chain.system.n_params], alone)).any(axis=0)
+    if lost.all():
+        row = int(np.argmax(~np.isfinite(lacking[needed[0]]))) + 2
+        raise ParameterError(f"column {needed[0]!r}", f"no number in row {row}", "a number where a prediction needs it")
+    return table.with_columns({name: whole.covariates[name] for name in needed}), lost
+
+
+def _interpolated(simulator: Simulator, table: RunTable) -> RunTable:
+    """Return a table with all missing cells of its inputs interpolated within runs."""
+    lacking = _inputs_with_gaps(simulator, table)
+    return table.with_columns({name: table.interpolated_within_runs(values) for name, values in lacking.items()})
+
+
+def _inputs_with_gaps(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
+    """Return the columns of numbers, except readings and their sd, in which cells are missing."""
+    columns = {k: v for k, v in table.covariates.items() if k not in (simulator.reading, simulator.noise.sd)}
+    return {name: values for name, values in columns.items() if not np.isfinite(values).all()}
 
 
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:

@@ -174,7 +174,7 @@ def predict_system(
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
         warnings.warn(
-            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a number that they need "
+            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a number they need "
             "is missing; where an effect looks back to it, it is interpolated",
             DoubtfulResultWarning,
             stacklevel=2,

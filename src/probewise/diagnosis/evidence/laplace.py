@@ -108,11 +108,11 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under Gaussian noise models, (n_laws,); `joined`: slopes and residual."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_points for law in laws])
-    if any(law.walk.size for law in laws):
+    if any(law.walk.size or law.before.size for law in laws):
         turned = np.stack([law(joined) for law in laws])
     else:
         turned = joined * np.stack([law.kept / law.sd for law in laws])[:, :, None]
-    if any(law.carry.any() for law in laws) and not any(law.walk.size for law in laws):
+    if any(law.carry.any() for law in laws) and not any(law.walk.size or law.before.size for law in laws):
         carry = np.stack([law.carry for law in laws])[:, 1:, None]
         turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
     gram = turned.transpose(0, 2, 1) @ turned

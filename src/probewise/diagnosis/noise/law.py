@@ -23,15 +23,31 @@ _EM_STEPS = 12
 _LEAST = 1e-150  # least scale, for readings that are exactly as predicted
 
 
-def n_rows_since_previous_usable(recording: Recording) -> IntArray:
-    """Return the number of rows back to the previous usable reading of the same scan, 0 if there is none.
+def order_by_scan(recording: Recording) -> IntArray:
+    """Return the numbers of the usable readings, those of each scan together, in their order, (n_usable,)."""
+    return np.argsort(recording.plan.scan[recording.usable], kind="stable")
 
-    Shape (n_usable,): neighbours of a missing reading are two steps apart.
+
+def previous_usable(recording: Recording) -> IntArray:
+    """Return the number of the usable reading before each in its scan, -1 for the first of a scan, (n_usable,)."""
+    order = order_by_scan(recording)
+    same = np.diff(recording.plan.scan[recording.usable][order], prepend=-1) == 0
+    out = np.full(len(order), -1)
+    out[order[same]] = order[np.flatnonzero(same) - 1]
+    return out
+
+
+def n_rows_since_previous_usable(recording: Recording) -> IntArray:
+    """Return the number of rows of the scan back to its previous usable reading, 0 if there is none.
+
+    Shape (n_usable,): neighbours of a missing reading are two steps apart. Rows of other scans in between do not count.
     """
-    rows = np.flatnonzero(recording.usable)
-    steps = np.diff(rows, prepend=rows[:1])
-    same = np.diff(recording.plan.scan[rows], prepend=-1) == 0
-    return np.where(same, steps, 0).astype(np.int64)
+    scan = recording.plan.scan
+    order = np.argsort(scan, kind="stable")
+    place = np.empty(len(scan), dtype=np.int64)
+    place[order] = np.arange(len(scan))
+    own, before = place[recording.usable], previous_usable(recording)
+    return np.where(before >= 0, own - own[before], 0).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +76,9 @@ class NoiseLaw:
     walk
         Increments in variance of a random walk of the offset from row to row, also between runs, relative to the
         overall variance, (n_points,); empty without one. Then there is no other correlation.
+    before
+        Number of the reading with which each has the correlation `carry`, (n_points,); of any use where that is not 0.
+        Empty where it is the one above, as it is unless the rows of scans are interleaved.
     """
 
     sd: FloatArray
@@ -72,6 +91,7 @@ class NoiseLaw:
     sigma: float = 1.0
     least: float = 0.0
     walk: FloatArray = field(default_factory=lambda: np.zeros(0))
+    before: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
 
     def __post_init__(self) -> None:
@@ -85,13 +105,15 @@ class NoiseLaw:
     @property
     def whitening_key(self) -> tuple[bytes, ...]:
         """Key of the whitening: distributions with the same key differ only in their tails."""
-        return self.sd.tobytes(), self.carry.tobytes(), self.lost.tobytes(), self.walk.tobytes()
+        arrays = self.sd, self.carry, self.lost, self.walk, self.before
+        return tuple(values.tobytes() for values in arrays)
 
     def is_practically_equal(self, other: NoiseLaw) -> bool:
         """Return whether another distribution is practically the same."""
         return (
             (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
             and np.array_equal(self.lost, other.lost)
+            and np.array_equal(self.before, other.before)
             and np.allclose(self.sd, other.sd, rtol=0.03)
             and np.allclose(self.carry, other.carry, atol=0.03)
             and self.walk.shape == other.walk.shape
@@ -114,7 +136,11 @@ class NoiseLaw:
         A reading then has its correlation with the one taken before it.
         """
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
-        return replace(self, sd=self.sd[rows], carry=self.carry[rows], lost=self.lost[rows], walk=walk)
+        carry, before = self.carry[rows], self.before
+        if before.size:
+            above = _nearest_kept_before(before, rows)
+            carry, before = np.where(above >= 0, carry, 0.0), np.maximum(above, 0)
+        return replace(self, sd=self.sd[rows], carry=carry, lost=self.lost[rows], walk=walk, before=before)
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Whiten columns, shape (n_points,) or (n_points, n_columns); rows of lost readings become 0."""
@@ -124,7 +150,10 @@ class NoiseLaw:
             y = self._whiten_with_walk(y)
             return y[:, 0] if flat else y
         y = y * (self.kept / self.sd)[:, None]
-        if np.any(self.carry):
+        if self.before.size:
+            carry = self.carry[:, None]
+            y = (y - carry * y[self.before]) / np.sqrt(1 - carry**2)
+        elif np.any(self.carry):
             carry = self.carry[1:, None]
             innovation = np.empty_like(y)
             innovation[0] = y[0]
@@ -229,6 +258,15 @@ class NoiseLaw:
                 eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
             eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.information)
         return eps * self.kept[:, None]
+
+
+def _nearest_kept_before(before: IntArray, kept: BoolArray) -> IntArray:
+    """Return for each kept reading the nearest kept one that `before` leads to, (n_kept,), -1 for none."""
+    number, nearest = np.cumsum(kept) - 1, np.full(len(before), -1)
+    for k, above in enumerate(before.tolist()):  # a reading comes after the one before it
+        if 0 <= above < k:
+            nearest[k] = number[above] if kept[above] else nearest[above]
+    return nearest[kept]
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +383,9 @@ def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> Noi
     return replace(white_noise(int(recording.usable.sum()), least=least), sd=recording.relative_sd[recording.usable])
 
 
-def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) -> FloatArray:
+def noise_statistics(
+    residuals: FloatArray, steps: IntArray, level: FloatArray, *, before: IntArray | None = None
+) -> FloatArray:
     """Return statistics that vanish for white normal noise, shape (3, n_draws).
 
     Parameters
@@ -356,6 +396,8 @@ def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) 
         Rows back to the previous reading of the scan, 0 for none, shape (n_points,).
     level
         Predicted readings, shape (n_points,).
+    before
+        Number of the previous reading of the scan, shape (n_points,); None where it is the one above.
 
     Returns
     -------
@@ -363,7 +405,8 @@ def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) 
     """
     r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
     neighbours = np.flatnonzero(steps == 1)
-    lag_1 = (r[neighbours] * r[neighbours - 1]).mean(axis=0) if neighbours.size else np.zeros(r.shape[1])
+    above = neighbours - 1 if before is None else before[neighbours]
+    lag_1 = (r[neighbours] * r[above]).mean(axis=0) if neighbours.size else np.zeros(r.shape[1])
     kurtosis = (r**4).mean(axis=0) - 3
     tilt = level - level.mean()
     tilt = tilt / max(float(np.linalg.norm(tilt)), 1e-300)

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable
+from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable, order_by_scan, previous_usable
 from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
@@ -140,7 +140,8 @@ class NoiseModel:
             0.0,
         )
         carry[lost] = 0.0
-        carry[1:][lost[:-1]] = 0.0
+        above = self._previous_in_scan
+        carry[(above >= 0) & lost[above]] = 0.0
         walk = (
             value_at_node(noise.walk) ** 2 * self._n_rows_since_previous_in_table if np.any(noise.walk) else np.zeros(0)
         )
@@ -163,7 +164,20 @@ class NoiseModel:
             log_extra,
             least=self.least_sd,
             walk=walk,
+            before=np.maximum(above, 0)
+            if self._has_interleaved_scans and np.any(carry)
+            else np.zeros(0, dtype=np.int64),
         )
+
+    @cached_property
+    def _previous_in_scan(self) -> IntArray:
+        """Number of the usable reading before each in its scan, -1 for its first, (n_usable,)."""
+        return previous_usable(self.recording)
+
+    @cached_property
+    def _has_interleaved_scans(self) -> bool:
+        above = self._previous_in_scan
+        return bool(np.any((above >= 0) & (above != np.arange(len(above)) - 1)))
 
     @cached_property
     def _usable_readings(self) -> FloatArray:
@@ -254,7 +268,8 @@ def rough_sd(recording: Recording) -> float:
     The estimate includes rounding; equal readings are spread over a step, so that the median is not one of few values.
     It is 0 if no three usable readings are successive.
     """
-    readings, steps = recording.readings[recording.usable], n_rows_since_previous_usable(recording)
+    order = order_by_scan(recording)
+    readings, steps = recording.readings[recording.usable][order], n_rows_since_previous_usable(recording)[order]
     inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1
     bends = np.sort(readings[inner - 1] - 2 * readings[inner] + readings[inner + 1])
     step = lattice_step(readings)

@@ -42,7 +42,11 @@ class _BasisMultipliers:
 
 
 def bank_of_unknown_effects(
-    covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, starts: IntArray
+    covariates: Sequence[Covariate],
+    signal: FloatArray,
+    slope: FloatArray,
+    starts: IntArray,
+    order: IntArray | None = None,
 ) -> TemplateBank:
     """Build the template bank of unknown effects: basis functions over every covariate.
 
@@ -53,7 +57,9 @@ def bank_of_unknown_effects(
     signal, slope
         Predicted reading above its minimum, and its slope along the motion, (n_usable,) each.
     starts
-        Index of the first usable row of each scan, (n_scans,).
+        Index of the first usable row of each scan, (n_scans,), in the order below.
+    order
+        Usable rows with those of each scan together, (n_usable,); None where they are.
 
     Returns
     -------
@@ -70,8 +76,10 @@ def bank_of_unknown_effects(
         for covariate in covariates
         for template in _bases_of_covariate(covariate, ways)
     ]
-    found += [("what was seen before", template) for template in _memory_bases(signal, starts)]
-    found += [("ends of scans", template) for template in _end_transients(len(signal), starts)]
+    by_scan = signal if order is None else signal[order]
+    along = [("what was seen before", template) for template in _memory_bases(by_scan, starts)]
+    along += [("ends of scans", template) for template in _end_transients(len(signal), starts)]
+    found += along if order is None else [(name, template[np.argsort(order)]) for name, template in along]
     kept = [(name, template) for name, template in found if np.any(template)]
     return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 

@@ -13,7 +13,7 @@ from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.fitting.fit import fit
 from probewise.diagnosis.judgement.judged import Hypothesis
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.noise.law import n_rows_since_previous_usable, noise_statistics
+from probewise.diagnosis.noise.law import n_rows_since_previous_usable, noise_statistics, previous_usable
 from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
@@ -194,10 +194,10 @@ def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, 
     That is autocorrelation, heavy tails, or a spread that depends on the level.
     """
     prepared, after = searched.prepared, best.problem
-    steps = n_rows_since_previous_usable(prepared.recording)
+    steps, before = n_rows_since_previous_usable(prepared.recording), previous_usable(prepared.recording)
     own = after.residual[: after.n_points, None]
     null = after.draw_null_residuals(_N_DRAWS, rng=rng)[: after.n_points]
-    joined = noise_statistics(np.concatenate([own, null], axis=1), steps, best.fit.found.predicted)
+    joined = noise_statistics(np.concatenate([own, null], axis=1), steps, best.fit.found.predicted, before=before)
     center, spread = joined[:, 1:].mean(axis=1), joined[:, 1:].std(axis=1)
     worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)
     p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + _N_DRAWS)

@@ -1,0 +1,140 @@
+"""Runs whose rows are mixed in the file: noise is correlated along the rows of a run, not those of the file."""
+
+import math
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import diagnose_system
+from probewise.diagnosis.noise.law import (
+    n_rows_since_previous_usable,
+    noise_statistics,
+    order_by_scan,
+    previous_usable,
+)
+from probewise.diagnosis.noise.models import NoiseModel, rough_sd
+from probewise.diagnosis.residuals.bases import bank_of_unknown_effects
+from probewise.effects import CorrelatedNoise
+from probewise.systems import RunTable, Simulator, as_recording
+
+SIMULATOR = Simulator(
+    "y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], run="run", vectorized=True
+)
+N = 40
+RUN = np.random.default_rng(1).permutation(np.repeat([0.0, 1.0, 2.0, 3.0], 10))
+SORTED = np.argsort([list(dict.fromkeys(RUN.tolist())).index(run) for run in RUN.tolist()], kind="stable")
+
+
+def _ar1(run, rho, rng):
+    noise, last = rng.standard_normal(len(run)), {}
+    for k, name in enumerate(run.tolist()):
+        if name in last:
+            noise[k] = rho * noise[last[name]] + math.sqrt(1 - rho**2) * noise[k]
+        last[name] = k
+    return noise
+
+
+def _recording(rows=None):
+    rng = np.random.default_rng(2)
+    y = 10.0 + _ar1(RUN, 0.5, rng)
+    y[[5, 17]] = np.nan
+    table = RunTable({"run": RUN, "x": rng.normal(size=N), "y": y}, run="run")
+    return as_recording(SIMULATOR, table if rows is None else table.take(rows))
+
+
+def _law(recording, node=20):
+    nodes = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(
+        np.full(int(recording.usable.sum()), 10.0)
+    )
+    return nodes.settings[node, 0], nodes.laws[node]
+
+
+def test_the_rows_back_to_the_previous_reading_are_those_of_the_run():
+    recording, together = _recording(), _recording(SORTED)
+    order = order_by_scan(recording)
+    np.testing.assert_array_equal(
+        n_rows_since_previous_usable(recording)[order], n_rows_since_previous_usable(together)
+    )
+    before, scan = previous_usable(recording), recording.plan.scan[recording.usable]
+    for k in range(len(before)):
+        same = np.flatnonzero(scan[:k] == scan[k])
+        assert before[k] == (same[-1] if same.size else -1)
+
+
+def test_the_noise_of_mixed_runs_is_whitened_by_the_inverse_root_of_its_covariance():
+    """Route two: the full covariance matrix, rho to the number of rows of the run in between."""
+    recording = _recording()
+    rho, law = _law(recording)
+    scan, place = recording.plan.scan, np.zeros(N)
+    for rows in recording.plan.rows_by_scan():
+        place[rows] = np.arange(len(rows))
+    scan, place = scan[recording.usable], place[recording.usable]
+    cov = np.where(scan[:, None] == scan, rho ** np.abs(place[:, None] - place), 0.0)
+    r = np.random.default_rng(0).normal(size=len(scan))
+    found = -0.5 * np.sum(law(r) ** 2) - law.half_log_det()
+    expected = -0.5 * r @ np.linalg.solve(cov, r) - 0.5 * np.linalg.slogdet(cov)[1]
+    assert found == pytest.approx(expected)
+
+
+def test_mixed_runs_have_the_noise_of_the_same_runs_one_after_the_other():
+    recording, together = _recording(), _recording(SORTED)
+    order = order_by_scan(recording)
+    (rho, law), (same, other) = _law(recording), _law(together)
+    assert rho == same
+    columns = np.random.default_rng(3).normal(size=(len(order), 2))
+    np.testing.assert_allclose(law(columns)[order], other(columns[order]), rtol=1e-12)
+    assert rough_sd(recording) == rough_sd(together)
+    steps, before = n_rows_since_previous_usable(recording), previous_usable(recording)
+    np.testing.assert_allclose(
+        noise_statistics(columns, steps, columns[:, 0], before=before),
+        noise_statistics(columns[order], steps[order], columns[order, 0]),
+    )
+
+
+def test_a_run_held_out_of_mixed_runs_leaves_the_others_as_they_were():
+    recording = _recording()
+    _, law = _law(recording)
+    out = recording.plan.scan[recording.usable] == 2
+    r = np.random.default_rng(4).normal(size=len(out))
+    np.testing.assert_allclose(law.take(~out)(r[~out]), law(r)[~out])
+    np.testing.assert_allclose(law.take(out)(r[out]), law(r)[out])
+
+
+def test_without_a_reading_in_between_the_next_has_its_correlation_with_the_one_before():
+    """As where runs are not mixed: `take` does not know how many rows it leaves out."""
+    recording, together = _recording(), _recording(SORTED)
+    order = order_by_scan(recording)
+    (_, law), (_, other) = _law(recording), _law(together)
+    kept = np.ones(len(order), dtype=bool)
+    kept[order[[13, 24]]] = False
+    r = np.random.default_rng(5).normal(size=len(order))
+    found = np.zeros(len(order))
+    found[kept] = law.take(kept)(r[kept])
+    np.testing.assert_allclose(found[order][kept[order]], other.take(kept[order])(r[order][kept[order]]))
+
+
+def test_the_memory_of_mixed_runs_is_along_each_run():
+    recording = _recording()
+    order = order_by_scan(recording)
+    starts = np.flatnonzero(n_rows_since_previous_usable(recording)[order] == 0)
+    signal = np.abs(np.random.default_rng(6).normal(size=len(order)))
+    mixed = bank_of_unknown_effects((), signal, signal, starts, order)
+    apart = bank_of_unknown_effects((), signal[order], signal[order], starts)
+    np.testing.assert_array_equal(mixed.columns[order], apart.columns)
+
+
+@pytest.mark.slow
+def test_correlated_noise_of_mixed_runs_is_found():
+    """Development seed; before, it was hidden: successive rows of the file are of different runs."""
+    rng = np.random.default_rng(7)
+    run, x = np.tile([0.0, 1.0, 2.0], 100), rng.normal(size=300)
+    table = {"run": run, "x": x, "y": 1.0 + 2.0 * x + 0.1 * _ar1(run, 0.7, rng)}
+    rows = np.argsort(run, kind="stable")
+    mixed, apart = (
+        diagnose_system(SIMULATOR, {k: v[at] for k, v in table.items()}, rng=np.random.default_rng(1))
+        for at in (np.arange(300), rows)
+    )
+    assert mixed.verdict == apart.verdict == "noise"
+    assert "correlated_noise" in mixed.report.noise.model
+    rho = [next(p.mean for p in d.report.noise.parameters if "rho" in p.name) for d in (mixed, apart)]
+    assert rho[0] == pytest.approx(rho[1], abs=0.02)

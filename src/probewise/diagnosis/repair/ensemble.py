@@ -73,7 +73,8 @@ class HypothesisSamples:
         At most six hypotheses; those of a probability below 0.02 are left out.
         """
         kept = [(self.averaged_over_orders(best), best, probabilities[best.names])]
-        for names in sorted(set(probabilities) - {best.names}, key=lambda names: -probabilities[names]):
+        rivals = [names for names in probabilities if names != best.names]  # no set: equal ones keep their order
+        for names in sorted(rivals, key=lambda names: -probabilities[names]):
             if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST:
                 break
             rival = max(self._candidates_of_same_form(best, names), key=lambda c: c.evidence[self.noise].log_z)
@@ -142,7 +143,7 @@ def _average_of_named_and_null(
 ) -> ModelSamples:
     """Average over named hypotheses by probability, and the null for the rest; used if the verdict names none."""
     by_mean = searched.posterior.by_mean
-    named = {names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)}
+    named = [names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)]
     fit = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
     if fit.names and predicts_far_worse(BestRepair.of(searched, test, fit, noise, rng=cached.rng).improvement):
         return cached.averaged_over_orders(test.null)

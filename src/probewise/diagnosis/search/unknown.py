@@ -82,7 +82,7 @@ class UnknownEffects:
         correspondingly more.
         """
         named = [c for c in candidates if not effects_out_of_vocabulary(c.names)]
-        for known in {c.names for c in named if len(c.names) <= 1}:
+        for known in dict.fromkeys(c.names for c in named if len(c.names) <= 1):
             rivals = [c for c in named if set(c.names) > set(known) and len(c.names) <= 2]
             if any(key[1] == known for key in self.log_z) and self._is_superfluous(known, rivals, candidates):
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}

@@ -27,6 +27,7 @@ from probewise.errors import FileError, ParameterError, ProbewiseError
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
+from probewise.systems.forms.origins import time_origin
 from probewise.systems.forms.rebinding import Recorded
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
@@ -213,8 +214,10 @@ def require_fitted_system(fitted: object) -> None:
 
 def _recorded_to_json(known: Recorded) -> dict[str, Any]:
     table = known.table
+    origin = time_origin(table)
     return {
         "time": table.time,
+        **({"counted_from": origin} if origin else {}),
         "run": table.run,
         "columns": {name: _column_to_json(values) for name, values in table.columns.items()},
         "predicted": known.predicted.tolist(),
@@ -233,6 +236,11 @@ def _column_to_json(values: NDArray[Any]) -> list[Any]:
 def _recorded_from_json(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
     columns = {name: _column_from_json(values) for name, values in document["columns"].items()}
     table = RunTable(columns, document["time"], document["run"])
+    if float(document.get("counted_from", 0.0)) != time_origin(table):
+        # An earlier version counted times far from 0 from there: the samples of its drifts and waves mean other ones.
+        raise ParameterError(
+            "bound_about", f"of {table.time} counted from 0", "a model of this version; diagnose again"
+        )
     states = {name: np.array(values, dtype=np.float64) for name, values in document["states"].items()}
     held = document.get("held")  # a file of an earlier version has none: only a law's columns were held then
     if held is None:

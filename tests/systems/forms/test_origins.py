@@ -1,9 +1,13 @@
 """Times and columns far from 0, as seconds of the epoch are: effects are what they are on a clock that starts at 0."""
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
+from probewise.errors import FileError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
 from probewise.systems.forms import ReferenceFit, forms_of
 from probewise.systems.forms.origins import origin_of_column, rounded_to_spread, text_rounded_to_spread, time_origin
@@ -164,3 +168,22 @@ def test_a_recording_by_the_epoch_has_the_diagnosis_of_the_same_recording_from_0
     for effects, probability in expected.items():
         if probability > 0.01:
             assert found[effects] == pytest.approx(probability, abs=2e-3)
+
+
+def test_a_model_of_a_version_that_counted_such_times_from_0_is_refused():
+    """Its drifts and waves would be off by any amount."""
+    about = _about(EPOCH, 0.0, _function)
+    model = FittedSystem(
+        about.system.simulator,
+        names=("offset", "gain", "offset_drift.a"),
+        samples=np.tile([1.0, 2.0, 0.1], (500, 1)),
+        noise_sd=np.full(500, 0.01),
+        effects=("offset_drift",),
+        known=extract_recorded(about),
+    )
+    document = json.loads(model.to_json())
+    assert document["bound_about"].pop("counted_from") == EPOCH
+    with pytest.raises(FileError, match="diagnose again"):
+        FittedSystem.from_json(json.dumps(document), about.system.simulator)
+    near = dataclasses.replace(model, known=extract_recorded(_about(0.0, 0.0, _function)))
+    assert "counted_from" not in json.loads(near.to_json())["bound_about"]

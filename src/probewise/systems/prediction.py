@@ -13,7 +13,16 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
-from probewise.effects import AGAIN, EFFECTS, PROPOSAL, NamedEffect, NoisePerRun, PredictiveMixture, RandomWalk
+from probewise.effects import (
+    AGAIN,
+    EFFECTS,
+    PROPOSAL,
+    DriftingNoise,
+    NamedEffect,
+    NoisePerRun,
+    PredictiveMixture,
+    RandomWalk,
+)
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
@@ -247,6 +256,20 @@ def _inputs_with_gaps(simulator: Simulator, table: RunTable) -> dict[str, FloatA
     return {name: values for name, values in columns.items() if not np.isfinite(values).all()}
 
 
+@dataclass(frozen=True)
+class _NoiseDriftOfRecording(DriftingNoise):
+    """Noise that changed in the time of a recording, from `begin` to `end`; before and after it is as at its ends."""
+
+    begin: float = 0.0
+    end: float = 1.0
+
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+        table = cast(RunTable, plan)
+        time = table.row_number if table.time is None else table.time_s
+        elapsed = (np.clip(time, self.begin, self.end) - self.begin) / ((self.end - self.begin) or 1.0)
+        return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
+
+
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
     """Bind the effects of a fitted simulator to the runs of a table, in their order.
 
@@ -280,6 +303,9 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
         elif name == NoisePerRun.name:
             seen = () if fitted.known is None else fitted.known.table.scan_names
             out.append(NoisePerRun(tuple(dict.fromkeys((*seen, *table.scan_names)))))
+        elif name == DriftingNoise.name and fitted.known is not None:
+            begin, end = float(fitted.known.table.time_s.min()), float(fitted.known.table.time_s.max())
+            out.append(_NoiseDriftOfRecording(begin=begin, end=end))
         elif name in EFFECTS:
             out.append(EFFECTS[name]())
         else:
@@ -291,10 +317,11 @@ def _columns_of_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[s
     """Return the names of the recording's columns of numbers that effects read: targets, and those in formulas."""
     assert fitted.known is not None
     known_names = [name for name in fitted.effects if not name.startswith(PROPOSAL)]
-    named = {part for name in known_names for part in name.removesuffix(AGAIN).split(":")[1:]}
+    targets = [f"{name.removesuffix(AGAIN)}:" for name in known_names]
     in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
     columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
-    return columns & named | {name for name in columns if covariate_of_column(name) in in_formulas}
+    named = {name for name in columns if any(f":{name}:" in target for target in targets)}
+    return named | {name for name in columns if covariate_of_column(name) in in_formulas}
 
 
 def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:

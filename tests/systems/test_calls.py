@@ -168,3 +168,20 @@ def test_a_sample_for_which_a_broadcasting_function_raises_leaves_the_others_as_
     np.testing.assert_allclose(readings[[0, 2, 3]], theta[[0, 2, 3], :1] + X)
     assert np.isnan(readings[[1, 4]]).all()
     assert system.caller.n_failed == 2
+
+
+@pytest.mark.parametrize("n_rows", [1, 2])
+def test_a_parameter_per_run_is_an_array_in_a_table_of_one_row_too(n_rows):
+    simulator = Simulator(
+        "y",
+        "V",
+        {"a": Uniform(0.5, 2.0), "b": Uniform(0.5, 2.0)},
+        simulate=lambda p, data: p["a"][np.zeros(len(data["x"]), dtype=int)] + float(p["b"]) * data["x"],
+        run="run",
+        per_run=("a",),
+    )
+    table = RunTable({"x": X[:n_rows], "run": np.ones(n_rows)}, run="run")
+    system = System.of(simulator, table)
+    found = system.chain(table, ()).predict(np.array([[0.7, 1.5]]), table)
+    by_name = dict(zip(system.marginals, [0.7, 1.5], strict=True))
+    np.testing.assert_allclose(found[0], by_name["a[1]"] + by_name["b"] * X[:n_rows])

@@ -128,7 +128,10 @@ class Caller:
                 )
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
-                own = {name: _value_of_sample(values, k) for name, values in parameters.items()}
+                own = {
+                    name: _value_of_sample(values, k, by_row=n_points == 1 and name in self.by_row)
+                    for name, values in parameters.items()
+                }
                 table = {
                     name: values[min(k, len(values) - 1)] if np.ndim(values) == 2 else values
                     for name, values in columns.items()
@@ -309,10 +312,13 @@ def _names_taken_by_row(
     return frozenset(taken)
 
 
-def _value_of_sample(values: FloatArray, k: int) -> Any:
-    """Return a parameter's value in sample k, a number or one per row; the same for all if there is only one."""
+def _value_of_sample(values: FloatArray, k: int, *, by_row: bool) -> Any:
+    """Return a parameter's value in sample k, a number or one per row; the same for all if there is only one.
+
+    `by_row`: it is one per row even if there is only one row.
+    """
     own = values[min(k, len(values) - 1)]
-    return float(own[0]) if own.shape == (1,) else own
+    return float(own[0]) if own.shape == (1,) and not by_row else own
 
 
 def _values_of_samples(values: Mapping[str, Any], samples: slice) -> dict[str, Any]:

@@ -69,3 +69,12 @@ def test_a_missing_input_leaves_out_its_readings_and_no_effect(law):
     assert set(with_gap.effects) == set(without.effects)
     assert np.flatnonzero(~with_gap.recording.usable).tolist() == (list(range(13, 30)) if law else [12])
     assert np.isfinite(with_gap.apparatus.about.predicted).all()
+
+
+def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column():
+    """Before, its periodic error asked for a frequency of a range that is no number, and the diagnosis ended."""
+    x = np.where(np.arange(_N) == 7, np.nan, _X)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 2.0 * np.nan_to_num(u["x"]))
+    prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": 1.0 + 2.0 * np.nan_to_num(x) + _Y - 1}))
+    assert {"periodic_error:x", "input_gain:x", "sensitivity:x"} <= set(prepared.effects)
+    assert np.isfinite(prepared.effects["periodic_error:x"].bank()).all()

@@ -201,6 +201,7 @@ def _max_n_trial_frequencies(about: ReferenceFit) -> int:
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     values = about.table.covariates[name]
+    values = values[np.isfinite(values)]
     if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
         return
     origin = origin_of_column(values)
@@ -212,7 +213,7 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     frequencies = trial_frequencies(
         np.sort(values), [np.arange(len(values))], _max_n_trial_frequencies(about), _ROWS_OF_A_WAVE
     )
-    guess = 1e-4 * float(np.nanstd(values))
+    guess = 1e-4 * float(np.std(values))
     typical = about.typical_amplitude(Stage.INPUT, act, sine_and_cosine_entries(guess, 1 / frequencies), guess)
     if typical is None:
         return

@@ -121,7 +121,8 @@ def predict_system(
     time was recorded, a step at a row (`at_row`) counts the rows of the recording: those of a table that does not begin
     with the recording's rows, readings included, come after its end. A row that lacks a number which the simulator or
     an effect needs has no prediction (NaN), and with a law the rows after it in the run neither; effects that look back
-    to it, such as a lag, take the number interpolated within the run.
+    to it, such as a lag, take the number interpolated within the run. The effect of a column that counts from its mean
+    is 0 where the column is missing, as in the fit.
 
     Parameters
     ----------

@@ -363,3 +363,15 @@ def test_a_form_that_looks_back_to_earlier_times_says_so():
         assert form.needs_rising_time == bool(np.any(change[others] != 0)), form.name
     named = {name.partition(":")[0] for name, form in FORMS.items() if form.needs_rising_time}
     assert named == {"lag", "delay", "input_delay"}
+
+
+def test_a_dose_is_the_integral_over_time_in_a_table_of_one_row_too():
+    """At the start of a run nothing has been taken up yet; before, the one row was added up as where no time is."""
+    dose = next(form for form in proposals(ABOUT) if "integral over t_s of |room_c|" in form.name)
+    theta = np.concatenate([ABOUT.theta[0], [1.0, 5.0]])[None, :]
+    for n_rows in (1, 2):
+        first = TABLE.take(np.arange(n_rows))
+        change = ABOUT.system.chain(first, [dose]).predict(theta, first) - ABOUT.system.chain(first, []).predict(
+            ABOUT.theta, first
+        )
+        assert change[0, 0] == 0.0

@@ -75,11 +75,12 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
     }
     if values.min() >= 0 or values.max() <= 0:
         each[f"|{name}|"] = np.abs
-    summed = f"integral over {table.time}" if table.has_varying_time else "sum over rows"
+    in_time = table.has_varying_time
+    summed = f"integral over {table.time}" if in_time else "sum over rows"
     for what, rate in each.items():
 
         def dose_at_rows(rows: RunTable, rate: Callable[[FloatArray], FloatArray] = rate) -> FloatArray:
-            return _integral_since_start_of_run(rate(rows.covariates[name]), rows)
+            return _integral_since_start_of_run(rate(rows.covariates[name]), rows, in_time=in_time)
 
         def act(
             value: FloatArray, theta: FloatArray, rows: RunTable, dose: Callable[[RunTable], FloatArray] = dose_at_rows
@@ -110,15 +111,15 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
                 "not a known effect"
             ),
             expression=f"a ({text.split(',')[0]}),{text.split(',', 1)[1]}",
-            needs_rising_time=table.has_varying_time,
+            needs_rising_time=in_time,
         )
 
 
-def _integral_since_start_of_run(values: FloatArray, rows: RunTable) -> FloatArray:
-    """Return the integral of values over time from the start of each row's run, (n_points,); their sum without time."""
+def _integral_since_start_of_run(values: FloatArray, rows: RunTable, *, in_time: bool) -> FloatArray:
+    """Return the integral of values over time from the start of each row's run, (n_points,); or their sum over rows."""
     out = np.zeros(len(rows))
     for own in rows.rows_by_scan():
-        if not rows.has_varying_time:
+        if not in_time:
             out[own] = np.cumsum(values[own])
         elif own.size:
             widths = np.diff(rows.time_s[own], prepend=rows.time_s[own][0])

@@ -63,3 +63,24 @@ def test_a_time_that_falls_within_a_run_is_refused_as_in_a_diagnosis():
     simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], time="t")
     with pytest.raises(ParameterError, match="begins anew"):
         audit_system(simulator, {"x": np.arange(20.0), "t": np.arange(20.0) % 10})
+
+
+def test_a_plan_that_lacks_a_cell_is_told_in_which_row():
+    """Before, its readings were said to be the same in all rows."""
+    x = np.where(np.arange(40) == 7, np.nan, np.linspace(0.0, 1.0, 40))
+    simulator = Simulator("y", "V", {"a": (0, 5)}, simulate=lambda p, u: p["a"] * u["x"])
+    with pytest.raises(ParameterError, match="no finite reading in 1 of 40 rows, first in row 9"):
+        audit_system(simulator, {"x": x})
+
+
+def test_a_plan_by_the_epoch_shows_what_the_same_plan_from_0_shows():
+    x = np.random.default_rng(2).normal(size=40)
+    simulator = Simulator(
+        "y", "V", {"a": (0, 5), "b": (0, 3)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time="t"
+    )
+    near, later = (audit_system(simulator, {"t": np.arange(40.0) + shift, "x": x}) for shift in (0.0, 1.7e9))
+    expected, found = ({e.name: (e.detectability, e.share) for e in each.effects} for each in (near, later))
+    assert found.keys() == expected.keys()
+    for name, (detectability, share) in expected.items():
+        assert found[name][0] == detectability
+        assert found[name][1] == pytest.approx(share, abs=1e-3)

@@ -81,8 +81,9 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
     """Return a point of the prior at which readings vary, its middle if possible.
 
     Coordinates, (n_params,); the predicted readings, (n_points,); the point in words. Raises ParameterError if there is
-    none.
+    none, or a row has no reading at any.
     """
+    never = np.ones(len(table), dtype=np.bool_)
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
         if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-9 * max(float(np.abs(predicted).max()), 1e-300):
@@ -92,6 +93,12 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
                 else "a point of the prior other than its middle, where readings are constant"
             )
             return z, predicted, at
+        never &= ~np.isfinite(predicted)
+    if never.any():
+        found = (
+            f"no finite reading in {int(never.sum())} of {len(table)} rows, first in row {int(np.argmax(never)) + 2}"
+        )
+        raise ParameterError("the table", found, "a number in each cell that the simulator reads")
     raise ParameterError("the table", "one reading in all rows", "rows over which the predicted reading changes")
 
 

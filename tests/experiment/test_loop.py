@@ -20,8 +20,8 @@ from probewise.experiment import Exploration, OneScan, arm_over, begin, explore,
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, prior_entropy
 from probewise.recordings import Disc
+from probewise.scene import AnyOf, Circle, Field, Rectangle
 from probewise.scene.scenes import HypothesisScene
-from probewise.scene.shapes import AnyOf, Circle, Field, Rectangle
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NaiveSensor
 from probewise.world import Blob, World, gaussian_spot
 

@@ -42,10 +42,12 @@ class Origin:
         length_mm = float(np.hypot(np.ptp(plan.x_mm), np.ptp(plan.y_mm)))
 
         def middle_mm(places_mm: FloatArray) -> float:
-            far = _is_far(float(np.abs(places_mm).min()), length_mm)
+            far = is_far_from_zero(float(np.abs(places_mm).min()), length_mm)
             return float(places_mm.min() + places_mm.max()) / 2 if far else 0.0
 
-        return cls(first_s if _is_far(first_s, duration_s) else 0.0, middle_mm(plan.x_mm), middle_mm(plan.y_mm))
+        return cls(
+            first_s if is_far_from_zero(first_s, duration_s) else 0.0, middle_mm(plan.x_mm), middle_mm(plan.y_mm)
+        )
 
     def seconds(self, plan: Plan) -> FloatArray:
         """Return the time of each reading since the origin, s, (n_points,)."""
@@ -90,6 +92,6 @@ class CountsPlaceFromOrigin(CountsFromOrigin):
         return f"X and Y count from ({x_mm:g}, {y_mm:g}) mm" if x_mm or y_mm else ""
 
 
-def _is_far(start: float, length: float) -> bool:
-    """Return whether a start lies farther from 0 than ten lengths; without a length it does not."""
+def is_far_from_zero(start: float, length: float) -> bool:
+    """Return whether values that begin at `start` lie more than ten of their lengths from 0; none of length 0 do."""
     return abs(start) > _FAR * length > 0.0

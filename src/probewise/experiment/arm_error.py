@@ -30,7 +30,7 @@ from probewise.experiment.state import ArmError
 from probewise.inference.problem import checked_log_prob
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
-from probewise.scene.shapes import AnyOf
+from probewise.scene.any_of import AnyOf
 from probewise.scene.symmetry import with_angles_near
 
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken

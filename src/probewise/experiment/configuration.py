@@ -40,7 +40,7 @@ from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Instrumentation
 from probewise.scene import Card
 from probewise.scene.albedo import Shape, require_shape
-from probewise.scene.shapes import AnyOf
+from probewise.scene.any_of import AnyOf
 from probewise.sensor.stages import SensorModel
 
 _MOST_LIFTED = 10.0

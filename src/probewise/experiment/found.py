@@ -13,7 +13,8 @@ from probewise.experiment.stopping_rule import probability_of_length_off, shape_
 from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.table import csv_text_of_rows
 from probewise.scene.albedo import Shape
-from probewise.scene.shapes import AnyOf, RegularPolygon
+from probewise.scene.any_of import AnyOf
+from probewise.scene.shapes import RegularPolygon
 
 FORMAT = "exploration/1"
 

@@ -19,7 +19,7 @@ from probewise.inquiry import TabulatedChain
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene.albedo import Shape
-from probewise.scene.shapes import AnyOf
+from probewise.scene.any_of import AnyOf
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
 

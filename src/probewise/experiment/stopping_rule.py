@@ -13,7 +13,7 @@ from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
-from probewise.scene.shapes import AnyOf
+from probewise.scene.any_of import AnyOf
 from probewise.scene.symmetry import mean_angles, with_angles_near
 
 OFF_SDS = 3.0

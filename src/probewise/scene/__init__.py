@@ -5,6 +5,7 @@ Collection for SSF Estimation" (the patterns S_BW and S_a to S_d).
 """
 
 from probewise.scene.albedo import Region, Scene, Shape
+from probewise.scene.any_of import AnyOf
 from probewise.scene.cards import Card, CardedRegion, CardedScene
 from probewise.scene.patterns import region_of
 from probewise.scene.regions import (
@@ -22,7 +23,7 @@ from probewise.scene.regions import (
     outlines,
 )
 from probewise.scene.scenes import HypothesisScene, KnownScene
-from probewise.scene.shapes import SHAPES, AnyOf, Circle, Ellipse, Field, PlacedPrior, Rectangle, RegularPolygon
+from probewise.scene.shapes import SHAPES, Circle, Ellipse, Field, PlacedPrior, Rectangle, RegularPolygon
 from probewise.scene.symmetry import mean_angles, with_angles_near
 
 __all__ = [

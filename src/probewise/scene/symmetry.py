@@ -8,7 +8,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.albedo import Shape
-from probewise.scene.shapes import AnyOf, HasTurn, Turn
+from probewise.scene.any_of import AnyOf
+from probewise.scene.shapes import HasTurn, Turn
 
 
 def mean_angles(shape: Shape, theta: FloatArray, weight: FloatArray) -> FloatArray:

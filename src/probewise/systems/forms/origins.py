@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.origin import is_far_from_zero
 from probewise.systems.table import RunTable
 
 _ALL = 17  # digits of a number in double precision
-_FAR = 10.0  # ranges of a column, from 0 to its least value, beyond which it is not counted from 0
 
 
 def origin_of_column(values: FloatArray) -> float:
@@ -21,7 +21,7 @@ def origin_of_column(values: FloatArray) -> float:
     frequency.
     """
     least, reach = float(np.nanmin(values)), float(np.nanmax(values) - np.nanmin(values))
-    return least if reach > 0 and abs(least) > _FAR * reach else 0.0
+    return least if is_far_from_zero(least, reach) else 0.0
 
 
 def time_origin(table: RunTable) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of, shipped_geometry_path
-from probewise.cli._bench import Bench
+from probewise.cli._bench import SimulatedBench
 from probewise.cli._plans import plan_for_lego_arm
 from probewise.diagnosis import diagnose
 from probewise.recordings import Recording, paper_plan, read_recording, write_recording
@@ -32,7 +32,7 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     geometry = read_geometry(file)
     plan = plan_for_lego_arm(paper_plan(), geometry)
     origin_mm = (524 + 0.37 * seed, 260 + 0.61 * seed)
-    bench = Bench(truth("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
+    bench = SimulatedBench(truth("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
     arm = bench.open_emulated_arm(geometry, file)
     stands, read = [], arm.read_here
     arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]

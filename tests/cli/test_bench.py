@@ -8,7 +8,7 @@ import pytest
 from probewise.arm import ReadingScale, RequestToPerson
 from probewise.calibration import predict, read_sensor
 from probewise.cli import main
-from probewise.cli._bench import Bench, shifted_pattern, world_and_instrumentation
+from probewise.cli._bench import SimulatedBench, shifted_pattern, world_and_instrumentation
 from probewise.errors import ParameterError
 from probewise.recordings import (
     Disc,
@@ -60,7 +60,7 @@ def test_a_ramp_stays_where_it_is():
 
 def test_a_bench_does_what_a_person_would_be_asked_for():
     world = dataclasses.replace(world_and_instrumentation(None)[0], noise_sd=0.0)
-    bench = Bench(world, "uniform:1", scale=ReadingScale(), seed=1)
+    bench = SimulatedBench(world, "uniform:1", scale=ReadingScale(), seed=1)
     with bench.open_simulated_arm(None) as arm:
         place = type(arm.pose)(*ORIGIN)
         white = arm.measure(place).value

@@ -30,7 +30,7 @@ from probewise.experiment import (
 )
 from probewise.experiment.acquisition import ArmReachAndTravel, predict_and_rate_readings
 from probewise.experiment.arm_error import arm_error_in_posterior
-from probewise.experiment.checking import ENOUGH_BITS, NAMES, OutlineCoverage, bits_about_left_out
+from probewise.experiment.checking import ENOUGH_BITS, NAMES, OutlineGaps, bits_about_left_out
 from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.noise_rivals import (
@@ -320,7 +320,9 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     with arm_of(Trial(REFERENCE, 0)) as arm:
         field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
     utility_input, _ = predict_and_rate_readings(doubting, joined, joined.theta[:20], field, at=inside)
-    outline = OutlineCoverage.of(utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
+    outline = OutlineGaps.from_region(
+        utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge)
+    )
     assert outline is not None
     far = outline.far_side_design
     opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])

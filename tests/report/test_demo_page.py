@@ -14,7 +14,7 @@ from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
-from probewise.report import doubt
+from probewise.report import doubting_robot
 from probewise.report.demo import HEADER, comparison_lines
 from probewise.report.paper_view import fine_entropy_map, paper_view, window_mm
 from probewise.report.plots import PAGE_IN
@@ -131,11 +131,12 @@ def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
     outline = np.array([600.0, 260.0]) + 90.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
     searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("trusting", "doubting")]
-    drawn = doubt.encoded_figures(searches)
+    drawn = doubting_robot.encoded_figures(searches)
     assert list(drawn) == ["doubt.png", "belief.png"]
-    assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
-    said = "".join(doubt.section(searches, drawn).body)
+    widest = 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
+    assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= widest
+    said = "".join(doubting_robot.section(searches, drawn).body)
     for row in ("trusting", "doubting"):
         assert f">{row}<" in said
-    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubt.summary_sentence(searches)
+    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubting_robot.summary_sentence(searches)
     assert found.stop_reason in said

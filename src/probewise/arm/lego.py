@@ -94,7 +94,7 @@ class LegoArm:
         """Raise the sensor if it is down, then release the motors; after an exception, only release them."""
         try:
             if error is None and self._is_down:
-                self.rise()
+                self.raise_sensor()
         except BaseException as failure:
             self._machine.__exit__(type(failure), failure, failure.__traceback__)
             raise
@@ -162,7 +162,7 @@ class LegoArm:
         there = self._pose()
         # The reading is complete. A connection lost now is noticed at the next move, which starts with raising.
         with contextlib.suppress(LinkError):
-            self.rise()
+            self.raise_sensor()
         return Reading(value=value, pose=there, time_s=time_s, covariates=covariates)
 
     def go_over(self, x_mm: float, y_mm: float) -> None:
@@ -174,7 +174,7 @@ class LegoArm:
             If the place is out of reach.
         """
         goals = self._goals_at_place(x_mm, y_mm, self.geometry.travel_height_mm)
-        self.rise()
+        self.raise_sensor()
         self._turn_joint_to(BASE, goals[BASE])
         for joint in self._choose_link_order(goals):
             self._move_joint_near(joint, goals[joint].counts)
@@ -200,13 +200,13 @@ class LegoArm:
     def _lower_to(self, x_mm: float, y_mm: float, height_mm: float) -> None:
         """Raise the sensor, turn the base, then lower the sensor over a place to a height."""
         goals = self._goals_at_place(x_mm, y_mm, height_mm)
-        self.rise()
+        self.raise_sensor()
         self._turn_joint_to(BASE, goals[BASE])
         self._is_down = True
         for joint in self._choose_link_order(goals):
             self._turn_joint_to(joint, goals[joint])
 
-    def rise(self) -> None:
+    def raise_sensor(self) -> None:
         """Raise the sensor to about travel height, if it is lower, by the link that needs the smaller turn.
 
         Raises
@@ -224,6 +224,8 @@ class LegoArm:
             _, joint, goal = min(ways)
             self._move_joint_near(joint, goal)
         self._is_down = False
+
+    rise = raise_sensor  # its old name
 
     def home(self) -> None:
         """Move all joints home (counter 0); joints with a stop find it first to set their counters.
@@ -244,7 +246,7 @@ class LegoArm:
                 self._machine.find_stop(joint, side)
                 self._arrived[joint] = side
                 stopped.append(joint)
-        self.rise()
+        self.raise_sensor()
         goals = [
             Goal(0, side)
             for side in self._approach_sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))

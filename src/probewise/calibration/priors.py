@@ -213,7 +213,7 @@ class ScanGeometry:
 
 
 def scan_geometry(recording: Recording) -> ScanGeometry:
-    """Measure step, span and reading range of a recording's usable rows.
+    """Measure step, span, reading and albedo range of a recording's usable rows, and whether black reads higher.
 
     Raises
     ------

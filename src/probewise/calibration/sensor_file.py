@@ -176,7 +176,7 @@ class FittedSensor(NamedSamples):
 
     @property
     def samples_for_new_scans(self) -> FloatArray:
-        """Samples with the columns of `chain`, without the effects of single scans."""
+        """Samples of the parameters of SSF, levels and effects, (n_samples, n), without effects of single scans."""
         return self.samples[:, [self.names.index(name) for name in self.chain(KnownScene({})).names]]
 
     carried_effects, carried_samples = effects_on_new_scans, samples_for_new_scans  # their earlier names
@@ -184,7 +184,7 @@ class FittedSensor(NamedSamples):
     def chain(self, scene: Scene) -> Chain:
         """Build the model that predicts new readings over a scene, with the effects that apply to new scans.
 
-        Its parameters are the columns of `samples_for_new_scans`, unless the scene has parameters.
+        Its parameters are the columns of `samples_for_new_scans`; those of a scene come before the effects'.
         """
         return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.effects_on_new_scans)
 

@@ -126,7 +126,7 @@ def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -
         "size_lambda": hidden.size_lambda,
         "on_noise": on_noise,
         "in_vocabulary": hidden.in_vocabulary,
-        "shows_in": list(hidden.visible_covariates),
+        "shows_in": list(hidden.residual_covariates),
         "cosines": {name: rho for name, rho in like.items() if rho > _LEAST_COSINE},
     }
 

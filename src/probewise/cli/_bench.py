@@ -30,7 +30,7 @@ _SEEN_MM = 0.5  # least offset of the sensor from a mark that a simulated person
 _TOUCHES_MM = 0.5  # least gap above the block that a simulated person notices
 
 
-class Bench:
+class SimulatedBench:
     """A table under a simulated or an emulated arm.
 
     Parameters
@@ -116,7 +116,7 @@ def open_arm_and_bench(
     seed: int = DEFAULT_SEED,
     start_s: float = 0.0,
     n_taken: int = 0,
-) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
     """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
 
     Parameters
@@ -145,7 +145,7 @@ def open_arm_and_bench(
     if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
     scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
-    bench = Bench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
+    bench = SimulatedBench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
     if chosen.is_lego:
         return bench.open_emulated_arm(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
     return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench

@@ -89,7 +89,7 @@ def _instrumentation_as_declared(path: Path, sensor: FittedSensor, settings: Map
 def _hypothesised_shape(path: Path, settings: Mapping[str, Any]) -> Shape:
     """Build the hypothesised shape that the journal's first line names.
 
-    Raises FileError unless `explore` offers it, or it is a set of such shapes.
+    Raises FileError unless it is a shape that `explore` offers, or a set of these.
     """
     from probewise.experiment import shape_named
     from probewise.scene import SHAPES, Field

@@ -52,7 +52,7 @@ from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Reading, RequestToPerson, SimulatedArm
-    from probewise.cli._bench import Bench
+    from probewise.cli._bench import SimulatedBench
     from probewise.recordings import Plan
 
 MARKS = "marks"
@@ -614,7 +614,7 @@ def _open_instrument(
     start_s: float = 0.0,
     n_taken: int = 0,
     scene: str = SCENE,
-) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
     """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
     if chosen is None or chosen.kind == "nxt":

@@ -61,7 +61,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
-    from probewise.report import doubt as doubt_report
+    from probewise.report import doubting_robot
     from probewise.world.shipped import truth as world_behind
 
     started = time.monotonic()
@@ -97,7 +97,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         started_alike=started_alike,
         geometry=read_geometry(shipped_geometry_path()),
     )
-    drawn |= report.encoded_diagnosis_figures(diagnosis) | doubt_report.encoded_figures(doubted)
+    drawn |= report.encoded_diagnosis_figures(diagnosis) | doubting_robot.encoded_figures(doubted)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     witnesses = diagnosis_report.encoded_figures(diagnosis)
     diagnosis_page = diagnosis_report.page_html(diagnosis, witnesses, source="concealed.csv", seed=seed)
@@ -131,7 +131,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         report.summary_sentence(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
-        f"a concealed saturation: {doubt_report.summary_sentence(doubted)}",
+        f"a concealed saturation: {doubting_robot.summary_sentence(doubted)}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
     )
 
@@ -262,7 +262,7 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
-    from probewise.report.doubt import SATURATION
+    from probewise.report.doubting_robot import SATURATION
     from probewise.scene import Field
     from probewise.world import Saturation
     from probewise.world.shipped import truth as world_behind

@@ -108,7 +108,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _read_inputs(
     arguments: argparse.Namespace, *, progress: Progress
 ) -> tuple[list[Recording], FittedSensor | None, Shape | None]:
-    """Return the recordings, the sensor (None if none is given), and the hypothesised shape of a journal, else None."""
+    """Return the recordings, the sensor, and the shape that a journal's run looked for; None for what there is not.
+
+    Without --sensor, that of the journal's run is read, and `arguments.sensor` is set to its file.
+    """
     from probewise.calibration import read_sensor
     from probewise.recordings import read_recording
 

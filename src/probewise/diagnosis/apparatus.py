@@ -61,7 +61,7 @@ class Apparatus(Protocol):
         """Return the vocabulary scaled to a recording, by name, without effects that could not be detectable there."""
         ...
 
-    def proposed_effects(self) -> Mapping[str, NamedEffect[Any]]:
+    def proposed_formulas(self) -> Mapping[str, NamedEffect[Any]]:
         """Return proposed formulas for effects out of vocabulary; names begin with `effects.PROPOSAL`."""
         ...
 

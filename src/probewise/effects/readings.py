@@ -21,7 +21,10 @@ from probewise.sensor.stages import Stage
 
 @dataclass(frozen=True)
 class Hysteresis(LinearEffect[FloatArray]):
-    """A reading that depends on the direction of motion: reading + amp d, d the sign of motion along X, or along Y."""
+    """A reading that depends on the direction of motion: reading + amp d.
+
+    d is the sign of the last motion along X, or along Y where X did not change; 0 without motion.
+    """
 
     typical: float = 0.5
     unit: str = field(default="", kw_only=True)
@@ -53,7 +56,7 @@ class Hysteresis(LinearEffect[FloatArray]):
 class Lag(NamedEffect[FloatArray]):
     """First-order lag of the electronics: v_k = a v_(k-1) + (1 - a) y_k with a = exp(-(t_k - t_(k-1)) / tau_s).
 
-    The first reading of a scan has no lag.
+    A reading after one of another scan has no lag.
     """
 
     shortest_s: float = 0.2

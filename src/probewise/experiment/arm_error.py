@@ -87,10 +87,10 @@ def arm_error_in_posterior(
         experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape
     )
     theta = posterior.theta[:, experiment.shape_columns]
-    return ArmError(slopes, draw_arm_error_shifts(experiment, slopes, theta, likely_shape, rng=rng))
+    return ArmError(slopes, draw_shape_shifts_from_arm_error(experiment, slopes, theta, likely_shape, rng=rng))
 
 
-def draw_arm_error_shifts(
+def draw_shape_shifts_from_arm_error(
     experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw an error of the arm for each sample of the shape's parameters, and return the shift that it causes.

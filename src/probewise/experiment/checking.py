@@ -100,7 +100,7 @@ def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolA
 
 
 @dataclass(frozen=True, eq=False)
-class OutlineCoverage:
+class OutlineGaps:
     """The part of a probable shape's outline within reach, and its distances from the readings taken near it.
 
     Attributes
@@ -122,7 +122,7 @@ class OutlineCoverage:
     diameter_mm: float
 
     @classmethod
-    def of(cls, utility_input: UtilityInput, region: Region, readings: Sequence[Reading]) -> Self | None:
+    def from_region(cls, utility_input: UtilityInput, region: Region, readings: Sequence[Reading]) -> Self | None:
         """Build from one region and the readings so far; None if it is no ellipse or polygon, or out of reach."""
         if not isinstance(region, EllipseRegion | PolygonRegion):
             return None

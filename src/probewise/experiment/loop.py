@@ -21,7 +21,7 @@ from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
 from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_and_rate_readings
-from probewise.experiment.arm_error import arm_error_in_posterior, draw_arm_error_shifts
+from probewise.experiment.arm_error import arm_error_in_posterior, draw_shape_shifts_from_arm_error
 from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.experiment.hidden import HiddenShape
 from probewise.experiment.journal import (
@@ -216,7 +216,9 @@ def _may_stop_and_chance_off(
         sd = np.hypot(sd, arm.sd)
         theta = posterior.theta.copy()
         own = theta[:, experiment.shape_columns]
-        theta[:, experiment.shape_columns] = own + draw_arm_error_shifts(experiment, arm.slopes, own, likely, rng=rng)
+        theta[:, experiment.shape_columns] = own + draw_shape_shifts_from_arm_error(
+            experiment, arm.slopes, own, likely, rng=rng
+        )
         posterior = dataclasses.replace(posterior, theta=theta)
     off = probability_of_length_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
     return experiment.may_stop(sd, shapes, off), off

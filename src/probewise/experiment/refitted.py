@@ -60,7 +60,7 @@ class Fits:
     precision: FloatArray
 
     @cached_property
-    def good_rows(self) -> IntArray:
+    def good_fit_rows(self) -> IntArray:
         """Rows of the fits that are not much worse than the best, best first; empty if every fit failed."""
         order = np.argsort(-self.score)
         return (
@@ -74,10 +74,10 @@ class Fits:
 
     @cached_property
     def log_z_by_fit(self) -> FloatArray:
-        """Log evidence of the Gaussian about each good fit (Laplace), (n_good,)."""
-        log_det = np.linalg.slogdet(self.precision[self.good_rows])[1]
+        """Log evidence of the Gaussian about each good fit (Laplace), (n_good,), in the order of `good_fit_rows`."""
+        log_det = np.linalg.slogdet(self.precision[self.good_fit_rows])[1]
         log_volume = 0.5 * self.theta.shape[1] * math.log(2 * math.pi) - 0.5 * log_det
-        return np.asarray(self.score[self.good_rows] + log_volume)
+        return np.asarray(self.score[self.good_fit_rows] + log_volume)
 
     @property
     def highest_log_z(self) -> float:
@@ -245,7 +245,7 @@ def sampled_about_fits(
     The samples; None where hardly a draw is possible.
     """
     n_params = found.theta.shape[1]
-    best = found.good_rows[np.argsort(-found.log_z_by_fit)][:_KEPT]
+    best = found.good_fit_rows[np.argsort(-found.log_z_by_fit)][:_KEPT]
     densities: list[_Density] = [
         LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse_precision(found.precision[best]))
     ]

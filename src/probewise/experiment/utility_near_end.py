@@ -18,7 +18,7 @@ from probewise.experiment.checking import (
     ENOUGH_BITS,
     FAR_SIDE,
     NAMES,
-    OutlineCoverage,
+    OutlineGaps,
     available_places_mm,
     bits_about_left_out,
 )
@@ -77,7 +77,7 @@ def utility_map_and_must_continue(
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return utilities, False
-    outline = OutlineCoverage.of(
+    outline = OutlineGaps.from_region(
         utility_input, experiment.shape.region(_mean_shape_theta(experiment, utility_input)), readings
     )
     far = () if outline is None or outline.far_side_design is None else (outline.far_side_design,)

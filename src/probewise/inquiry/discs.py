@@ -94,7 +94,7 @@ class DiscTable:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """x_mm, y_mm, radius_mm."""
+        """Names of the parameters: x_mm, y_mm, radius_mm."""
         return NAMES
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:

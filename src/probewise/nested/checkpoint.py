@@ -330,7 +330,7 @@ def _numeric_fields(move: Move) -> dict[str, float]:
 
 
 def _with_numeric_fields(move: Move, numbers: object) -> Move:
-    """Return a move with the tuned fields of the checkpoint; ValueError where they do not fit the move."""
+    """Return a move with the tuned fields of the checkpoint; an error if it has no such fields."""
     if not is_dataclass(move) or not isinstance(numbers, dict):
         raise ValueError("the move cannot be restored")
     restored: Move = replace(move, **numbers)

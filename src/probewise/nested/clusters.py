@@ -92,7 +92,7 @@ class Clusters:
 def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
     """Split points, (n, n_params), recursively while two Gaussians explain them better than one.
 
-    No cluster has fewer points than `least`, by default enough for its covariance.
+    No part of a split has fewer points than `least`, by default enough for its covariance.
 
     The gain in log likelihood must exceed the number of additional parameters (Akaike's criterion),
     plus 10 nats against chance, plus 0.15 nats per point: halving a uniform box gains only noise, while two

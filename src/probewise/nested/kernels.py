@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.moves import SliceMove, Tally
@@ -153,7 +153,7 @@ class KernelMove:
 class _LastAcceptedProposals:
     """Index of the proposal each chain accepted last, -1 for none, (n_chains,), and the number of acceptances."""
 
-    index: FloatArray
+    index: IntArray
     n_accepted: int
 
 

@@ -74,7 +74,7 @@ class _StudentMixture:
         """Return the log density of the mixture, (n, n_params) -> (n,)."""
         return np.asarray(np.logaddexp.reduce(self.log_densities(x), axis=0))
 
-    def from_principal_axes(self, e: FloatArray, part: IntArray) -> FloatArray:
+    def x_from_principal_axes(self, e: FloatArray, part: IntArray) -> FloatArray:
         """Map coordinates along the axes of a part, one for each row, to x: (n, n_params) and (n,) -> (n, n_params)."""
         return np.asarray(self.center[part] + np.einsum("nij,nj->ni", self.root[part], e))
 
@@ -117,7 +117,7 @@ class _PriorNearPosterior:
         """Draw `n` points of this prior in the coordinates of chains, (n, n_params)."""
         part = rng.choice(len(self.parts), size=n, p=self.parts.share)
         e = rng.standard_t(_DEGREES_OF_FREEDOM, (n, len(self.names)))
-        return self.whole.to_principal_axes(self.parts.from_principal_axes(e, part), 0)
+        return self.whole.to_principal_axes(self.parts.x_from_principal_axes(e, part), 0)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         # The first number also chooses the part: its place within the part's share is again uniform.
@@ -126,7 +126,7 @@ class _PriorNearPosterior:
         within = u.copy()
         within[:, 0] = (u[:, 0] - (ladder - self.parts.share)[part]) / self.parts.share[part]
         e = np.asarray(stdtrit(_DEGREES_OF_FREEDOM, np.clip(within, 0.0, 1.0)), dtype=np.float64)
-        return self.space.leave(self.parts.from_principal_axes(e, part))[0]
+        return self.space.leave(self.parts.x_from_principal_axes(e, part))[0]
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Return the place in the cube that leads to theta by way of the part that is densest there."""

@@ -249,7 +249,10 @@ def _view_along_repair_change(diagnosis: Diagnosis) -> CovariateView:
 
 
 def _shaded_interval(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
-    """Return the interval to shade: from a place's start to its end, or around its category; None if it has neither."""
+    """Return the interval to shade for a window of a covariate; None if it has no ends and no category.
+
+    It is from the window's start to its end or, with `names`, in category numbers, half a category beyond those within.
+    """
     ends = None if place.start is None or place.end is None else (place.start, place.end)
     if not names:
         return ends

@@ -12,7 +12,7 @@ from probewise.diagnosis import Diagnosis
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
-from probewise.report import doubt as doubt_report
+from probewise.report import doubting_robot
 from probewise.report import exploration as exploration_report
 from probewise.report.held_out import part_with_largest_gain
 from probewise.report.html import (
@@ -101,7 +101,7 @@ def main_findings_by_key(
         "concealed": concealed,
         "diagnosis": diagnosis_report.summary_sentence(diagnosis),
         "reason": typeset(diagnosis.reason),
-        "doubt": doubt_report.summary_sentence(doubt),
+        "doubt": doubting_robot.summary_sentence(doubt),
     }
 
 
@@ -243,7 +243,7 @@ def page_html(
     doubt
         The search of the robot that trusts its sensor model, and of the one that doubts it.
     drawn
-        From `encoded_figures`, `encoded_diagnosis_figures` and `report.doubt.encoded_figures`.
+        From `encoded_figures`, `encoded_diagnosis_figures` and `report.doubting_robot.encoded_figures`.
     concealed
         Name of the effect that the simulated world concealed in the second recording.
     seed, seconds
@@ -253,7 +253,7 @@ def page_html(
         _sensor_section(calibration, recording, prediction, drawn, seed),
         _search_section(searches, started_alike, frames, drawn),
         _diagnosis_section(diagnosis, drawn, concealed),
-        doubt_report.section(doubt, drawn),
+        doubting_robot.section(doubt, drawn),
         Section(
             "This run",
             (

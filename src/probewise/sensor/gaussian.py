@@ -555,8 +555,8 @@ def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 @mean_albedo_under_one.register
-def _mean_albedo_over_mixture(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Integrate each hypothesis by the rule for its kind of region."""
+def _mean_albedo_over_mixed_regions(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Return the mean albedo, (n_samples, n_points), of regions of several kinds: each by the rule for its kind."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows_and_regions():
         out[rows] = mean_albedo_under_one(part, gaussian.take(rows), n_nodes)

@@ -35,9 +35,12 @@ _CHORDS = 4  # iterations with the Jacobian of a known trajectory
 _NEWTONS = 8  # iterations with a sample's own Jacobian
 _HOPELESS = 4  # of these, after which a sample that still changes by a tenth is left to be stepped
 _SLOW = 0.1  # change of a chord iteration, in that of the one before, from which a sample needs its own Jacobian
-_CONVERGED, _SETTLED = 1e-8, 1e-12  # change of an iteration, in the largest state, and what the next would change
-_NUDGE = 1e-7  # of the largest state, for the Jacobian
-_FAR = 1e-3  # change from a known trajectory, in the largest state, from which another one is remembered
+_CONVERGED, _SETTLED = (
+    1e-8,
+    1e-12,
+)  # largest change of a state by an iteration, in that state's largest value; and by the next
+_NUDGE = 1e-7  # of each state's largest value, for the Jacobian
+_FAR = 1e-3  # change from a known trajectory, in a state's largest value, from which another one is remembered
 _MOST_NEW = 8  # trajectories remembered of one batch
 _MOST_KNOWN = 48  # trajectories remembered
 _WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at the cost of a step of all of them
@@ -157,10 +160,11 @@ class TrajectoryCache:
 
 @dataclass(frozen=True, eq=False)
 class SolvedSteps:
-    """States (n_states, n_samples, n_steps + 1, n_runs), the mask `done` of the converged samples, and the cost.
+    """States (n_states, n_samples, n_steps + 1, n_runs), and the mask `done` (n_samples,) of converged samples.
 
-    `bands` are Jacobians of some samples by their number; `moved` (n_samples,) is the change from the trajectory that a
-    sample began from, in the largest state; `n_evaluated` is the number of steps evaluated, of all samples and runs.
+    `bands` holds the last Jacobian, as of `_bands_of_jacobian`, by sample number, where one was computed. `moved`
+    (n_samples,) is the largest change of any state from the trajectory that a sample began from, in that state's
+    largest absolute value. `n_evaluated`, the cost, is the number of steps evaluated, of all samples and runs.
     """
 
     states: FloatArray

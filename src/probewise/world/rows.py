@@ -73,5 +73,5 @@ class Rows:
         return np.isin(self.scan, chosen)
 
     def starts_scan(self) -> BoolArray:
-        """Return whether each row is the first of its scan, shape (n_points,)."""
+        """Return whether each row is the first, or comes after one of another scan, shape (n_points,)."""
         return np.concatenate([[True], self.scan[1:] != self.scan[:-1]])

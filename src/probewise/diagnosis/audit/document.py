@@ -11,7 +11,11 @@ CURE_PLAN = "cure_plan.csv"
 
 
 def audit_json(audit: PlanAudit) -> dict[str, Any]:
-    """Convert an audit to the content of audit.json: finite numbers, texts, lists, null for missing numbers."""
+    """Convert an audit to the content of audit.json.
+
+    An `amount` is null if none suffices, a `cure` if there is none; `rows` and alias classes that were not computed are
+    left out.
+    """
     plan = audit.cure_plan
     return {
         "format": "audit/1",

@@ -32,7 +32,7 @@ def _difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]
     return np.concatenate([z[None, :], z + np.diag(steps)]), steps
 
 
-def _value_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Convert predictions at these points (n_params + 1, n_points) to the one at z and slopes (n_points, n_params)."""
     with np.errstate(invalid="ignore"):  # of a start from which the model diverges: not finite, and not taken
         return batch[0], (batch[1:] - batch[0]).T / steps
@@ -84,7 +84,7 @@ class Model:
     def predict_and_differentiate(self, z: FloatArray, plan: Plan | None = None) -> tuple[FloatArray, FloatArray]:
         """Return predictions, (n_points,), and slopes, (n_points, n_params), at one point z (n_params,)."""
         points, steps = _difference_points_and_steps(z)
-        return _value_and_slopes(self.predict(points, plan), steps)
+        return _prediction_and_slopes(self.predict(points, plan), steps)
 
     def with_effect(self, effect: NamedEffect[Any]) -> Model:
         """Return the model with one more effect, the last."""
@@ -203,7 +203,7 @@ def _minimisation(
 
     def request_slopes(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         points, steps = _difference_points_and_steps(z)
-        return _value_and_slopes((yield points)[:, usable], steps)
+        return _prediction_and_slopes((yield points)[:, usable], steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
@@ -243,7 +243,7 @@ def _minimisation(
             break
         z, best = tries[at], float(values[at])
         if about:
-            predicted, slopes = _value_and_slopes(all_predicted[at], about[at][1])
+            predicted, slopes = _prediction_and_slopes(all_predicted[at], about[at][1])
         else:
             predicted, slopes = yield from request_slopes(z)
         if settled:

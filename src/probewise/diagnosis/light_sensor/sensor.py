@@ -56,8 +56,8 @@ class LightSensor:
             if (null.admits(effect) if null is not None else not effect.is_absorbed_by_ssf(plan))
         }
 
-    def proposed_effects(self) -> dict[str, NamedEffect[Any]]:
-        """Return none: effects with a formula are among `effects` here."""
+    def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
+        """Return the effects with a formula that are proposed for what has no name: none here."""
         return {}
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
@@ -65,7 +65,7 @@ class LightSensor:
         return frozenset(effects.keys() - EFFECTS)
 
     def refit_budget_share_spent(self) -> float:
-        """Return 0: predictions are cheap here."""
+        """Return the spent share of the budget of refits: 0, since predictions are cheap here."""
         return 0.0
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:

@@ -219,7 +219,7 @@ class NoiseLaw:
         return math.sqrt(1 + self.flat**2 / 3)
 
     def without_tail_or_rounding(self) -> NoiseLaw:
-        """Return normal noise with the same whitening and free sd, without tail or rounding."""
+        """Return normal noise with the same whitening, its sd free, without tail or rounding."""
         return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
 
     def likeliest_sigma(self, whitened: FloatArray) -> FloatArray:

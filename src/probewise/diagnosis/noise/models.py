@@ -70,7 +70,7 @@ class NoiseModel:
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
     def thinned_nodes(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return every third node, and log weights, for `likely`: of effects of one parameter and over twelve nodes."""
+        """Return every third node and its log weight, of each effect with one parameter and over twelve nodes."""
         out = {}
         for effect in self.effects:
             nodes = effect.bank()[:, 0, :]
@@ -79,7 +79,10 @@ class NoiseModel:
         return out
 
     def nodes_for_predictions(self, predicted: FloatArray) -> NoiseNodes:
-        """Return the nodes of all combinations of the effects, given predictions of the usable rows, (n_usable,)."""
+        """Return the product grid of the effects' nodes, with the noise law and log weight at each.
+
+        `predicted` are predictions of the usable rows, (n_usable,).
+        """
         residuals = (self._usable_readings - predicted) / self._relative_sd
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
         sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12)) or 1.0

@@ -79,8 +79,9 @@ def improvement_and_correction(
 ) -> tuple[Improvement, FloatArray]:
     """Correct the residuals of the best fit by basis functions, if this improves held-out predictions.
 
-    Bases are added one at a time until the test passes or the next one gains nothing. If the first gains nothing on
-    other scans, blocks within scans are held out instead, for residuals that are local in time.
+    Bases are added one at a time, at most six, until the test passes or the next one gains less than its sd. If the
+    first gains nothing on other scans, blocks within scans are held out instead, for residuals that are local in time.
+    Where nothing can be held out, one basis is added without that check.
 
     Returns
     -------

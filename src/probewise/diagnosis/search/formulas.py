@@ -34,7 +34,7 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
     prepared = searched.prepared
     if not needs_more_than_memoryless_noise(searched) or prepared.apparatus.is_refit_budget_spent():
         return searched
-    proposals = prepared.apparatus.proposed_effects()
+    proposals = prepared.apparatus.proposed_formulas()
     if not proposals:
         return searched
     progress("weighing formulas")

@@ -323,7 +323,7 @@ class Searched:
     def probabilities_of_unknown_forms(self) -> dict[str, float]:
         """Return the probability of each form of an unknown effect: effects out of vocabulary, families of bases.
 
-        They sum to one.
+        They sum to one, if any has a probability.
         """
         by_mean = self.posterior.by_mean
         unknown = by_mean.get(("unknown",), 0.0)

@@ -107,7 +107,7 @@ class SimulatorApparatus:
         stops = {} if self.stop is None else {self.stop.name: self.stop}
         return forms | {effect.name: effect for effect in on_noise} | stops
 
-    def proposed_effects(self) -> dict[str, NamedEffect[Any]]:
+    def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
         """Return by name the formulas to propose: short expressions of columns and states."""
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in proposals(self.about)})
 

@@ -256,7 +256,7 @@ class Inquiry(ShowsItself):
         return bool(self._goal) and 1.0 < self._largest_sd_over_goal < _NEAR_GOAL
 
     def _utility_by_weights(self, weight: FloatArray) -> FloatArray:
-        """Compute the acquisition function for the posterior samples with these weights, (n_settings,)."""
+        """Compute the acquisition function per reading, (n_settings,), for the posterior samples with these weights."""
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
         theta = self._posterior.theta[resampled_rows(weight, n, self._rng)]
         theta = theta[self._rng.permutation(n)]  # copies of one sample apart

@@ -71,7 +71,7 @@ def arm_and_sensor(
 
 
 def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw the arm from the side with every length of its geometry, for building or measuring it.
+    """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring it.
 
     Parameters
     ----------

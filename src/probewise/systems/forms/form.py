@@ -148,17 +148,17 @@ class Form:
 
     @property
     def scans(self) -> tuple[str, ...]:
-        """Empty: it acts in all runs."""
+        """Names of the runs to which it is restricted: (), it acts in all."""
         return ()
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """Empty: tables have no patterns."""
+        """Names of the patterns to which it is restricted: (), tables have none."""
         return ()
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Empty: no further columns are needed."""
+        """Names of further columns that it needs: (), none."""
         return ()
 
     def variants(self) -> tuple[Form, ...]:

@@ -68,7 +68,7 @@ class EffectSampler:
 
     Parameters
     ----------
-    visible_covariates
+    residual_covariates
         Covariates along which its residual is visible.
     draw
         Function that draws all parameters except the amplitude.
@@ -80,7 +80,7 @@ class EffectSampler:
         Whether its size can be chosen; otherwise the amplitude is `first`.
     """
 
-    visible_covariates: tuple[str, ...]
+    residual_covariates: tuple[str, ...]
     draw: Draw
     first: float
     limit: float

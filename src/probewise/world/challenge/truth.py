@@ -43,16 +43,16 @@ class HiddenEffect:
         return self.name in INSIDE
 
     @property
-    def visible_covariates(self) -> tuple[str, ...]:
+    def residual_covariates(self) -> tuple[str, ...]:
         """Covariates along which its residual is visible."""
-        return (INSIDE.get(self.name) or OUTSIDE[self.name]).visible_covariates
+        return (INSIDE.get(self.name) or OUTSIDE[self.name]).residual_covariates
 
     @property
     def parameters(self) -> dict[str, object]:
         """Parameters by name, as in the vocabulary."""
         return dict(vars(self.effect))
 
-    shows_in = visible_covariates  # its old name
+    shows_in = visible_covariates = residual_covariates  # its old names
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Truth:
                     "in_vocabulary": hidden.in_vocabulary,
                     "parameters": hidden.parameters,
                     "size_lambda": hidden.size_lambda,
-                    "shows_in": hidden.visible_covariates,
+                    "shows_in": hidden.residual_covariates,
                     "region": None if hidden.region is None else dataclasses.asdict(hidden.region),
                 }
                 for hidden in self.hidden

@@ -25,10 +25,10 @@ from probewise.world.systems.formulas import FORMULAS
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
 from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
+from probewise.world.systems.residual_covariates import residual_covariates_of
 from probewise.world.systems.rivals import rivals_with_nats, vocabulary_name
 from probewise.world.systems.strata import system_stratum_of
 from probewise.world.systems.table import SystemTable
-from probewise.world.systems.visible_covariates import visible_covariates_of
 from probewise.world.systems.vocabulary import FAMILIES, forms_of
 
 KINDS: tuple[SystemKind, ...] = (*FORMULAS, *LAWS)
@@ -392,4 +392,4 @@ def _effect_with_rivals(
         frozenset({effect.name, *(e.name for e in others)}),
     )
     left = (target - fitted.readings) / drawn.kind.sd
-    return replace(effect, rivals=rivals, covariates=visible_covariates_of(effect.form, left, drawn.true_system))
+    return replace(effect, rivals=rivals, covariates=residual_covariates_of(effect.form, left, drawn.true_system))

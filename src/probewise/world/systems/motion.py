@@ -217,7 +217,7 @@ class _Integration:
             hair = 1e-8 if len(edges) > 2 else 0.0
             begin, end = low + hair, high - hair
             at_begin = free_rates(begin, s) if hard else {}
-            modes = [_mode_of_motion(f, size, s[names.index(f.target)], at_begin[f.target]) for f, size in hard]
+            modes = [_stick_or_bound_mode(f, size, s[names.index(f.target)], at_begin[f.target]) for f, size in hard]
 
             n_calls = 0
 
@@ -312,7 +312,7 @@ class _Integration:
             for _ in range(_MOST_EVENTS):
                 rates = free_rates(share, s)
                 modes = [
-                    forced.get(m, int(_mode_of_motion(f, size, s[names.index(f.target)], rates[f.target])))
+                    forced.get(m, int(_stick_or_bound_mode(f, size, s[names.index(f.target)], rates[f.target])))
                     for m, (f, size) in enumerate(hard)
                 ]
 
@@ -369,8 +369,8 @@ def _intervals_between(edges: Sequence[float]) -> Iterator[tuple[float, float]]:
     return ((low, high) for low, high in pairwise(edges) if high - low > _CLOSE)
 
 
-def _mode_of_motion(form: Form, size: Any, value: Any, rate: Any) -> Any:
-    """Return the mode: for friction, the direction of motion, 0 at rest; for a bound, 1 if free, 0 if held."""
+def _stick_or_bound_mode(form: Form, size: Any, value: Any, rate: Any) -> Any:
+    """Return the mode: for friction, the direction of motion, 0 if it sticks; for a bound, 1 if free, 0 if held."""
     if form.sticks:
         return np.where(value != 0, np.sign(value), np.where(np.abs(rate) > size, np.sign(rate), 0.0))
     return np.where((value >= size) & (rate > 0), 0, 1)

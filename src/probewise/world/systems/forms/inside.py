@@ -27,16 +27,16 @@ def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
         if name in true.kind.per_run and true.kind.law is not None:
             own = {}  # initial values do not vary within a run
         for kind, how in own.items():
-            yield varying_parameter(true, f"{kind}:{name}", name, how)
+            yield varying_parameter_form(true, f"{kind}:{name}", name, how)
         if not (name in true.kind.per_run and true.kind.law is not None):
             for column in true.varying_columns:
-                yield varying_parameter(
+                yield varying_parameter_form(
                     true, f"depends:{name}:{column}", name, modulations.proportional_to_column(true, column)
                 )
 
 
-def varying_parameter(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
-    """Return the form `name` by which the parameter `target` varies as a modulation."""
+def varying_parameter_form(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
+    """Build the effect `name`, by which the parameter `target` varies as `how` says: a step, a drift, with a column."""
     first = 0.003 * float(np.abs(true.parameters[target]).mean()) / how.reach
     return Form(
         name,
@@ -56,7 +56,7 @@ def varying_parameter(true: TrueSystem, name: str, target: str, how: Modulation)
     )
 
 
-def term_in_rate(
+def rate_term_form(
     true: TrueSystem,
     name: str,
     state: str,
@@ -95,25 +95,25 @@ def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
     for state, values in true.states.items():
         size = float(np.abs(values).max())
         own = (f"state:{state}", "time")
-        yield term_in_rate(
+        yield rate_term_form(
             true, f"damping:{state}", state, _term_in_state(state, lambda r: -r), size, own, signed=False
         )
         drags = _term_in_state(state, lambda r: -np.abs(r) * r)
-        yield term_in_rate(true, f"drag:{state}", state, drags, size**2, own, signed=False)
-        yield term_in_rate(
+        yield rate_term_form(true, f"drag:{state}", state, drags, size**2, own, signed=False)
+        yield rate_term_form(
             true, f"forcing:{state}", state, _term_in_state(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
         )
         for other, there in true.states.items():
             most = float(np.abs(there).max())
             seen = (f"state:{other}", "time")
-            yield term_in_rate(
+            yield rate_term_form(
                 true, f"cubic:{state}:{other}", state, _term_in_state(other, lambda r: -(r**3)), most**3, seen
             )
-            yield term_in_rate(
+            yield rate_term_form(
                 true, f"quadratic:{state}:{other}", state, _term_in_state(other, lambda r: -(r**2)), most**2, seen
             )
             if other != state:
-                yield term_in_rate(
+                yield rate_term_form(
                     true, f"coupling:{state}:{other}", state, _term_in_state(other, lambda r: -r), most, seen
                 )
         yield _periodic_term(true, state)

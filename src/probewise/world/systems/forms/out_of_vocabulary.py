@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Instants, Numbers
-from probewise.world.systems.forms.inside import term_in_rate
+from probewise.world.systems.forms.inside import rate_term_form
 from probewise.world.systems.forms.modulations import scale_only_member
 from probewise.world.systems.forms.readings import OFFSET
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
@@ -182,7 +182,7 @@ def _two_settlings(true: TrueSystem) -> Form:
 def _one_sided_spring(true: TrueSystem, state: str) -> Form:
     at = float(np.quantile(true.states[state], 0.6))
     size = float(np.ptp(true.states[state]))
-    return term_in_rate(
+    return rate_term_form(
         true,
         f"strange_one_sided_spring:{state}",
         state,
@@ -199,7 +199,7 @@ def _leak(true: TrueSystem, state: str) -> Form:
     def push(s: dict[str, FloatArray], now: object, v: Numbers) -> FloatArray:
         return np.asarray(-np.expm1(np.clip(s[state] / scale, -30, 12)))
 
-    return term_in_rate(
+    return rate_term_form(
         true,
         f"strange_leak:{state}",
         state,
@@ -212,7 +212,7 @@ def _leak(true: TrueSystem, state: str) -> Form:
 
 def _column_times_state(true: TrueSystem, state: str, column: str) -> Form:
     middle, spread, most = true.mean_of(column), true.sd_of(column), float(np.abs(true.states[state]).max())
-    return term_in_rate(
+    return rate_term_form(
         true,
         f"strange_column_times_state:{state}:{column}",
         state,

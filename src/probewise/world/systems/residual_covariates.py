@@ -13,7 +13,7 @@ _AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts 
 _PLAIN = 0.25  # least explained share of the sum of squares
 
 
-def visible_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
+def residual_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
     """Return the covariates that a right answer may rank first: the form's own, and equivalent ones.
 
     Parameters

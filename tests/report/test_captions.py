@@ -26,7 +26,7 @@ from probewise.recordings import Disc, Instrumentation, read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
 from probewise.report.animation import animated_gif
-from probewise.scene import Circle, HypothesisScene, outlines
+from probewise.scene import Circle, HypothesisScene, Rectangle, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture, footprint_of, mean_ssf_field
 from probewise.world import Blob, World, gaussian_spot
 
@@ -192,3 +192,12 @@ def test_the_page_of_a_calibration_names_what_is_there_and_prints_no_error_of_ze
     cells = re.search(r"A_1</td>.*?</tr>", page)[0]
     assert "0.031" in cells
     assert f"{sensor.sd()['A_1']:.3f}" not in cells
+
+
+def test_the_errors_of_a_rectangle_do_not_depend_on_which_side_is_its_width():
+    """One of 80 x 120 that was found as 120.5 x 79, turned by nearly a quarter turn, is off by a millimetre."""
+    shape = Rectangle()
+    last = SimpleNamespace(names=shape.prior.names, mean=np.array([600.0, 250.0, 120.5, 79.0, 1.565]), likely_shape="")
+    found = SimpleNamespace(experiment=SimpleNamespace(shape=shape), last=last, sd=np.array([1.0, 1.0, 2.0, 3.0, 0.1]))
+    truth = dict(zip(shape.prior.names, (600.0, 250.0, 80.0, 120.0, 0.0), strict=True))
+    assert "width 0.5 ± 2.0 mm, height \N{MINUS SIGN}1.0 ± 3.0 mm" in exploration.errors_text(found, truth)

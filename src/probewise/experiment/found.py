@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.experiment.left_out import left_out_after_step
 from probewise.experiment.state import Exploration, require_exploration
-from probewise.experiment.stopping_rule import probability_of_length_off, shape_samples
+from probewise.experiment.stopping_rule import probability_of_length_off
 from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.table import csv_text_of_rows
 from probewise.scene.albedo import Shape
@@ -50,7 +50,7 @@ class FoundShape:
 def found_shape(run: Exploration) -> FoundShape:
     """Summarise the posterior after the last reading: the most probable shape and its parameters."""
     shape, last = run.experiment.shape, run.last
-    theta, weight = shape_samples(run.experiment, run.posterior.theta, run.posterior.weight), run.posterior.weight
+    theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
     name = last.likely_shape or _shape_name(shape)
     if isinstance(shape, AnyOf):
         own = shape.shape_index(theta) == shape.shape_names.index(name)
@@ -94,7 +94,7 @@ def samples_csv(run: Exploration) -> str:
     """
     require_exploration(run)
     shape, names = run.experiment.shape, run.last.names
-    theta, weight = shape_samples(run.experiment, run.posterior.theta, run.posterior.weight), run.posterior.weight
+    theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
     several = isinstance(shape, AnyOf)
     columns = [k for k, name in enumerate(names) if name != "shape"]
     rows = []

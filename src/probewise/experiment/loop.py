@@ -21,6 +21,7 @@ from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
 from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_and_rate_readings
+from probewise.experiment.aligned_angles import with_aligned_angles
 from probewise.experiment.arm_error import arm_error_in_posterior, draw_shape_shifts_from_arm_error
 from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.experiment.hidden import HiddenShape
@@ -129,11 +130,13 @@ def step(
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
     wary = carried.with_warier_odds
-    posterior = wary.joined(rng=rng)
+    joined = wary.joined(rng=rng)
+    posterior = with_aligned_angles(experiment, joined)
     if _may_stop_and_chance_off(experiment, posterior, None, "", rng)[0]:
         carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
         wary = carried.with_warier_odds
-        posterior = wary.joined(rng=rng)
+        joined = wary.joined(rng=rng)
+        posterior = with_aligned_angles(experiment, joined)
     mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     leader = carried.kinds[carried.leader]
     p_value, worst = p_value_and_worst_reading(
@@ -180,9 +183,7 @@ def step(
         samples=utility_input.drawn[:, experiment.shape_columns],
         map=utilities,
         next_pose=None if reason else pose,
-        bits=bits_gained(
-            information_nats(posterior), problem.prior.log_prob(posterior.theta), posterior.weight, prior_bits
-        ),
+        bits=bits_gained(information_nats(joined), problem.prior.log_prob(joined.theta), joined.weight, prior_bits),
         p_value=p_value,
         posterior=posterior,
         sensor=sensor_moments(experiment, posterior),

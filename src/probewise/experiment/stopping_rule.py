@@ -14,7 +14,6 @@ from probewise.inference.problem import SensorProblem
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.scene.any_of import AnyOf
-from probewise.scene.symmetry import mean_angles, with_angles_near
 
 OFF_SDS = 3.0
 """Error, in units of the stopping rule's sd, above which a length counts as wrong: 12 mm for 4 mm."""
@@ -26,25 +25,16 @@ def information_nats(posterior: Weighted) -> float:
     return float(posterior.weight[some] @ posterior.log_likelihood[some]) - posterior.log_z
 
 
-def shape_samples(experiment: Experiment, theta: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the shape's parameters of weighted samples, (n_samples, n_params), with angles about their circular mean.
-
-    `theta` has the columns of the experiment. An angle may lie outside its prior's range by up to half a turn of the
-    shape's symmetry.
-    """
-    own = theta[:, experiment.shape_columns]
-    return with_angles_near(experiment.shape, own, mean_angles(experiment.shape, own, weight))
-
-
 def shape_moments_and_probabilities(
     experiment: Experiment, posterior: Weighted
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     """Return mean and sd of the shape's parameters, (n_params,) each, and the probability of each shape by label.
 
+    Angles are taken as they are, see `with_aligned_angles`.
     For a set of shapes, the moments are those given the most probable shape, with NaN for parameters that it does not
     have. For a single shape the probabilities are empty.
     """
-    theta, weight = shape_samples(experiment, posterior.theta, posterior.weight), posterior.weight
+    theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
     if not isinstance(experiment.shape, AnyOf):
         mean = weight @ theta
         return mean, np.sqrt(weight @ (theta - mean) ** 2), {}
@@ -65,7 +55,7 @@ def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_m
 
     For a set of shapes: from the mean given the most probable shape, and other shapes count as wrong.
     """
-    theta, weight = shape_samples(experiment, posterior.theta, posterior.weight), posterior.weight
+    theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
     mean, _, _ = shape_moments_and_probabilities(experiment, posterior)
     lengths = [
         k for k, name in enumerate(experiment.shape.prior.names) if name.endswith("_mm") and np.isfinite(mean[k])

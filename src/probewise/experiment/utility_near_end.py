@@ -14,6 +14,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
+from probewise.experiment.aligned_angles import theta_with_aligned_angles
 from probewise.experiment.checking import (
     ENOUGH_BITS,
     FAR_SIDE,
@@ -25,7 +26,7 @@ from probewise.experiment.checking import (
 from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.stopping_rule import OFF_SDS, shape_samples
+from probewise.experiment.stopping_rule import OFF_SDS
 from probewise.inquiry import UtilityInput, UtilityMap, entropy_bits
 from probewise.inquiry.given_reading import GivenReading
 from probewise.recordings.plan import Plan
@@ -130,7 +131,7 @@ def _map_of_candidates(
 
 def _mean_shape_theta(experiment: Experiment, utility_input: UtilityInput) -> FloatArray:
     """Return the posterior mean of the shape's parameters, (1, n_params)."""
-    theta = shape_samples(experiment, utility_input.theta, utility_input.weight)
+    theta = utility_input.theta[:, experiment.shape_columns]
     return np.asarray((utility_input.weight @ theta)[None] / utility_input.weight.sum())
 
 
@@ -153,8 +154,8 @@ def _draw_theta_lengths_weights(
             whole.append(kind.to_whole_theta(own, rng))
             weight.append(np.full(n, p / n))
     share = np.concatenate(weight)
-    shapes = shape_samples(experiment, np.concatenate(whole), share)
-    return theta, shapes[:, columns - experiment.shape_columns[0]], share / share.sum()
+    aligned = theta_with_aligned_angles(experiment, np.concatenate(whole), share)
+    return theta, aligned[:, columns], share / share.sum()
 
 
 def _candidate_designs(

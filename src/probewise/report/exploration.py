@@ -30,7 +30,7 @@ from probewise.report.plots import (
     posterior_widths,
 )
 from probewise.report.words import count, interval, number, probability, unit_name, unit_of, with_error, without_unit
-from probewise.scene import outlines
+from probewise.scene import AnyOf, outlines, with_angles_near
 
 MODEL_NAMES = {"ssf": "SSF"}
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
@@ -154,12 +154,26 @@ def _fault_section(steps: Sequence[Step], trust: float) -> Section:
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, with the posterior sd; those without a truth are left out."""
-    step = run.last
+    step, truth = run.last, _truth_near_estimate(run, truth)
     return ", ".join(
         f"{without_unit(_without_shape(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
+
+
+def _truth_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[str, float]:
+    """Return the truth with its angle within half a turn of the estimate's: a rectangle's sides may then be swapped."""
+    shape, step = run.experiment.shape, run.last
+    likely, columns = shape, np.arange(len(step.names))
+    if isinstance(shape, AnyOf):
+        likely = shape.shapes[step.likely_shape]
+        columns = shape.prior.columns[shape.shape_names.index(step.likely_shape)]
+    names = [step.names[k] for k in columns]
+    if not all(name in truth for name in names):
+        return dict(truth)
+    near = with_angles_near(likely, np.array([[truth[name] for name in names]]), step.mean[columns])[0]
+    return {**truth, **dict(zip(names, near.tolist(), strict=True))}
 
 
 def summary_sentence(run: Exploration) -> str:

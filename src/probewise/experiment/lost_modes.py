@@ -51,6 +51,6 @@ def _share_beyond(own: Weighted, found: Weighted) -> float:
     """Return the share of the samples found beyond the range of a kind's own in some parameter, less chance's part."""
     kept = own.theta[own.weight > 0]
     outside = ((found.theta < kept.min(axis=0)) | (found.theta > kept.max(axis=0))).any(axis=1)
-    by_chance = 2 * kept.shape[1] / (len(kept) + 1)
+    by_chance: float = 2 * kept.shape[1] / (len(kept) + 1)
     beyond = float(found.weight[outside].sum())
     return beyond - by_chance

@@ -175,6 +175,33 @@ def test_a_step_at_a_row_is_there_in_the_recording_and_its_first_rows():
     np.testing.assert_allclose(predicted(model, both).mean[40:], 3.0 + table.columns["x"][:5])
 
 
+@pytest.mark.parametrize("rows", [(5, 20), (20, 40), (39, 40), (0, 1)], ids=["middle", "second file", "last", "first"])
+def test_a_part_of_the_recording_is_predicted_where_it_is_in_it(rows):
+    """Rows 5 to 19 were predicted as what comes after the recording, with the step on."""
+    model, table = _model_with_a_step_at_a_row()
+    part = table.take(np.arange(*rows))
+    np.testing.assert_allclose(predicted(model, part).mean, part.columns["y"])
+    cut = RunTable({**part.columns, "y": np.append(part.columns["y"][:-1], np.nan)})
+    later = predicted(model, cut).mean - cut.columns["x"]  # a reading that the recording has is missing: other rows
+    np.testing.assert_allclose(later, 3.0)
+
+
+def test_a_part_is_found_in_a_recording_in_which_rows_are_repeated_and_cells_are_missing():
+    model, table = _model_with_a_step_at_a_row()
+    known = model.known
+    x, y = np.round(table.columns["x"]), np.round(table.columns["y"])
+    y[30] = np.nan
+    table = RunTable({"x": x, "y": y})
+    model = dataclasses.replace(model, known=dataclasses.replace(known, table=table))
+    part = {"x": x[22:35].copy(), "y": y[22:35]}
+    part["x"][1] = np.nan  # as in the file; the model's own copy has it interpolated
+    with pytest.warns(DoubtfulResultWarning, match="first row 3"):
+        found = predicted(model, part).mean - x[22:35]
+    np.testing.assert_allclose(
+        np.delete(found, 1), np.where(np.arange(22, 35) > _STEP_AT, 3.0, 1.0)[np.arange(13) != 1]
+    )
+
+
 def test_a_new_table_comes_after_the_step_at_a_row_of_the_recording():
     """The machine jumped and stayed there; before, a new table began anew, ahead of the jump."""
     model, table = _model_with_a_step_at_a_row()

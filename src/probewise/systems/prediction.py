@@ -118,11 +118,11 @@ def predict_system(
     prediction, with all effects of the model. For a run outside the recording, each sample draws the parameters per
     run: a `per_run` parameter from its prior; an effect's value per run from a Student-t about the sample's values for
     the recorded runs, with their scatter as its width, and one degree of freedom more than there are runs. Where no
-    time was recorded, a step at a row (`at_row`) counts the rows of the recording: those of a table that does not begin
-    with the recording's rows, readings included, come after its end. A row that lacks a number which the simulator or
-    an effect needs has no prediction (NaN), and with a law the rows after it in the run neither; effects that look back
-    to it, such as a lag, take the number interpolated within the run. The effect of a column that counts from its mean
-    is 0 where the column is missing, as in the fit.
+    time was recorded, a step at a row (`at_row`) counts the rows of the recording: those of a table that neither
+    begins with the recording's rows nor is a contiguous part of them, readings included, come after its end. A row that
+    lacks a number which the simulator or an effect needs has no prediction (NaN), and with a law the rows after it in
+    the run neither; effects that look back to it, such as a lag, take the number interpolated within the run. The
+    effect of a column that counts from its mean is 0 where the column is missing, as in the fit.
 
     Parameters
     ----------
@@ -195,21 +195,35 @@ def predict_system(
 def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
     """Return the number of a table's first row, counted from the first of the recording that the model was fitted to.
 
-    A table that begins with the recording's rows, or is a part from its beginning, is that recording; any other comes
-    after its end.
+    A table that begins with the recording's rows, or is a contiguous part of them, readings included, is that
+    recording; any other comes after its end.
     """
     reading, known = fitted.simulator.reading, fitted.known
     if known is None:
         return 0
     table, recorded = cast(RunTable, recording.plan), known.table
-    n = min(len(table), len(recorded))
-    if not np.array_equal(recording.readings[:n], recorded.columns[reading][:n], equal_nan=True):
+    if not np.isfinite(recording.readings).any():
         return len(recorded)
-    for name in recorded.covariates.keys() & table.covariates.keys() - {reading}:
-        now, then = table.covariates[name][:n], recorded.covariates[name][:n]
-        if np.any((now != then) & np.isfinite(now)):  # a cell that it lacked was interpolated when it was fitted
-            return len(recorded)
-    return 0
+    inputs = sorted(recorded.covariates.keys() & table.covariates.keys() - {reading})
+    now, then = (
+        np.stack([np.where(np.isfinite(readings), readings, np.inf), *(own.covariates[name] for name in inputs)])
+        for own, readings in ((table, recording.readings), (recorded, recorded.columns[reading]))
+    )
+    at = _first_column_of_block(now[:, : len(recorded)], then)
+    return len(recorded) if at is None else at
+
+
+def _first_column_of_block(block: FloatArray, within: FloatArray) -> int | None:
+    """Return the first column from which `within` (n, n_columns) holds `block` (n, n_block); None if it does not.
+
+    What is NaN in the block fits anything: an input that the recording lacked was interpolated when it was fitted.
+    """
+    starts = np.arange(within.shape[1] - block.shape[1] + 1)
+    for k, column in enumerate(block.T):
+        starts = starts[((within[:, starts + k] == column[:, None]) | np.isnan(column[:, None])).all(axis=0)]
+        if not starts.size:
+            return None
+    return int(starts[0])
 
 
 def _table_without_gaps(chain: SystemChain, theta: FloatArray, table: RunTable) -> tuple[RunTable, BoolArray]:

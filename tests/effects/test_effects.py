@@ -343,7 +343,8 @@ def test_no_other_effect_on_the_mean_counts_from_0(name):
         (-999.0, 999.0, Origin()),
         (1001.0, 0.0, Origin(time_s=1001.0)),
         (0.0, 1001.0, Origin(x_mm=1051.0)),
-        (-1001.0, -1101.0, Origin(time_s=-1001.0, x_mm=-1051.0)),
+        (-1001.0, -1001.0, Origin()),  # it ends within ten lengths of 0
+        (-1101.0, -1101.0, Origin(time_s=-1101.0, x_mm=-1051.0)),
     ],
 )
 def test_a_recording_within_ten_of_its_lengths_of_0_counts_from_0(start_s, start_mm, origin):

@@ -35,19 +35,17 @@ class Origin:
     def of(cls, plan: Plan) -> Self:
         """Choose the origin for a recording by its plan, for each axis on its own.
 
-        It is 0 where the recording begins within ten of its own lengths of 0: its duration, or the diagonal of its
+        It is 0 where the recording comes within ten of its own lengths of 0: its duration, or the diagonal of its
         places. Farther away it is the first time, and the middle of the places.
         """
-        first_s, duration_s = float(plan.time_s.min()), float(np.ptp(plan.time_s))
         length_mm = float(np.hypot(np.ptp(plan.x_mm), np.ptp(plan.y_mm)))
 
         def middle_mm(places_mm: FloatArray) -> float:
-            far = is_far_from_zero(float(np.abs(places_mm).min()), length_mm)
+            far = is_far_from_zero(places_mm, length_mm)
             return float(places_mm.min() + places_mm.max()) / 2 if far else 0.0
 
-        return cls(
-            first_s if is_far_from_zero(first_s, duration_s) else 0.0, middle_mm(plan.x_mm), middle_mm(plan.y_mm)
-        )
+        time_s = float(plan.time_s.min()) if is_far_from_zero(plan.time_s, float(np.ptp(plan.time_s))) else 0.0
+        return cls(time_s, middle_mm(plan.x_mm), middle_mm(plan.y_mm))
 
     def seconds(self, plan: Plan) -> FloatArray:
         """Return the time of each reading since the origin, s, (n_points,)."""
@@ -92,6 +90,6 @@ class CountsPlaceFromOrigin(CountsFromOrigin):
         return f"X and Y count from ({x_mm:g}, {y_mm:g}) mm" if x_mm or y_mm else ""
 
 
-def is_far_from_zero(start: float, length: float) -> bool:
-    """Return whether values that begin at `start` lie more than ten of their lengths from 0; none of length 0 do."""
-    return abs(start) > _FAR * length > 0.0
+def is_far_from_zero(values: FloatArray, length: float) -> bool:
+    """Return whether all values, (n_points,), lie more than ten lengths from 0; with length 0 none do."""
+    return float(np.nanmin(np.abs(values))) > _FAR * length > 0.0

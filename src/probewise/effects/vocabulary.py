@@ -13,7 +13,6 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_mapping
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import FittedReadings
-from probewise.effects.origin import CountsFromOrigin
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseParameters
@@ -58,6 +57,14 @@ class NamedEffect(Effect[V], Protocol[V]):
     def reads(self) -> tuple[str, ...]:
         """Columns of a plan that it reads besides place, time and scan; by default none."""
         return ()
+
+    @property
+    def counted_from(self) -> str:
+        """From where it counts a time, a place or a column, in words; "" for 0, or if it does not count: the default.
+
+        The recording that is diagnosed sets it, so that the effect means the same in any other plan.
+        """
+        return ""
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
@@ -216,8 +223,7 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
 def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
     """Describe an effect by samples of its parameters, (n_samples, n_params), and say from where it counts if not 0."""
     sentence = effect.sentence(samples.mean(axis=0), samples.std(axis=0))
-    counted_from = effect.counted_from if isinstance(effect, CountsFromOrigin) else ""
-    return f"{sentence} ({counted_from})" if counted_from else sentence
+    return f"{sentence} ({effect.counted_from})" if effect.counted_from else sentence
 
 
 def single_column_bank(*parameters: ArrayLike) -> FloatArray:

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
+from probewise.effects import public_name
+from probewise.effects.vocabulary import sentence_from_samples
 from probewise.errors import FileError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
 from probewise.systems.forms import ReferenceFit, forms_of
@@ -17,6 +19,9 @@ from probewise.systems.forms.rebinding import extract_recorded
 EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
 FAR = 2.0**21  # of a column
 N_ROWS = 60
+COUNTS_TIME = (
+    "offset_drift", "gain_drift", "drifts:gain", "drifts:offset", "interference", "clock_drift", "periodic_forcing:s",
+)  # fmt: skip
 _T = np.tile(0.125 * np.arange(N_ROWS // 2), 2)
 _DRIVE = np.round(512 * (np.sin(_T) + 0.3 * np.sin(3.1 * _T))) / 512
 
@@ -67,6 +72,9 @@ def test_a_recording_that_begins_within_ten_of_its_lengths_is_counted_from_0():
     assert origin_of_column(np.array([-10.0, -9.0])) == 0.0
     assert origin_of_column(np.array([10.5, 11.5])) == 10.5
     assert origin_of_column(np.array([-20.0, np.nan, -19.0])) == -20.0
+    assert origin_of_column(np.array([-101.0, -91.0])) == 0.0  # by its near end, as one in front of 0 is
+    assert origin_of_column(np.array([91.0, 101.0])) == 0.0
+    assert origin_of_column(np.array([-1.0, 1000.0])) == 0.0
     assert origin_of_column(np.array([7.0, 7.0])) == 0.0
     assert time_origin(_table(0.0)) == 0.0
     assert time_origin(_table(EPOCH)) == EPOCH
@@ -105,8 +113,35 @@ def test_a_periodic_error_of_a_column_far_from_0_has_its_phase_from_there():
     for setting in ([0.1, 0.7, 0.4], [0.05, 0.31, -1.0]):
         shifted = [*setting[:2], setting[2] - 2 * np.pi * least / setting[1]]  # that from 0 has it at 0
         np.testing.assert_allclose(_readings(away, found, setting), _readings(near, form, shifted), atol=1e-8)
-    assert f"its phase counted from {FAR + least:.12g}" in found.sentence(np.array(setting), np.array([0.01] * 3))
-    assert "phase" not in form.sentence(np.array(setting), np.array([0.01] * 3))
+
+
+@pytest.mark.parametrize(
+    ("how", "name"),
+    [*((_function, name) for name in COUNTS_TIME[:-2]), *((_law, name) for name in COUNTS_TIME[-2:])],
+)
+def test_what_counts_from_a_far_time_says_so_and_nothing_else_does(how, name):
+    """The drift of a gain is 0 at the first time: without that time its size alone says nothing."""
+    near, later = (forms_of(_about(shift, 0.0, how)) for shift in (0.0, EPOCH))
+    setting = near[name].bank()[:1, 0]
+    plain = sentence_from_samples(near[name], setting)
+    assert sentence_from_samples(later[name], setting) == f"{plain} (t_s counts from 1700000000 s)"
+    assert not [each for each, form in near.items() if form.counted_from]
+    counting = {public_name(each) for each, form in later.items() if form.counted_from}
+    assert counting <= set(COUNTS_TIME)
+
+
+def test_a_column_that_is_far_from_0_is_named_in_the_sentence_of_its_wave():
+    form = forms_of(_about(0.0, FAR, _function))["periodic_error:drive"]
+    said = sentence_from_samples(form, form.bank()[:1, 0])
+    assert said.endswith(f" (drive counts from {FAR + _DRIVE.min():.12g})")
+
+
+def test_the_proposal_of_a_square_wave_says_from_which_time_it_counts():
+    near, later = (
+        next(form for form in proposals(_about(shift, 0.0, _function)) if "mod 1" in form.name)
+        for shift in (0.0, EPOCH)
+    )
+    assert (near.counted_from, later.counted_from) == ("", "t_s counts from 1700000000 s")
 
 
 def test_a_mean_is_rounded_no_coarser_than_the_spread_about_it():

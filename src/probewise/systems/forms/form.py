@@ -89,6 +89,8 @@ class Form:
         Names of parameters that are zero in this one of several alternatives; reports leave them out.
     needs_rising_time
         Whether it looks back to earlier times of a run, which time must then not fall within.
+    counted_from
+        From where it counts a time or a column, in words; "" for 0, or if it does not count.
     """
 
     name: str
@@ -107,6 +109,7 @@ class Form:
     alternatives: tuple[Form, ...] = ()
     fixed: tuple[str, ...] = ()
     needs_rising_time: bool = False
+    counted_from: str = ""
 
     @cached_property
     def prior(self) -> Product:

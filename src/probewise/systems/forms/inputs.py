@@ -112,8 +112,10 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
                 yield replace(form, needs_rising_time=True)
     if time is not None:
         says = partial(_fill_sentence, "the true time is the recorded time times (1 + a), a = {}")
-        clock = _column_changer(time, _clock_at_rate(time_origin(table)))
-        yield from _linear_form(about, "clock_drift", clock, 1e-5, "1", says, "time")
+        origin = time_origin(table)
+        clock = _column_changer(time, _clock_at_rate(origin))
+        for form in _linear_form(about, "clock_drift", clock, 1e-5, "1", says, "time"):
+            yield replace(form, counted_from=origin_in_words(time, origin, about.time_unit))
 
 
 def _fill_sentence(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
@@ -234,9 +236,9 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         lambda m, s: (
             f"{name} has a periodic error with an amplitude of {mean_with_sd(m[0], s[0], '')} "
             f"and a period of {mean_with_sd(m[1], s[1], '')}, both in units of {name}"
-            f"{origin_in_words(origin, '')}"
         ),
         joined=starting_point_of_wave,
+        counted_from=origin_in_words(name, origin),
     )
 
 

@@ -26,7 +26,7 @@ class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
     `marginals` is a function of the amplitude's prior, `entries` of its typical size, `units` of the quantity's unit,
-    `says` of the quantity's name and unit and the parameters' mean and sd.
+    `says` of the quantity's name and unit and the parameters' mean and sd. `counted_from` is that of the forms.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
@@ -38,6 +38,7 @@ class Modulation:
     amplitudes: tuple[int, ...] = (0,)
     change_points: ChangePoints | None = None
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+    counted_from: str = ""
 
 
 def _single_entry(size: float) -> FloatArray:
@@ -54,6 +55,7 @@ def linear_drift(table: RunTable, time_unit: str) -> Modulation:
         units=lambda unit: (f"{unit}/{time_unit}",),
         says=lambda what, unit, mean, sd: f"{what} drifts by {mean_with_sd(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
+        counted_from=origin_in_words(table.time, origin, time_unit),
     )
 
 
@@ -172,8 +174,9 @@ def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
             f"{what} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], unit)} and a period of "
-            f"{1 / mean[1]:.4g} {time_unit}{origin_in_words(origin, time_unit)}"
+            f"{1 / mean[1]:.4g} {time_unit}"
         ),
         covariates=("time",),
+        counted_from=origin_in_words(table.time, origin, time_unit),
         joined=starting_point_of_wave,
     )

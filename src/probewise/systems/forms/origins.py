@@ -16,12 +16,12 @@ _ALL = 17  # digits of a number in double precision
 def origin_of_column(values: FloatArray) -> float:
     """Return the origin from which an effect counts a column, (n_points,), in its unit: 0 unless that is far away.
 
-    Where the column's least value is more than ten of its ranges from 0, as a time in seconds of the epoch is, the
-    origin is that value. Counted from 0, a drift would be a constant, and a phase would turn with the last digit of a
+    Where all its values are more than ten of its ranges from 0, as times in seconds of the epoch are, the origin is the
+    least of them. Counted from 0, a drift would be a constant, and a phase would turn with the last digit of a
     frequency.
     """
-    least, reach = float(np.nanmin(values)), float(np.nanmax(values) - np.nanmin(values))
-    return least if is_far_from_zero(least, reach) else 0.0
+    least = float(np.nanmin(values))
+    return least if is_far_from_zero(values, float(np.nanmax(values)) - least) else 0.0
 
 
 def time_origin(table: RunTable) -> float:
@@ -32,9 +32,9 @@ def time_origin(table: RunTable) -> float:
     return origin_of_column(table.time_s)
 
 
-def origin_in_words(origin: float, unit: str) -> str:
-    """Return what to add to a sentence about a wave: the origin of its phase, "" if that is 0."""
-    return f", its phase counted from {origin:.12g} {unit}".rstrip() if origin else ""
+def origin_in_words(name: str | None, origin: float, unit: str = "") -> str:
+    """Return from where an effect counts the column `name`, "" for 0."""
+    return f"{name} counts from {origin:.12g} {unit}".rstrip() if origin else ""
 
 
 def rounded_to_spread(value: float, spread: float, least: int) -> float:

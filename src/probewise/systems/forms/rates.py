@@ -144,9 +144,9 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
-            f"{origin_in_words(origin, about.time_unit)}"
         ),
         joined=starting_point_of_wave,
+        counted_from=origin_in_words(time, origin, about.time_unit),
     )
 
 

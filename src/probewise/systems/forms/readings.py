@@ -45,6 +45,7 @@ def modulated_form(
             lambda mean, sd: how.says(what, unit, mean, sd),
             change_points=how.change_points,
             joined=how.joined,
+            counted_from=how.counted_from,
         )
 
 

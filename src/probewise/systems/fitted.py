@@ -27,12 +27,12 @@ from probewise.errors import FileError, ParameterError, ProbewiseError
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
-from probewise.systems.forms.origins import time_origin
-from probewise.systems.forms.rebinding import Recorded
+from probewise.systems.forms.rebinding import Recorded, counts_from_far_origin
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
 FORMAT = "system/1"
+_ORIGINS = 1  # rule by which effects on a recording far from 0 count: files of earlier versions, from 0, have none
 _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` writes"
 
 
@@ -110,6 +110,10 @@ class FittedSystem(NamedSamples):
         median, interval = self.median(), self.interval()
         return "\n".join(interval_table_lines([(name, median[name], interval[name]) for name in self.names]))
 
+    @property
+    def _counts_from_far_origin(self) -> bool:
+        return self.known is not None and counts_from_far_origin(self.effects, self.simulator, self.known)
+
     def to_json(self) -> str:
         """Serialise as strict JSON, format "system/1"."""
         mean, sd, median, interval = self.mean(), self.sd(), self.median(), self.interval()
@@ -133,6 +137,7 @@ class FittedSystem(NamedSamples):
             "noise": {"mean": float(self.noise_sd.mean()), "sd": self.noise_sd.tolist()},
             "level": list(self.level),
             "bound_about": None if self.known is None else _recorded_to_json(self.known),
+            **({"origins": _ORIGINS} if self._counts_from_far_origin else {}),
             "notes": list(self.notes),
             "samples": self.samples.tolist(),
         }
@@ -164,7 +169,7 @@ class FittedSystem(NamedSamples):
                     f"that file unchanged; {simulator.source} has {simulator.fingerprint}, diagnose again with it",
                 )  # fmt: skip
             samples, known = np.array(document["samples"], dtype=np.float64), document["bound_about"]
-            return cls(
+            fitted = cls(
                 simulator,
                 names=tuple(each["name"] for each in document["parameters"]),
                 samples=samples,
@@ -179,6 +184,14 @@ class FittedSystem(NamedSamples):
                 notes=tuple(document["notes"]),
                 version=str(document["version"]),
             )
+            found = document.get("origins", 0)
+            if found != _ORIGINS and fitted._counts_from_far_origin:
+                # Its samples of a drift or of a phase would mean other ones.
+                raise FileError(
+                    path, f"origins {found!r}: a recording far from 0, of which its effects counted from elsewhere",
+                    f"{_ORIGINS}, as a model of this version has; diagnose again",
+                )  # fmt: skip
+            return fitted
         except FileError:
             raise
         except (KeyError, IndexError) as error:
@@ -214,10 +227,8 @@ def require_fitted_system(fitted: object) -> None:
 
 def _recorded_to_json(known: Recorded) -> dict[str, Any]:
     table = known.table
-    origin = time_origin(table)
     return {
         "time": table.time,
-        **({"counted_from": origin} if origin else {}),
         "run": table.run,
         "columns": {name: _column_to_json(values) for name, values in table.columns.items()},
         "predicted": known.predicted.tolist(),
@@ -236,11 +247,6 @@ def _column_to_json(values: NDArray[Any]) -> list[Any]:
 def _recorded_from_json(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
     columns = {name: _column_from_json(values) for name, values in document["columns"].items()}
     table = RunTable(columns, document["time"], document["run"])
-    if float(document.get("counted_from", 0.0)) != time_origin(table):
-        # An earlier version counted times far from 0 from there: the samples of its drifts and waves mean other ones.
-        raise ParameterError(
-            "bound_about", f"of {table.time} counted from 0", "a model of this version; diagnose again"
-        )
     states = {name: np.array(values, dtype=np.float64) for name, values in document["states"].items()}
     held = document.get("held")  # a file of an earlier version has none: only a law's columns were held then
     if held is None:

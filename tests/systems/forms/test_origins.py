@@ -1,6 +1,5 @@
 """Times and columns far from 0, as seconds of the epoch are: effects are what they are on a clock that starts at 0."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -205,20 +204,36 @@ def test_a_recording_by_the_epoch_has_the_diagnosis_of_the_same_recording_from_0
             assert found[effects] == pytest.approx(probability, abs=2e-3)
 
 
-def test_a_model_of_a_version_that_counted_such_times_from_0_is_refused():
-    """Its drifts and waves would be off by any amount."""
-    about = _about(EPOCH, 0.0, _function)
-    model = FittedSystem(
+def _model(about, *effects):
+    forms = forms_of(about)
+    parameters = [f"{name}.{p}" for name in effects for p in forms[name].prior.names]
+    theta = np.concatenate([[1.0, 2.0], *(forms[name].bank()[0, 0] for name in effects)])
+    return FittedSystem(
         about.system.simulator,
-        names=("offset", "gain", "offset_drift.a"),
-        samples=np.tile([1.0, 2.0, 0.1], (500, 1)),
+        names=("offset", "gain", *parameters),
+        samples=np.tile(theta, (500, 1)),
         noise_sd=np.full(500, 0.01),
-        effects=("offset_drift",),
+        effects=effects,
         known=extract_recorded(about),
     )
-    document = json.loads(model.to_json())
-    assert document["bound_about"].pop("counted_from") == EPOCH
-    with pytest.raises(FileError, match="diagnose again"):
+
+
+@pytest.mark.parametrize(("shift", "far", "effect"), [(EPOCH, 0.0, "offset_drift"), (0.0, FAR, "periodic_error:drive")])
+def test_a_model_of_a_version_that_counted_from_0_is_refused_where_its_effects_count_from_elsewhere(shift, far, effect):
+    """Its drifts and phases would be off by any amount; before, those of a column far from 0 were read."""
+    about = _about(shift, far, _function)
+    document = json.loads(_model(about, effect).to_json())
+    assert document.pop("origins") == 1
+    with pytest.raises(FileError, match=r"origins 0: .*diagnose again"):
         FittedSystem.from_json(json.dumps(document), about.system.simulator)
-    near = dataclasses.replace(model, known=extract_recorded(_about(0.0, 0.0, _function)))
-    assert "counted_from" not in json.loads(near.to_json())["bound_about"]
+
+
+@pytest.mark.parametrize(
+    ("shift", "far", "effect"), [(EPOCH, FAR, "lag"), (0.0, 0.0, "offset_drift"), (0.0, FAR, "lag")]
+)
+def test_a_model_of_an_earlier_version_whose_effects_do_not_count_from_elsewhere_is_read(shift, far, effect):
+    """Its file is as it was; before, one that held a lag alone was refused, as its times are far from 0."""
+    about = _about(shift, far, _function)
+    text = _model(about, effect).to_json()
+    assert "origins" not in json.loads(text)
+    assert FittedSystem.from_json(text, about.system.simulator).effects == (effect,)

@@ -97,22 +97,34 @@ def rebind_forms(
         If a proposal cannot be rebound.
     """
     wanted = list(dict.fromkeys(names))
-    system = System(simulator, known.table.scan_names)
-    about = _RecordedFit(system, known.table, np.zeros(system.n_params), 1.0, known)
-    found = forms_of(about)
+    found = _forms_about(wanted, simulator, known)
     longer = _table_with_more_runs(known.table, list(more_runs))
     if longer is not known.table:
-        system = System(simulator, longer.scan_names)
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
         states = {name: values[rows] for name, values in known.states.items()}
         beyond = Recorded(longer, known.predicted[rows], states, known.held)
-        again = forms_of(_RecordedFit(system, longer, np.zeros(system.n_params), 1.0, beyond))
-        found |= {name: form for name, form in again.items() if has_value_per_run(name)}
-    if any(name.startswith(PROPOSAL) for name in wanted):
-        found |= {form.name: form for form in proposals(about)}
+        per_run = [name for name in wanted if has_value_per_run(name)]
+        found |= _forms_about(per_run, simulator, beyond)
     lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
     if lost:
         raise ParameterError("effects", lost[0], "a term that this version can bind again")
+    return {name: found[name] for name in wanted if name in found}
+
+
+def counts_from_far_origin(names: Iterable[str], simulator: Simulator, known: Recorded) -> bool:
+    """Return whether any of these forms counts a time or a column of the recording from elsewhere than 0."""
+    return any(form.counted_from for form in _forms_about(list(names), simulator, known).values())
+
+
+def _forms_about(wanted: list[str], simulator: Simulator, known: Recorded) -> dict[str, Form]:
+    """Bind those forms and proposals about a recording that are wanted, and that this version has, by name."""
+    if not wanted:
+        return {}
+    system = System(simulator, known.table.scan_names)
+    about = _RecordedFit(system, known.table, np.zeros(system.n_params), 1.0, known)
+    found = forms_of(about)
+    if any(name.startswith(PROPOSAL) for name in wanted):
+        found |= {form.name: form for form in proposals(about)}
     return {name: found[name] for name in wanted if name in found}
 
 

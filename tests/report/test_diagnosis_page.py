@@ -9,6 +9,7 @@ import pytest
 from mixtures import fixed_mixture
 
 from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page
@@ -231,6 +232,15 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
 
 def place_of(covariate, start):
     return Place(covariate, None, start, start + 1.0, 0.004, 4.0, *[np.zeros(0)] * 3, values=np.arange(3.0))
+
+
+def test_a_columns_values_are_no_categories_though_it_is_called_as_those_of_a_light_sensor():
+    simulator, plan = SimpleNamespace(time="t", reading="y"), SimpleNamespace(scan_names=("1", "2"))
+    apparatus = SimulatorApparatus(SimpleNamespace(system=SimpleNamespace(simulator=simulator)))
+    found = SimpleNamespace(apparatus=apparatus, recording=SimpleNamespace(plan=plan))
+    for name in ("scan", "direction", "orientation"):
+        assert category_name_by_value(found, place_of(name, 0.0)) is None
+    assert category_name_by_value(found, place_of("run", 0.0)) == {0.0: "1", 1.0: "2"}
 
 
 def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():

@@ -20,7 +20,6 @@ from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.scheduling import Command
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
-from probewise.systems.table import published_covariate
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,7 @@ class Words:
         """Return the name of a covariate in words."""
         if self.covariates is None:
             return name.replace("_", " ")
-        own = published_covariate(name)
-        return self.covariates.get(own, own.replace("state:", "state ").replace("column:", "column "))
+        return self.covariates.get(name, name.replace("state:", "state ").replace("column:", "column "))
 
 
 class Apparatus(Protocol):

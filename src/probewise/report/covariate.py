@@ -79,9 +79,11 @@ def covariate_values_by_place(diagnosis: Diagnosis) -> dict[str, FloatArray]:
 
 def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
     """Return the name of each value of a categorical covariate (scan, direction, up to 24 orientations), else None."""
+    if place.covariate == diagnosis.apparatus.words.run:
+        return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}
+    if isinstance(diagnosis.apparatus, SimulatorApparatus):
+        return None  # a table's column may be called as a covariate of a light sensor is
     match place.covariate:
-        case "scan" | "run":
-            return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}
         case "direction":
             return {-1.0: "backwards", 1.0: "forwards"}
         case "orientation":

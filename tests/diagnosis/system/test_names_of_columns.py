@@ -4,6 +4,12 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.residuals.bases import bank_of_unknown_effects
+from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.diagnosis.residuals.locate import places_of_effect, significant_places
+from probewise.diagnosis.residuals.outlying import FAR_OUT, clustering_log_bayes_factors
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.diagnosis.verdict_report.document import diagnosis_json
 from probewise.systems import Law, Simulator, table_for
@@ -61,8 +67,28 @@ def test_results_name_a_column_as_it_is_unless_that_means_something_else():
     words = _prepared({}).apparatus.words
     assert words.covariate_in_words("level") == "predicted y"
     assert words.covariate_in_words("column:level") == "column level"
-    assert words.covariate_in_words("column:slope") == "slope"
+    assert words.covariate_in_words("slope") == "slope"
     assert words.covariate_in_words("state:s") == "state s"
+
+
+@pytest.mark.parametrize(("name", "published"), [("scan", "scan"), ("level", "column:level"), ("room_c", "room_c")])
+def test_a_place_and_a_family_of_unknown_effects_have_the_name_that_results_have(name, published):
+    """Before, a place had "column:scan" in Python and "scan" in diagnosis.json."""
+    prepared, rows = _prepared({name: _OWN[name]}), np.arange(_N)
+    covariate = Covariate(covariate_of_column(name), _OWN[name], rows)
+    bump = np.exp(-0.5 * ((_OWN[name] - 1) / 0.3) ** 2)
+    ones = np.ones((_N, 1)) / np.sqrt(_N)
+    residual = 3 * (bump - ones @ (ones.T @ bump[:, None])[:, 0]) + 0.3 * (_X - _X.mean())
+    problem = Linearised(ones, residual, white_noise(_N), 1.0, _N)
+    draws = problem.draw_null_residuals(199, rng=np.random.default_rng(0))
+    (place,) = significant_places(problem, [covariate], ("all",), residual, draws)
+    effect, plan = forms_of(prepared.apparatus.about)[f"sensitivity:{name}"], prepared.recording.plan
+    (of_effect,) = places_of_effect(effect, bump, covariate, None, plan, residual, p_value=0.001, size=8.0, sd=1.0)
+    assert place.covariate == of_effect.covariate == published
+    bank = bank_of_unknown_effects([covariate], _X - _X.min(), _X, np.array([0]))
+    assert set(bank.labels) <= {published, f"{published}, locally", "what was seen before", "ends of scans"}
+    assert published in bank.labels
+    assert list(clustering_log_bayes_factors(bump, [covariate])) == [f"{published}{FAR_OUT}"]
 
 
 def test_a_column_with_the_name_of_a_state_is_no_second_variable_of_that_name():
@@ -82,4 +108,4 @@ def test_a_reading_that_depends_on_a_column_called_scan_is_found_in_it():
     y = 1.0 + _X + 0.2 * (scan - 20) + 0.1 * _RNG.normal(size=_N)
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"], time="t_s")
     found = diagnose_system(simulator, {"t_s": _T, "x": _X, "scan": scan, "y": y}, rng=np.random.default_rng(1))
-    assert diagnosis_json(found)["where"][0]["covariate"] == "scan"
+    assert found.where[0].covariate == diagnosis_json(found)["where"][0]["covariate"] == "scan"

@@ -103,7 +103,8 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
 
 def _family_name(covariate: Covariate, template: FloatArray) -> str:
     """Return the label of a template's family; a covariate's many local bases form a family apart from smooth ones."""
-    where = covariate.name if covariate.scan is None else f"{covariate.name} within scans"
+    name = covariate.published_name
+    where = name if covariate.scan is None else f"{name} within scans"
     return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.systems.table import published_covariate
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,3 +22,8 @@ class Covariate:
     rows: IntArray
     groups: bool = False
     scan: str | None = None
+
+    @property
+    def published_name(self) -> str:
+        """Its name in results: a column's own where that means nothing else in a table."""
+        return published_covariate(self.name)

@@ -198,7 +198,7 @@ def significant_places(
         if covariate.name in _RUNS:
             scan, start, end = scan_names[int(kept[best][0])], None, None
         curve = _mean_curve_fields(covariate, residuals, problem.sd)
-        out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), **curve))
+        out.append(Place(covariate.published_name, scan, start, end, p_value, float(scores[best]), **curve))
     return sorted(out, key=lambda place: (place.p_value, -place.z))
 
 
@@ -253,7 +253,7 @@ def places_of_effect(
     values = covariate.values[significant]
     curve = _mean_curve_fields(covariate, residuals, sd)
     start, end = float(values.min()), float(values.max())
-    return [Place(name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
+    return [Place(covariate.published_name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
 
 
 def _scans_with_effect(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:

@@ -52,5 +52,5 @@ def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covar
             inside, many = far_out @ columns, columns.sum(axis=0)
             outside, few = total - inside, n - many
             apart = betaln(inside + _A, many - inside + _A) + betaln(outside + _A, few - outside + _A)
-            scores.setdefault(f"{covariate.name}{FAR_OUT}", []).append(apart - 2 * betaln(_A, _A) - even)
+            scores.setdefault(f"{covariate.published_name}{FAR_OUT}", []).append(apart - 2 * betaln(_A, _A) - even)
     return {family: log_mean_exp(np.concatenate(own)) for family, own in scores.items()}

@@ -14,7 +14,6 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.verdict_report.findings import ParameterFound, parameters_found
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import is_out_of_vocabulary
-from probewise.systems.table import published_covariate
 
 _N_DRAWS = 199
 
@@ -64,7 +63,7 @@ def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: n
     found = significant_places(
         best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws
     )
-    where = published_covariate(found[0].covariate) if found else None
+    where = found[0].covariate if found else None
     shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate_in_words(where)}"
     share = more / (named + more) if named + more > 0 else 0.0
     sentence = f"A smaller misfit remains ({p_in_words(p_value)}, {share:.0%} of the gain in log evidence){shows}."

@@ -12,7 +12,6 @@ from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, require_diagnosis
 from probewise.diagnosis.verdict_report.findings import ParameterFound
 from probewise.effects import public_name
-from probewise.systems.table import published_covariate
 
 NEXT_PLAN = "next_plan.csv"
 
@@ -59,7 +58,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "credible_set": list(diagnosis.judged.credible),
         "where": [
             {
-                "covariate": published_covariate(place.covariate),
+                "covariate": place.covariate,
                 "scan": place.scan,
                 "from": place.start,
                 "to": place.end,

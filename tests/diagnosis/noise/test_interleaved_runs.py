@@ -113,6 +113,26 @@ def test_without_a_reading_in_between_the_next_has_its_correlation_with_the_one_
     np.testing.assert_allclose(found[order][kept[order]], other.take(kept[order])(r[order][kept[order]]))
 
 
+@pytest.mark.parametrize("left_out", ["first", "first two", "from the first on"])
+def test_without_the_first_reading_of_a_run_the_next_is_its_first(left_out):
+    """Route two: the covariance of what is left, without any between runs. Before, it was tied to another run's."""
+    recording, together = _recording(), _recording(SORTED)
+    order = order_by_scan(recording)
+    scan = recording.plan.scan[recording.usable][order]
+    place = np.arange(len(scan)) - np.searchsorted(scan, scan)
+    out = {"first": place == 0, "first two": (place < 2) & (scan > 0), "from the first on": (scan == 2) & (place < 6)}
+    kept = ~out[left_out]
+    r = np.random.default_rng(5).normal(size=len(scan))
+    (rho, mixed), (_, apart) = _law(recording), _law(together)
+    steps = n_rows_since_previous_usable(together)
+    own = np.cumsum(steps)[kept]  # rows along each run, but for a constant
+    cov = np.where(scan[kept][:, None] == scan[kept], rho ** np.abs(own[:, None] - own), 0.0)
+    expected = -0.5 * r[kept] @ np.linalg.solve(cov, r[kept]) - 0.5 * np.linalg.slogdet(cov)[1]
+    for law, at in ((mixed, np.argsort(order)), (apart, np.arange(len(order)))):
+        taken = law.take(kept[at])
+        assert -0.5 * np.sum(taken(r[at][kept[at]]) ** 2) - taken.half_log_det() == pytest.approx(expected)
+
+
 def test_the_memory_of_mixed_runs_is_along_each_run():
     recording = _recording()
     order = order_by_scan(recording)

@@ -133,14 +133,29 @@ class NoiseLaw:
     def take(self, rows: BoolArray) -> NoiseLaw:
         """Return the distribution of some readings: exact for whole scans, else as if those left out between were not.
 
-        A reading then has its correlation with the one taken before it.
+        A reading then has its correlation with the one taken before it, and none where all of those before it with
+        which it was correlated, back to the first of its scan, are left out.
         """
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
-        carry, before = self.carry[rows], self.before
-        if before.size:
-            above = _nearest_kept_before(before, rows)
-            carry, before = np.where(above >= 0, carry, 0.0), np.maximum(above, 0)
+        above = self._nearest_taken_before(rows)
+        before = np.maximum(above, 0) if self.before.size else self.before
+        carry = np.where(above >= 0, self.carry[rows], 0.0)
         return replace(self, sd=self.sd[rows], carry=carry, lost=self.lost[rows], walk=walk, before=before)
+
+    def _nearest_taken_before(self, rows: BoolArray) -> IntArray:
+        """Return for each reading taken the nearest one taken before it with which it is correlated, -1 for none.
+
+        Numbers are those of the readings taken, (n_taken,).
+        """
+        number, linked = np.cumsum(rows) - 1, self.carry != 0
+        if not self.before.size:  # those above it, as long as each has a correlation with the one above
+            chain = np.cumsum(~linked)[rows]
+            return np.where(np.diff(chain, prepend=-1) == 0, np.arange(len(chain)) - 1, -1)
+        nearest = np.full(len(rows), -1)
+        for k in np.flatnonzero(linked).tolist():  # a reading comes after the one before it
+            above = self.before[k]
+            nearest[k] = number[above] if rows[above] else nearest[above]
+        return nearest[rows]
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Whiten columns, shape (n_points,) or (n_points, n_columns); rows of lost readings become 0."""
@@ -258,15 +273,6 @@ class NoiseLaw:
                 eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
             eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.information)
         return eps * self.kept[:, None]
-
-
-def _nearest_kept_before(before: IntArray, kept: BoolArray) -> IntArray:
-    """Return for each kept reading the nearest kept one that `before` leads to, (n_kept,), -1 for none."""
-    number, nearest = np.cumsum(kept) - 1, np.full(len(before), -1)
-    for k, above in enumerate(before.tolist()):  # a reading comes after the one before it
-        if 0 <= above < k:
-            nearest[k] = number[above] if kept[above] else nearest[above]
-    return nearest[kept]
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,11 +136,17 @@ def test_without_the_first_reading_of_a_run_the_next_is_its_first(left_out):
 def test_the_memory_of_mixed_runs_is_along_each_run():
     recording = _recording()
     order = order_by_scan(recording)
-    starts = np.flatnonzero(n_rows_since_previous_usable(recording)[order] == 0)
+    scan = recording.plan.scan[recording.usable]
     signal = np.abs(np.random.default_rng(6).normal(size=len(order)))
-    mixed = bank_of_unknown_effects((), signal, signal, starts, order)
-    apart = bank_of_unknown_effects((), signal[order], signal[order], starts)
+    mixed = bank_of_unknown_effects((), signal, signal, scan)
+    apart = bank_of_unknown_effects((), signal[order], signal[order], scan[order])
     np.testing.assert_array_equal(mixed.columns[order], apart.columns)
+    each = [bank_of_unknown_effects((), *(2 * [signal[scan == k]]), np.zeros(np.sum(scan == k), int)) for k in range(4)]
+    for k, own in enumerate(each):  # route two: the memory of each run, alone in its table
+        there = [label == "what was seen before" for label in mixed.labels]
+        alone = [label == "what was seen before" for label in own.labels]
+        columns, others = mixed.take(np.flatnonzero(there)).columns, own.take(np.flatnonzero(alone)).columns
+        np.testing.assert_array_equal(columns[scan == k], others)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ FORTH = np.sign(PLAN.direction_of_motion[:, 0])
 IN_X = 25.0 / 8 / np.cosh(PLAN.x_mm / 8) ** 2  # the signal's slope in the lab frame
 SLOPE = IN_X * np.where(FORTH == 0, 1.0, FORTH)  # and along the move
 STARTS = np.flatnonzero(np.diff(PLAN.scan, prepend=-1))
-BASES = bank_of_unknown_effects(varying_covariates(PLAN, np.arange(N), SIGNAL, SLOPE), SIGNAL, SLOPE, STARTS)
+BASES = bank_of_unknown_effects(varying_covariates(PLAN, np.arange(N), SIGNAL, SLOPE), SIGNAL, SLOPE, PLAN.scan)
 TEMPLATES = [BASES[k] for k in range(len(BASES.widths))]
 TIME = (PLAN.time_s - PLAN.time_s.min()) / np.ptp(PLAN.time_s)
 MISMATCHES = {

@@ -42,11 +42,7 @@ class _BasisMultipliers:
 
 
 def bank_of_unknown_effects(
-    covariates: Sequence[Covariate],
-    signal: FloatArray,
-    slope: FloatArray,
-    starts: IntArray,
-    order: IntArray | None = None,
+    covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, scan: IntArray
 ) -> TemplateBank:
     """Build the template bank of unknown effects: basis functions over every covariate.
 
@@ -56,15 +52,15 @@ def bank_of_unknown_effects(
         Covariates of the usable readings.
     signal, slope
         Predicted reading above its minimum, and its slope along the motion, (n_usable,) each.
-    starts
-        Index of the first usable row of each scan, (n_scans,), in the order below.
-    order
-        Usable rows with those of each scan together, (n_usable,); None where they are.
+    scan
+        Number of each usable row's scan, (n_usable,); rows of scans may be mixed.
 
     Returns
     -------
     Bank of bases, (n_usable, n_columns) each, labelled by family; families have equal prior weight.
     """
+    order = np.argsort(scan, kind="stable")  # those of each scan together
+    starts, back = np.flatnonzero(np.diff(scan[order], prepend=-1)), np.argsort(order)
     sign = np.zeros(len(signal))
     for covariate in covariates:
         if covariate.name == "direction":
@@ -76,10 +72,8 @@ def bank_of_unknown_effects(
         for covariate in covariates
         for template in _bases_of_covariate(covariate, ways)
     ]
-    by_scan = signal if order is None else signal[order]
-    along = [("what was seen before", template) for template in _memory_bases(by_scan, starts)]
-    along += [("ends of scans", template) for template in _end_transients(len(signal), starts)]
-    found += along if order is None else [(name, template[np.argsort(order)]) for name, template in along]
+    found += [("what was seen before", template[back]) for template in _memory_bases(signal[order], starts)]
+    found += [("ends of scans", template[back]) for template in _end_transients(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
     return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 

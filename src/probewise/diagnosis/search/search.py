@@ -10,12 +10,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
-import numpy as np
-
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.templates import TemplateCache
-from probewise.diagnosis.noise.law import n_rows_since_previous_usable, order_by_scan
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named
@@ -204,9 +201,7 @@ def _unknown_bases_and_covariates(
     null, recording = state.null, prepared.recording
     covariates, slope = prepared.apparatus.covariates_and_slope(null.found, recording)
     level = null.found.predicted
-    order = order_by_scan(recording)
-    starts = np.flatnonzero(n_rows_since_previous_usable(recording)[order] == 0)
-    mixed = None if np.array_equal(order, np.arange(len(order))) else order
-    bases = bank_of_unknown_effects(covariates, level - level.min(), slope, starts, mixed)
+    scan = recording.plan.scan[recording.usable]
+    bases = bank_of_unknown_effects(covariates, level - level.min(), slope, scan)
     problem = Linearised.of(null.found, state.refits.likeliest_law(null))
     return bases_unlike_named(bases, state.templates.coarse_bank(null.found, named), problem), tuple(covariates)

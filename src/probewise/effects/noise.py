@@ -78,7 +78,8 @@ class SignalDependentNoise(NoiseEffect):
 class DriftingNoise(NoiseEffect):
     """Noise whose sd grows or shrinks exponentially in time: sd x growth^(time / duration - 1/2).
 
-    It is outside the vocabulary: a nuisance that keeps the tests of the mean valid.
+    It is outside the vocabulary: a nuisance that keeps the tests of the mean valid. Time counts from the first reading
+    to the last of the plan; no repaired model holds it, so that it never acts on another plan than the recording's.
     """
 
     least: float = 0.2

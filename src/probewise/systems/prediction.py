@@ -17,7 +17,6 @@ from probewise.effects import (
     AGAIN,
     EFFECTS,
     PROPOSAL,
-    DriftingNoise,
     NamedEffect,
     NoisePerRun,
     PredictiveMixture,
@@ -271,20 +270,6 @@ def _inputs_with_gaps(simulator: Simulator, table: RunTable) -> dict[str, FloatA
     return {name: values for name, values in columns.items() if not np.isfinite(values).all()}
 
 
-@dataclass(frozen=True)
-class _NoiseDriftOfRecording(DriftingNoise):
-    """Noise that changed in the time of a recording, from `begin` to `end`; before and after it is as at its ends."""
-
-    begin: float = 0.0
-    end: float = 1.0
-
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        table = cast(RunTable, plan)
-        time = table.row_number if table.time is None else table.time_s
-        elapsed = (np.clip(time, self.begin, self.end) - self.begin) / ((self.end - self.begin) or 1.0)
-        return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
-
-
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
     """Bind the effects of a fitted simulator to the runs of a table, in their order.
 
@@ -318,9 +303,6 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
         elif name == NoisePerRun.name:
             seen = () if fitted.known is None else fitted.known.table.scan_names
             out.append(NoisePerRun(tuple(dict.fromkeys((*seen, *table.scan_names)))))
-        elif name == DriftingNoise.name and fitted.known is not None:
-            begin, end = float(fitted.known.table.time_s.min()), float(fitted.known.table.time_s.max())
-            out.append(_NoiseDriftOfRecording(begin=begin, end=end))
         elif name in EFFECTS:
             out.append(EFFECTS[name]())
         else:

@@ -14,7 +14,7 @@ from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
-from probewise.effects import Extent
+from probewise.effects import DriftingNoise, Extent
 from probewise.recordings import Recording, two_way_plan
 
 PLAN = two_way_plan()
@@ -38,6 +38,23 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     mixture = sensor.mixture()
     np.testing.assert_allclose(mixture.mean_mm, sensor.field.mean_mm, atol=sensor.field.pixel_mm)
     assert total_variation(mixture, sensor.field) < 0.1
+
+
+def test_a_model_does_not_hold_noise_that_changes_in_time():
+    """It is a nuisance of the search, by the recording's clock: in another plan the change would begin anew."""
+    rng = np.random.default_rng(0)
+    sensor = default_sensor(Extent(10.0, 60.0, PLAN), 1)
+    elapsed = (PLAN.time_s - PLAN.time_s.min()) / np.ptp(PLAN.time_s)
+    z = np.zeros(sensor.n_params)
+    predicted = sensor.chain(PLAN, (), n_nodes=16).predict(sensor.theta(z[None, :]), PLAN)[0]
+    recording = Recording(PLAN, predicted + 0.3 * 4.0 ** (elapsed - 0.5) * rng.standard_normal(len(PLAN)))
+    found = fit(Model(sensor, (), PLAN), recording, z, white_noise(len(PLAN), least=1e-3))
+    plain, drifting = (
+        laplace_evidence(found, NoiseModel(effects, recording, least_sd=1e-3)) for effects in ((), (DriftingNoise(),))
+    )
+    assert drifting.log_z > plain.log_z + 10
+    samples = sample_model(found, drifting, recording, weights={}, rng=rng, annealed=False)
+    assert samples.effects == samples.chain.effects == ()
 
 
 @pytest.mark.slow

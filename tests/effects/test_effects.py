@@ -233,7 +233,13 @@ def test_effects_of_a_mounting_may_sit_in_each_mounting_and_each_scan():
 
 
 @pytest.mark.parametrize(
-    ("written_deg", "as_deg"), [((0, 90, 360, -90), (0, 90, 0, -90)), ((180, 0, -180, 270), (-180, 0, -180, 270))]
+    ("written_deg", "as_deg"),
+    [
+        ((0, 90, 360, -90), (0, 90, 0, -90)),
+        ((180, 0, -180, 270), (-180, 0, -180, 270)),
+        ((0.1, 45.3, 360.1, -314.7), (0.1, -314.7, 0.1, -314.7)),
+        ((-1e-9, 720.2, 360, 0.2), (0, 0.2, 0, 0.2)),
+    ],
 )
 def test_orientations_a_whole_turn_apart_are_one_mounting(written_deg, as_deg):
     plan = replace(paper_plan(), orientation_rad=np.zeros(408))

@@ -30,8 +30,10 @@ def orientation_deg(plan: Plan) -> FloatArray:
 
     So 0 and 360 degrees are one orientation, and so are -180 and 180.
     """
-    recorded = np.round(np.degrees(plan.orientation_rad), 6)
-    _, which = np.unique(recorded % 360.0, return_inverse=True)
+    turned = np.degrees(plan.orientation_rad)
+    # Rounded after the turns are taken off, since most decimals have another last digit a turn on; 359.9999999 is 0.
+    _, which = np.unique(np.round(turned % 360.0, 6) % 360.0, return_inverse=True)
+    recorded = np.round(turned, 6)
     least = np.full(which.max(initial=-1) + 1, np.inf)
     np.minimum.at(least, which, recorded)
     return np.asarray(least[which], dtype=np.float64)

@@ -126,10 +126,10 @@ def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(
     """A sensor of times in seconds since 1970, from its file, predicts as one of the same times from 0."""
     columns = {"gain_drift.frac": 0.2, "gain_drift.tau_s": 30.0, "position_scale.x": 0.05, "position_scale.y": 0.0}
     from_0 = make_sensor(effects=("gain_drift", "position_scale"), extra=columns)
-    since_1970 = replace(from_0, origin=Origin(time_s=1.7e9, x_mm=2e4))
+    since_1970 = replace(from_0, origins=dict.fromkeys(from_0.effects, Origin(time_s=1.7e9, x_mm=2e4)))
     write_sensor(since_1970, tmp_path / "sensor.json")
     back = read_sensor(tmp_path / "sensor.json")
-    assert back.origin == since_1970.origin
+    assert back.origins == since_1970.origins
     plan = paper_plan().take(np.arange(101))
     edge = plan.patterns["boundary"]
     assert isinstance(edge, HalfPlane)
@@ -146,12 +146,16 @@ def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(
 
 def test_a_sensor_file_of_before_counts_from_0(make_sensor: Callable[..., FittedSensor]) -> None:
     drifting = make_sensor(effects=("offset_drift",), extra={"offset_drift.per_hour": 2.0})
-    document = json.loads(replace(drifting, origin=Origin(time_s=3.0)).to_json())
-    document.pop("origin")
-    assert FittedSensor.from_json(json.dumps(document)).origin == Origin()
+    document = json.loads(replace(drifting, origins={"offset_drift": Origin(time_s=3.0)}).to_json())
+    document.pop("origins")
+    (of_before,) = FittedSensor.from_json(json.dumps(document)).effects_on_new_scans
+    assert of_before.origin == Origin()
     for damaged in ({"time_s": "noon"}, {"hours": 3.0}, 3):
         with pytest.raises(FileError):
-            FittedSensor.from_json(json.dumps(document | {"origin": damaged}))
+            FittedSensor.from_json(json.dumps(document | {"origins": {"offset_drift": damaged}}))
+    for damaged in (3, {"backlash": {"time_s": 3.0}}):
+        with pytest.raises(FileError):
+            FittedSensor.from_json(json.dumps(document | {"origins": damaged}))
 
 
 def test_effects_of_single_scans_do_not_carry_over(make_sensor: Callable[..., FittedSensor]) -> None:

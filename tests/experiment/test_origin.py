@@ -20,7 +20,7 @@ def test_effects_of_a_sensor_from_far_away_count_from_0_in_a_run():
         field=SSFField(np.ones((1, 1)), 1.0, (0.0, 0.0)),
         instrumentation=Instrumentation(),
         effects=("gain_drift",),
-        origin=Origin(time_s=1.7e9),
+        origins={"gain_drift": Origin(time_s=1.7e9)},
     )
     (kept,) = sensor.effects_on_new_scans
     (of_run,) = chain_of(sensor, KnownScene({})).effects

@@ -14,7 +14,8 @@ from probewise import scene
 from probewise.arm import Pose, Reading, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.arm.uncertainty import FITTED
-from probewise.calibration import FittedSensor, mean_field
+from probewise.calibration import FittedSensor, mean_field, predict
+from probewise.effects import Origin
 from probewise.errors import ParameterError
 from probewise.experiment import (
     CLEAN,
@@ -47,7 +48,7 @@ from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
-from probewise.recordings import Instrumentation
+from probewise.recordings import Instrumentation, Plan, Uniform
 from probewise.sensor import mixture_names
 from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
 from probewise.study.concealed import _arm_in_concealed_world
@@ -357,6 +358,27 @@ def test_a_repaired_sensor_holds_the_effect_that_leads(sensor, stepped):
     told = repaired_sensor(sensor, leading(stepped[-1], "dropouts"), rng=rng)
     assert told.effects == ()
     assert any("dropouts" in note for note in told.notes)
+
+
+def test_an_effect_found_in_a_run_counts_from_0_beside_one_from_far_away(sensor, stepped):
+    """A bright margin of the run's field: over black it adds its gradients times the run's own places."""
+    far = replace(
+        sensor,
+        names=(*sensor.names, "position_scale.x", "position_scale.y"),
+        samples=np.pad(sensor.samples, ((0, 0), (0, 2))),
+        effects=("position_scale",),
+        origins={"position_scale": Origin(x_mm=2000.0)},
+    )
+    mended = repaired_sensor(far, leading(stepped[-1], "ambient_gradient"), rng=np.random.default_rng(1))
+    mended = type(sensor).from_json(mended.to_json())
+    assert {e.name: e.origin.x_mm for e in mended.effects_on_new_scans} == {
+        "position_scale": 2000.0,
+        "ambient_gradient": 0.0,
+    }
+    black, per_mm_x, per_mm_y = (mended.mean()[n] for n in ("I_min", *mended.names[-2:]))
+    plan = Plan.from_arrays(x_mm=[0.0, 300.0, 0.0], y_mm=[0.0, 0.0, 200.0], patterns=Uniform(0.0), unit="LEGO")
+    expected = black + np.array([0.0, 300 * per_mm_x, 200 * per_mm_y])
+    np.testing.assert_allclose(predict(mended, plan).mean, expected, rtol=1e-9)
 
 
 @pytest.mark.slow

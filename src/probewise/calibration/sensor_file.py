@@ -102,8 +102,9 @@ class FittedSensor(NamedSamples):
     absent
         By effect, the samples without it, (n_samples,), where a diagnosis is uncertain whether it is present; other
         effects act in all samples.
-    origin
-        Time and place from which the effects count: 0, or that of a recording far from it.
+    origins
+        By effect, the time and place from which it counts, where it was found in a recording far from 0; others count
+        from 0.
     scan_noise
         Noise of each scan of the recording.
     fingerprint, source
@@ -127,7 +128,7 @@ class FittedSensor(NamedSamples):
     effects: tuple[str, ...] = ()
     patterns: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     absent: Mapping[str, BoolArray] = dataclasses.field(default_factory=dict)
-    origin: Origin = dataclasses.field(default=Origin())
+    origins: Mapping[str, Origin] = dataclasses.field(default_factory=dict)
     scan_noise: tuple[ScanNoise, ...] = ()
     fingerprint: str = ""
     source: str = ""
@@ -144,6 +145,10 @@ class FittedSensor(NamedSamples):
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
+        stray = [name for name in self.origins if name not in self.effects or not _counts_from_origin(name)]
+        if stray:
+            counting = [name for name in self.effects if _counts_from_origin(name)]
+            raise ParameterError("origins", stray[0], f"effects of the model that count from an origin: {counting}")
         require_masks_of_absent_effects(self.absent, self.effects, len(samples))
         if not 1 <= self.n_gaussians <= len(self.names) // 6:
             allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
@@ -170,8 +175,8 @@ class FittedSensor(NamedSamples):
 
     def _effect(self, name: str) -> AnyEffect:
         kind: type[AnyEffect] = EFFECTS[name]
-        if issubclass(kind, CountsFromOrigin):
-            return cast(AnyEffect, kind(origin=self.origin))
+        if name in self.origins:
+            return cast(AnyEffect, cast(type[CountsFromOrigin], kind)(origin=self.origins[name]))
         return _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else kind()
 
     @property
@@ -223,6 +228,7 @@ class FittedSensor(NamedSamples):
             field=mean_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
             effects=tuple(name for name in self.effects if name not in left_out),
             patterns={name: own for name, own in self.patterns.items() if name not in left_out},
+            origins={name: own for name, own in self.origins.items() if name not in left_out},
             absent={},
         )
 
@@ -290,7 +296,7 @@ class FittedSensor(NamedSamples):
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),
             "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},
-            "origin": asdict(self.origin),
+            "origins": {name: asdict(origin) for name, origin in self.origins.items()},
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {
                 "model": self._noise_in_words(),
@@ -351,7 +357,10 @@ class FittedSensor(NamedSamples):
                 effects=tuple(read.texts("effects")),
                 patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
                 absent={name: read.mask(len(samples), "absent", name) for name in document.get("absent", {})},
-                origin=Origin(**{key: read.number("origin", key) for key in document.get("origin", {})}),
+                origins={
+                    name: Origin(**{key: read.number("origins", name, key) for key in read.value("origins", name)})
+                    for name in document.get("origins", {})
+                },
                 scan_noise=tuple(
                     _dataclass_of_item(read, ScanNoise, s, "noise.scans") for s in read.objects("noise", "scans")
                 ),
@@ -420,6 +429,10 @@ def require_sensor(sensor: object, more: str = "") -> None:
     elif hasattr(sensor, "fitted_sensor"):
         allowed = "a FittedSensor: take its .fitted_sensor(recording, rng=rng), of the recording that was diagnosed"
     require_kind("sensor", sensor, FittedSensor, f"{allowed}{', ' if more else ''}{more}")
+
+
+def _counts_from_origin(name: str) -> bool:
+    return issubclass(EFFECTS[name], CountsFromOrigin)
 
 
 def _determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:

@@ -25,7 +25,7 @@ from probewise.effects.motion import orientation_deg, scan_indicator, sign_of_mo
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
 from probewise.effects.noise_distribution import FittedReadings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
-from probewise.effects.origin import CountsFromOrigin, Origin
+from probewise.effects.origin import CountsFromOrigin, Origin, origins_of
 from probewise.effects.pose import Backlash, PositionScale
 from probewise.effects.predictive_mixture import PredictiveMixture
 from probewise.effects.rails import BentRails, MissingTooth
@@ -206,6 +206,7 @@ __all__ = [
     "log_density",
     "name_of_first_copy",
     "orientation_deg",
+    "origins_of",
     "public_name",
     "scan_indicator",
     "sign_of_motion",

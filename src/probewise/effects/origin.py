@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -63,6 +64,7 @@ class CountsFromOrigin:
     It belongs to the recording that is diagnosed, so that the effect means the same in any other plan.
     """
 
+    name: ClassVar[str]
     origin: Origin = field(default=Origin(), kw_only=True)
 
     @property
@@ -88,6 +90,12 @@ class CountsPlaceFromOrigin(CountsFromOrigin):
         """Say from which place the effect counts; "" for (0, 0)."""
         x_mm, y_mm = self.origin.x_mm, self.origin.y_mm
         return f"X and Y count from ({x_mm:g}, {y_mm:g}) mm" if x_mm or y_mm else ""
+
+
+def origins_of(effects: Iterable[object]) -> dict[str, Origin]:
+    """Return the origins of those effects that do not count from 0, by the effect's name."""
+    counting = (effect for effect in effects if isinstance(effect, CountsFromOrigin))
+    return {effect.name: effect.origin for effect in counting if effect.origin != Origin()}
 
 
 def is_far_from_zero(values: FloatArray, length: float) -> bool:

@@ -115,6 +115,7 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
     note = f"a run that explored with it found {spoken_name(name)} (probability {p:.3g})"
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
+    # What the sensor knew keeps its origins; the effect that was found has none, since a run's model counts from 0.
     n_own, n = len(effect.prior.names), len(sensor.samples)
     own = theta_in_seconds_of(effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace)
     return replace(

@@ -18,7 +18,7 @@ from probewise._kinds import did_you_mean
 from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
-from probewise.effects import Estimated, Known, Origin
+from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.pace import DescribedEffect, FromRest
@@ -244,7 +244,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
     means = sensor.mean()
     effects: list[AnyEffect] = []
     # A run has a clock and a frame of its own, not those of the recording that was diagnosed.
-    for effect in replace(sensor, origin=Origin()).effects_on_new_scans:
+    for effect in replace(sensor, origins={}).effects_on_new_scans:
         if effect.stage is Stage.NOISE:  # noise of readings far apart in place and time is independent
             continue
         names = [f"{effect.name}.{name}" for name in effect.prior.names]

@@ -23,7 +23,7 @@ from probewise.diagnosis.repair.annealing import Density, draw_by_annealing, imp
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 from probewise.diagnosis.repair.surrogate import SurrogatePosterior
-from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
+from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd, origins_of
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.progress import Progress, silent
 from probewise.recordings import fingerprint
@@ -96,7 +96,7 @@ class ModelSamples:
             effects=self.effects,
             patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
             absent=self.absent,
-            origin=Extent.of(recording).origin,
+            origins={name: Extent.of(recording).origin for name in origins_of(self.chain.effects)},
             scan_noise=scan_noise,
             fingerprint=fingerprint(recording),
             source=PurePath(recording.source).name,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mixtures import total_variation
 
-from probewise.calibration import FittedSensor
+from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis.evidence.laplace import laplace_evidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, GaussianMixtureSensor, default_sensor
 from probewise.diagnosis.fitting.fit import Model, fit
@@ -14,8 +16,8 @@ from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
-from probewise.effects import DriftingNoise, Extent
-from probewise.recordings import Recording, two_way_plan
+from probewise.effects import AmbientGradient, DriftingNoise, Extent, GainDrift
+from probewise.recordings import Recording, Uniform, two_way_plan
 
 PLAN = two_way_plan()
 
@@ -55,6 +57,24 @@ def test_a_model_does_not_hold_noise_that_changes_in_time():
     assert drifting.log_z > plain.log_z + 10
     samples = sample_model(found, drifting, recording, weights={}, rng=rng, annealed=False)
     assert samples.effects == samples.chain.effects == ()
+
+
+def test_a_sensors_effects_count_from_where_those_that_were_fitted_do():
+    """Only part of a recording far from 0 was fitted: another first time, and another middle of its places."""
+    far = replace(
+        PLAN, x_mm=PLAN.x_mm + 5e3, time_s=PLAN.time_s + 1.7e9, patterns=dict.fromkeys(PLAN.pattern_names, Uniform(1.0))
+    )
+    fitted = far.take(np.arange(40, 90))
+    effects = [kind.for_extent(Extent(10.0, 60.0, fitted)) for kind in (AmbientGradient, GainDrift)]
+    sensor, rng = default_sensor(Extent(10.0, 60.0, fitted), 1), np.random.default_rng(0)
+    chain = sensor.chain(far, effects, n_nodes=16)
+    own = {"ambient_gradient.per_mm_x": 0.01, "gain_drift.frac": 0.2, "gain_drift.tau_s": 30.0}
+    theta = np.concatenate([sensor.theta(np.zeros((1, 7)))[0], [own.get(name, 0.0) for name in chain.names[8:]]])
+    samples = ModelSamples(chain, np.tile(theta, (500, 1)), np.full(500, 0.5), ("ambient_gradient", "gain_drift"), 1)
+    predicted = chain.predict(theta[None, :], far)[0]
+    found = samples.fitted_sensor(Recording(far, predicted + 0.5 * rng.standard_normal(len(far))), rng=rng)
+    assert found.origins["gain_drift"].time_s == far.time_s[40]
+    np.testing.assert_allclose(predict(found, far).mean, predicted, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ class ModelSamples:
             effects=self.effects,
             patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
             absent=self.absent,
-            origins={name: Extent.of(recording).origin for name in origins_of(self.chain.effects)},
+            origins=origins_of(self.chain.effects),
             scan_noise=scan_noise,
             fingerprint=fingerprint(recording),
             source=PurePath(recording.source).name,

@@ -3,15 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from probewise.calibration import FittedSensor
+from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis import audit_plan
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import prepare
-from probewise.effects import VOCABULARY
-from probewise.errors import ParameterError
+from probewise.diagnosis.repair.samples import ModelSamples
+from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import SSFField, mixture_names
 
@@ -48,33 +47,48 @@ def test_values_of_usable_readings_are_spread_over_all_rows():
     assert np.isnan(spread[1::2]).all()
 
 
-def test_readings_at_another_height_than_the_sensors_calibration_are_at_theirs():
-    """As readings of the calibration's height that command it: a sensor that hangs higher sees more, and dimmer."""
-    names, theta = (*mixture_names(1), "I_min", "I_max"), [1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0]
+def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
+    """As readings of the calibration's height that command it; the plan itself stays as it was declared."""
+    names, theta = (*mixture_names(1), "I_min", "I_max"), np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
     sensor = FittedSensor(
         names=names,
         samples=theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8)),
         n_gaussians=1,
         noise_sd=np.full(500, 0.5),
         field=SSFField(np.ones((1, 1)), 1.0, (0.0, 0.0)),
-        instrumentation=replace(paper_plan().instrumentation, height_mm=14.0),
+        instrumentation=replace(paper_plan().instrumentation, height_mm=16.0),
     )
     whole = recording()
-    high = replace(whole, plan=replace(whole.plan, instrumentation=replace(whole.plan.instrumentation, height_mm=20.0)))
-    plan = prepare(high, sensor=sensor, apparatus=SENSOR).recording.plan
-    assert plan.instrumentation.height_mm == 14.0
-    np.testing.assert_array_equal(plan.covariates["height_mm"], 20.0)
-    assert prepare(high, apparatus=SENSOR).recording is high
-    audited = audit_plan(high.plan.take(np.arange(40)), sensor=sensor, effects={"lag": VOCABULARY["lag"]})
-    np.testing.assert_array_equal(audited.plan.covariates["height_mm"], 20.0)
-
-
-def test_no_reading_is_refused():
-    with pytest.raises(ParameterError, match="usable readings"):
-        prepare(replace(recording(), readings=np.full(408, np.nan)), apparatus=SENSOR)
-
-
-def test_an_effect_of_ones_own_stands_beside_the_vocabulary():
-    own = LightSensor({"backlash": VOCABULARY["backlash"]}).effects(recording(), None)
-    assert "backlash" in own
-    assert "lag" not in own
+    controls = ("height_mm",)
+    high, calibrated = (
+        replace(whole.plan, instrumentation=replace(whole.plan.instrumentation, height_mm=height, controls=controls))
+        for height in (20.0, 16.0)
+    )
+    commanded = replace(calibrated, covariates={**calibrated.covariates, "height_mm": np.full(len(calibrated), 20.0)})
+    prepared = prepare(replace(whole, plan=high), sensor=sensor, apparatus=SENSOR)
+    assert prepared.recording.plan is high
+    effect = VOCABULARY["sensor_tilt"].for_extent(Extent(10.0, 60.0, high))
+    chain = prepared.null.chain(high, (effect,), n_nodes=16)
+    of_calibration = replace(chain, calibrated_height_mm=None)
+    tilted = np.concatenate([prepared.null.theta(np.zeros((1, 7))), [[0.3, 0.2]]], axis=1)
+    expected = of_calibration.predict(tilted, commanded)
+    np.testing.assert_array_equal(chain.predict(tilted, high), expected)
+    np.testing.assert_array_equal(chain.predict(tilted, commanded), expected)
+    view = chain.simulated_view(tilted, high)
+    np.testing.assert_array_equal(chain.readings_from_simulated_view(view, tilted, high), expected)
+    np.testing.assert_array_equal(chain.poses(tilted, high).x_mm, of_calibration.poses(tilted, commanded).x_mm)
+    assert np.abs(expected - of_calibration.predict(tilted, high)).max() > 1.0
+    samples = ModelSamples(chain, np.tile(tilted, (500, 1)), np.full(500, 0.5), ("sensor_tilt",), 1)
+    repaired = samples.fitted_sensor(replace(whole, plan=high), rng=np.random.default_rng(0))
+    np.testing.assert_allclose(predict(repaired, high).mean, expected[0])
+    offered = SENSOR.candidate_measurements(high)
+    assert {scan.plan.instrumentation.height_mm for scan in offered} == {20.0}
+    for scan in offered:
+        np.testing.assert_array_equal(scan.plan.covariates.get("height_mm", 25.0), 25.0)
+    assert "take scan edge_0 with the sensor at 25 mm" in {scan.description for scan in offered}
+    first, lag = np.arange(101), {"lag": VOCABULARY["lag"]}
+    audited, as_commanded = (audit_plan(plan.take(first), sensor=sensor, effects=lag) for plan in (high, commanded))
+    assert audited.effects == as_commanded.effects
+    assert audited.plan.instrumentation.height_mm == 20.0
+    assert "height_mm" not in audited.plan.covariates
+    assert {cure.plan.instrumentation.height_mm for cure in audited.cures} <= {20.0}

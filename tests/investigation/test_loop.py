@@ -1,14 +1,22 @@
 """The loop of an investigation: when it goes on, what it asks, and why it ends."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from probewise.arm import carry_out
+from probewise.calibration import FittedSensor, mean_field
 from probewise.diagnosis import Hypothesis
 from probewise.errors import ParameterError
 from probewise.investigation import Budget, investigate, reason_if_settled
-from probewise.recordings import Recording, paper_plan
+from probewise.recordings import Instrumentation, Recording, paper_plan
+from probewise.sensor import mixture_names
+from probewise.world import World
+from probewise.world.concealed import Backlash
+from probewise.world.shipped import BLOB
+from probewise.world.spots import gaussian_spot
 
 
 def scans(*numbers):
@@ -103,3 +111,47 @@ def test_wrong_kinds_are_refused_before_anything_is_read():
         investigate(record, scans(0), rng=np.random.default_rng(0), rounds=0)
     with pytest.raises(ParameterError, match="rng"):
         investigate(record, scans(0), rng=3)
+
+
+class Fixed:
+    """An instrument at one height that its arm cannot change."""
+
+    turns = True
+
+    def measure(self, pose):
+        return 0.0
+
+
+@pytest.mark.slow
+def test_an_instrument_at_another_height_than_its_sensors_calibration_goes_on_to_a_second_round():
+    """Calibrated at 16 mm, read at 20 mm: what is advised is read at 20 mm too, without a word about heights."""
+    inverse = np.linalg.inv([[16.0, 1.5], [1.5, 6.25]]) / 2  # of the world's spot
+    truth = np.array([1.0, 0.0, 1.5, inverse[0, 0], inverse[1, 1], inverse[0, 1], 10.0, 60.0])
+    sd = np.array([0.0, 0.03, 0.03, 6e-4, 2e-3, 3e-4, 0.1, 0.1])
+    samples = truth + sd * np.random.default_rng(1).standard_normal((500, 8))
+    sensor = FittedSensor(
+        names=(*mixture_names(1), "I_min", "I_max"),
+        samples=samples,
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.6),
+        field=mean_field(samples, 1, pixel_mm=0.5),
+        instrumentation=Instrumentation(unit="LEGO", height_mm=16.0),
+    )
+    world = World(gaussian_spot([BLOB]), height_mm=16.0, concealed=(Backlash(1.0),))
+
+    def record_at_20_mm(number, plan, asked):
+        assert plan.instrumentation.height_mm == 20.0
+        next(carry_out(Fixed(), plan, origin_mm=(0.0, 0.0), ask=lambda _: None))  # refuses another height
+        lifted = replace(plan, covariates={**plan.covariates, "height_mm": np.full(len(plan), 20.0)})
+        return Recording(plan, world.simulate(lifted, rng=np.random.default_rng(number)).readings)
+
+    plan = scans(0, 1, 2, 3)
+    plan = replace(plan, instrumentation=replace(plan.instrumentation, height_mm=20.0))
+    rounds = list(investigate(record_at_20_mm, plan, sensor=sensor, rounds=2, rng=np.random.default_rng(0)))
+    assert len(rounds) == 2
+    found = rounds[-1].diagnosis
+    assert found.combination == ("backlash",)
+    assert found.recording.plan.instrumentation.height_mm == 20.0
+    repaired = found.repaired.fitted_sensor(found.recording, rng=np.random.default_rng(0))
+    assert repaired.instrumentation.height_mm == 16.0
+    assert abs(repaired.median()["u_1"]) < 0.1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
 
@@ -15,7 +15,6 @@ from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.sensor_prior import (
     SensorPrior,
-    plan_at_height_of,
     require_same_unit,
     require_sensor_prior,
     sensor_from_samples,
@@ -116,7 +115,6 @@ def prepare(
         require_described(everything.plan)
     if sensor is not None:
         require_same_unit(sensor, everything.plan)
-        everything = replace(everything, plan=plan_at_height_of(sensor, everything.plan))
         null = sensor_from_samples(sensor)
     rows = rows_to_diagnose(everything)
     recording = everything if len(rows) == len(everything) else everything.take(rows)

@@ -19,7 +19,7 @@ from probewise.priors import Prior
 from probewise.recordings.patterns import Polygon
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene import AnyOf, Region, Shape, outlines
-from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
+from probewise.sensor import FAST_NODES, Chain
 
 _N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
 
@@ -117,8 +117,7 @@ class SensorAndShape:
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
         """Build the model of a plan with effects, over the shape and the patterns that are described."""
-        scene = _ShapeAmongPatterns(self.shape, plan)
-        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, tuple(effects), n_nodes=n_nodes)
+        return self.sensor.chain_over(_ShapeAmongPatterns(self.shape, plan), effects, n_nodes=n_nodes)
 
     def with_shape_in_next_plan(self, diagnosis: Diagnosis) -> Diagnosis:
         """Return the diagnosis with the shape, at its posterior mean, as the unknown patterns of its next plan.

@@ -21,6 +21,7 @@ from probewise.sensor.commanded import (
     has_commanded_height_or_led,
     height_ratio,
     led_state,
+    with_declared_height_commanded,
 )
 from probewise.sensor.discrete import mean_albedo_by_pixels
 from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, mean_albedo_under_one, turn_into_lab_frame
@@ -116,7 +117,8 @@ class Chain:
     the levels', the scene's, then the effects' as "effect.parameter".
 
     `n_nodes` is the number of quadrature nodes over curved edges (the default is accurate to 1e-8 of
-    I_max - I_min, `FAST_NODES` to 1e-4, mostly 1e-5).
+    I_max - I_min, `FAST_NODES` to 1e-4, mostly 1e-5). `calibrated_height_mm` is the height at which SSF and levels
+    hold, so that a plan may declare another; None: the height that a plan declares.
     """
 
     ssf: SSFModel
@@ -124,6 +126,7 @@ class Chain:
     scene: Scene
     effects: tuple[AnyEffect, ...] = ()
     n_nodes: int = field(default=ACCURATE_NODES, kw_only=True)
+    calibrated_height_mm: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         order = "in the order Chain(ssf, levels, scene)"
@@ -147,6 +150,10 @@ class Chain:
         """Return the chain with these effects added."""
         return replace(self, effects=(*self.effects, *effects))
 
+    def plan_at_calibrated_height(self, plan: Plan) -> Plan:
+        """Return a plan as this model reads it: described at its calibrated height, another declared one commanded."""
+        return with_declared_height_commanded(plan, self.calibrated_height_mm)
+
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings.
 
@@ -169,6 +176,7 @@ class Chain:
             If the plan has a pattern that the scene lacks, theta holds no valid SSF, or a height is commanded of a
             `DiscreteSSF`.
         """
+        plan = self.plan_at_calibrated_height(plan)
         at_once = self._hypotheses_at_once(theta, plan)
         if at_once < len(theta):
             blocks = (theta[first : first + at_once] for first in range(0, len(theta), at_once))
@@ -188,6 +196,7 @@ class Chain:
 
         `view` may hold one hypothesis where those of theta differ only in these stages.
         """
+        plan = self.plan_at_calibrated_height(plan)
         apply = self._stage_applier(theta, plan)
         seen = apply(Stage.RESPONSE, apply(Stage.SEEN, view).seen)
         i_min, i_max = self._levels_of(theta)
@@ -216,6 +225,7 @@ class Chain:
     def simulated_view(self, theta: FloatArray, plan: Plan) -> View:
         """Compute the sensor's view of the scene: the stages of `predict` before SEEN, with their effects."""
         require_columns(theta, self.names)
+        plan = self.plan_at_calibrated_height(plan)
         layout = self._layout_under_poses(theta, plan)
         if isinstance(self.ssf, DiscreteSSF):
             if height_ratio(plan) is not None:
@@ -235,6 +245,7 @@ class Chain:
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
         """Return the sensor's true poses: the chain up to stage POSE; arrays (n_samples or 1, n_points), lab frame."""
+        plan = self.plan_at_calibrated_height(plan)
         told = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
         found: Poses = self._stage_applier(theta, plan)(Stage.POSE, told)
         return found
@@ -285,6 +296,7 @@ class Chain:
     def noise_parameters(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseParameters:
         """Return the noise of each reading: `sd`, broadcasting to (n_samples, n_points), and the effects on it."""
         require_columns(theta, self.names)
+        plan = self.plan_at_calibrated_height(plan)
         start = NoiseParameters(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
             return start

@@ -7,6 +7,7 @@ the LED off there is no signal. Without a column, or at NaN, the sensor is as it
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -48,6 +49,7 @@ def height_ratio(plan: Plan) -> FloatArray | None:
     return None if (ratio == 1.0).all() else ratio
 
 
+@lru_cache(maxsize=32)  # models are predicted many times over one plan, and recognise it
 def with_declared_height_commanded(plan: Plan, calibrated_mm: float | None) -> Plan:
     """Return a plan described at the height of a calibration, its own declared height as a command where it differs.
 

@@ -32,7 +32,6 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, Ca
 from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.fitting.sensor_prior import (
     SensorPrior,
-    plan_at_height_of,
     require_same_unit,
     require_sensor_prior,
     sensor_from_samples,
@@ -268,7 +267,6 @@ def audit_plan(
     require_described(plan)
     if sensor is not None:
         require_same_unit(sensor, plan)
-        plan = plan_at_height_of(sensor, plan)
     if noise_sd is None and isinstance(sensor, FittedSensor):
         noise_sd = float(sensor.noise_sd.mean())
     expected, said = _expected_sensor_and_description(plan, sensor, noise_sd)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -21,7 +21,7 @@ from probewise._arrays import FloatArray, read_only_floats
 from probewise.effects import Extent, NamedEffect
 from probewise.errors import ShapeError
 from probewise.recordings.plan import Plan
-from probewise.scene import KnownScene
+from probewise.scene import KnownScene, Scene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
 
 FARTHEST = 6.0
@@ -35,12 +35,14 @@ LEAST_READINGS = 24
 class CalibratedSensor(ABC):
     """A sensor over known patterns as a `Null`, with a normal prior of the natural coordinates of SSF and levels.
 
-    `center` (n_params,) is the prior's mean, `factor` a square root of its covariance.
+    `center` (n_params,) is the prior's mean, `factor` a square root of its covariance. `calibrated_height_mm` is the
+    height of an earlier calibration; None: the height that a plan declares.
     """
 
     n_gaussians: int
     center: FloatArray
     factor: FloatArray
+    calibrated_height_mm: float | None
 
     def __post_init__(self) -> None:
         n = self.n_params
@@ -126,8 +128,17 @@ class CalibratedSensor(ABC):
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
         """Build the chain over the plan's patterns."""
+        return self.chain_over(cached_known_scene(plan), effects, n_nodes=n_nodes)
+
+    def chain_over(self, scene: Scene, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+        """Build the chain over any scene."""
         return Chain(
-            FreeMixture(self.n_gaussians), FreeLevels(), cached_known_scene(plan), tuple(effects), n_nodes=n_nodes
+            FreeMixture(self.n_gaussians),
+            FreeLevels(),
+            scene,
+            tuple(effects),
+            n_nodes=n_nodes,
+            calibrated_height_mm=self.calibrated_height_mm,
         )
 
 
@@ -142,6 +153,7 @@ class GaussianMixtureSensor(CalibratedSensor):
     center: FloatArray
     factor: FloatArray
     exchangeable: bool = True
+    calibrated_height_mm: float | None = field(default=None, kw_only=True)
 
     @property
     def n_params(self) -> int:

@@ -34,6 +34,7 @@ class FreeFormSensor(CalibratedSensor):
     center: FloatArray
     factor: FloatArray
     n_gaussians: int = field(default=N_FREE_FORM, init=False)
+    calibrated_height_mm: float | None = field(default=None, kw_only=True)
 
     @classmethod
     def from_one_gaussian(cls, one: GaussianMixtureSensor) -> Self:

@@ -15,11 +15,13 @@ from probewise.diagnosis.fitting.coordinates import CalibratedSensor, GaussianMi
 from probewise.diagnosis.fitting.free_form import FreeFormSensor, free_form_to_natural
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
-from probewise.sensor import is_free_form, with_declared_height_commanded
+from probewise.sensor import is_free_form
 
 
-def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
-    """Build a prior from an earlier sensor's posterior mean and covariance.
+def sensor_from_posterior(
+    names: Sequence[str], mean: FloatArray, cov: FloatArray, *, height_mm: float | None = None
+) -> CalibratedSensor:
+    """Build a prior from an earlier sensor's posterior mean and covariance, at its height if that is known.
 
     Only the SSF's and the levels' columns are used; effects of the earlier model are dropped.
 
@@ -48,9 +50,9 @@ def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArra
     floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
     return (
-        FreeFormSensor(center, factor)
+        FreeFormSensor(center, factor, calibrated_height_mm=height_mm)
         if free
-        else GaussianMixtureSensor(n_gaussians, center, factor, exchangeable=False)
+        else GaussianMixtureSensor(n_gaussians, center, factor, exchangeable=False, calibrated_height_mm=height_mm)
     )
 
 
@@ -85,19 +87,13 @@ def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
         raise ParameterError("sensor", f"one that reads in {own!r}", f"one in {unit!r}, as the recording")
 
 
-def plan_at_height_of(sensor: SensorPrior, plan: Plan) -> Plan:
-    """Return a plan described at the height of a sensor's calibration: another one that it declares is a command."""
-    if not isinstance(sensor, FittedSensor):
-        return plan
-    return with_declared_height_commanded(plan, sensor.instrumentation.height_mm)
-
-
 def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
     """Build a prior from an earlier sensor's posterior samples; see `sensor_from_posterior`.
 
     If the samples average several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
     """
+    height_mm = None
     if isinstance(sensor, FittedSensor):
-        sensor = sensor.with_leading_effects()
+        sensor, height_mm = sensor.with_leading_effects(), sensor.instrumentation.height_mm
     samples = np.asarray(sensor.samples, dtype=np.float64)
-    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))
+    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T), height_mm=height_mm)

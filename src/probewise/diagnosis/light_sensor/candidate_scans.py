@@ -110,9 +110,12 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
                     Scan("relight", f"take scan {name} with the LED off{every}", _with_name_suffix(dark, "dark"))
                 )
             if "height_mm" in controls and height_mm is not None:
-                high = _with_commanded_value(once, "height_mm", _RAISE * height_mm)
-                words = f"take scan {name} with the sensor at {_RAISE * height_mm:.4g} mm{every}"
-                out.append(Scan("raise", words, _with_name_suffix(high, "raised")))
+                commanded_mm = once.covariates.get("height_mm", np.full(len(once), np.nan))
+                high_mm = _RAISE * np.where(np.isfinite(commanded_mm), commanded_mm, height_mm)
+                where = f"{high_mm[0]:.4g} mm" if np.ptp(high_mm) == 0.0 else f"{_RAISE:g} times its height"
+                raised = replace(once, covariates={**once.covariates, "height_mm": high_mm})
+                words = f"take scan {name} with the sensor at {where}{every}"
+                out.append(Scan("raise", words, _with_name_suffix(raised, "raised")))
     return out
 
 

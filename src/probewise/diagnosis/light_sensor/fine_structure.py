@@ -8,13 +8,15 @@ are projected out.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration import mixture_moments
-from probewise.diagnosis.fitting.coordinates import CalibratedSensor, cached_known_scene
+from probewise.diagnosis.fitting.coordinates import CalibratedSensor
 from probewise.diagnosis.fitting.fit import Model
-from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
+from probewise.sensor import FAST_NODES, FreeMixture
 
 # In sds of the SSF, in its own metric.
 _REACH = 2.4
@@ -52,7 +54,7 @@ def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> Floa
     (aa, cc), (_, bb) = np.linalg.inv(_WIDTH**2 * covariance) / 2
     levels = theta[0, 6 * sensor.n_gaussians :]
     narrow = np.array([[1.0, u, v, aa, bb, cc, *levels] for u, v in places])
-    chain = Chain(FreeMixture(1), FreeLevels(), cached_known_scene(model.plan), (), n_nodes=FAST_NODES)
+    chain = replace(sensor.chain(model.plan, (), n_nodes=FAST_NODES), ssf=FreeMixture(1))
     whole = model.predict(z[None, :])[0]  # normalised, so that the total weight is unchanged
     return np.asarray(_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
 

@@ -28,7 +28,7 @@ from probewise.inference import sd_ceiling, sd_floor
 from probewise.progress import Progress, silent
 from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
-from probewise.sensor import ACCURATE_NODES
+from probewise.sensor import ACCURATE_NODES, Chain
 
 N_SAMPLES = 500
 N_WALKERS = 250
@@ -92,7 +92,7 @@ class ModelSamples:
             n_gaussians=self.n_gaussians,
             noise_sd=self.noise_sd,
             field=field,
-            instrumentation=recording.plan.instrumentation,
+            instrumentation=cast(Chain, self.chain).plan_at_calibrated_height(recording.plan).instrumentation,
             effects=self.effects,
             patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
             absent=self.absent,

@@ -102,6 +102,7 @@ def test_an_aliased_effect_is_settled_by_the_readings_that_are_asked_for(tmp_pat
     assert found["hypotheses"][0]["effects"] == ["backlash"]
     assert found["hypotheses"][0]["probability"] > 0.95
     assert (whole / "rounds" / "2.csv").exists()
+    assert set(read_recording(whole / "recording.csv").plan.sessions) >= {0, 1}
     assert run("investigate", *options, "--out", cut, "--rounds", 1) == 0
     assert run("investigate", *options, "--out", cut, "--resume") == 0
     for name in ("diagnosis.json", "recording.csv", "sensor.json", "rounds/2.csv"):

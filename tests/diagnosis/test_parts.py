@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
+from probewise.arm import readings_of_recording, recording_of
 from probewise.diagnosis.advice.aliases import Alias, projected_cosine
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import (
@@ -30,16 +31,29 @@ from probewise.diagnosis.fitting.coordinates import (
 from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.fitting.sensor_prior import sensor_from_posterior
-from probewise.diagnosis.joining import join
+from probewise.diagnosis.joining import join, join_plans
 from probewise.diagnosis.judgement.judged import Hypothesis, credible_labels, verdict_from_probabilities
+from probewise.diagnosis.light_sensor.candidate_scans import rows_as_new_scan
 from probewise.diagnosis.light_sensor.covariates import covariate_of
 from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
+from probewise.effects.motion import candidate_scan_groups
 from probewise.errors import ParameterError
-from probewise.recordings import HalfPlane, Image, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
+from probewise.recordings import (
+    HalfPlane,
+    Image,
+    Instrumentation,
+    Plan,
+    Recording,
+    Uniform,
+    paper_plan,
+    read_recording,
+    two_way_plan,
+    write_recording,
+)
 from probewise.recordings.plans import with_jittered_times
 from probewise.sensor import footprint_of, mixture_names
 
@@ -421,6 +435,22 @@ def test_joined_recordings_keep_scans_and_patterns_apart():
     assert join([joined, line(2)]).plan.sessions == (0, 0, 1, 1, 2, 2, 3, 3)
     assert joined.plan.take(joined.plan.scan == 3).sessions == (1,)
     assert join([first]) is first
+
+
+def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tmp_path):
+    joined = join([line(12), replace(line(12), readings=np.linspace(1.0, 3.0, 24))])
+    write_recording(joined, tmp_path / "recording.csv")
+    back = read_recording(tmp_path / "recording.csv")
+    groups = candidate_scan_groups(joined.plan)
+    assert ("s0 (2)", "s1 (2)") in groups
+    assert candidate_scan_groups(back.plan) == groups
+    assert candidate_scan_groups(replace(joined.plan, sessions=())) != groups
+    more = rows_as_new_scan(joined.plan, np.arange(24, 36), 100.0, 1.0, "more")
+    assert more.sessions == ()
+    assert join_plans([joined.plan, more]).sessions == (0, 0, 1, 1, 2)
+    assert join_plans([more, more]).sessions == ()
+    readings = readings_of_recording(joined)
+    assert recording_of(joined.plan, readings).plan.sessions == ()
 
 
 def test_joined_recordings_keep_their_patterns_where_a_third_is_joined_to_them():

@@ -73,6 +73,16 @@ def test_what_was_made_from_arrays_is_written_and_read_back(tmp_path):
     require_same(read_recording(tmp_path / "made.csv"), recording)
 
 
+def test_sessions_are_written_read_back_and_made_from_a_table(tmp_path):
+    recording = made(scan=[*"aab"], session=[0, 0, 1])
+    assert recording.plan.sessions == (0, 1)
+    write_recording(recording, tmp_path / "made.csv")
+    assert read_recording(tmp_path / "made.csv").plan.sessions == (0, 1)
+    table = columns_of(recording) | {"session": [0, 0, 1]}
+    assert Recording.from_table(table, patterns={"edge": EDGE}, unit="V").plan.sessions == (0, 1)
+    assert made(scan=[*"aab"], session=2).plan.sessions == ()
+
+
 def test_scans_begin_where_their_name_changes_and_times_are_a_second_apart():
     plan = made(scan=[1, 2, 1]).plan
     assert (plan.scan.tolist(), plan.scan_names) == ([0, 1, 2], ("1", "2", "1"))
@@ -157,6 +167,8 @@ def test_two_columns_of_one_name_but_for_blanks_are_refused():
         ({"readings": [np.nan] * 3}, "allowed: at least one number within the declared range"),
         ({"readings": [1 + 2j, 0, 0]}, "readings is .*; allowed: numbers"),
         ({"scan": ["a"]}, "scan has 1 names; allowed: 3"),
+        ({"session": [0, 0, 1]}, r"session\[2\] is 1.0; allowed: a whole number from 0, the same throughout a scan"),
+        ({"covariates": {"session": [0, 0, 1]}}, "covariates is 'session'; allowed: a name that is no column"),
         ({"min": 5, "max": 0}, "max is 0.0; allowed: greater than min, 5"),
         ({"step": 0}, "step is 0.0; allowed: a number greater than 0"),
         ({"controls": "led"}, "controls is 'led'; allowed: a tuple of texts"),

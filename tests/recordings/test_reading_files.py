@@ -63,6 +63,14 @@ def test_a_scan_name_that_returns_is_a_new_scan(tmp_path):
     assert plan.scan_names == ("a", "b", "a")
 
 
+def test_a_session_is_a_number_of_each_scan_and_one_session_is_none(tmp_path):
+    csv = "x_mm,y_mm,reading,scan,session\n0,0,1,a,0\n1,0,1,a,0\n0,0,1,b,{0}\n1,0,1,c,{0}\n"
+    assert read_plan(put(tmp_path, csv.format(3))).sessions == (0, 3, 3)
+    assert read_plan(put(tmp_path, csv.format(0))).sessions == ()
+    said = read_recording(put(tmp_path, "x_mm,y_mm,reading,session\n0,0,1,noon\n0,0,2,noon\n"))
+    assert (said.plan.sessions, said.notes) == ((), ("column session is text, ignored",))
+
+
 def test_missing_and_out_of_range_readings_are_counted_and_left_out(tmp_path):
     recording = read_recording(put(tmp_path, "x_mm,y_mm,reading\n0,0,\n0,0,NaN\n0,0,101\n0,0,50\n0,0,0\n0,0,1e200\n"))
     np.testing.assert_array_equal(recording.usable, [False, False, False, True, True, False])
@@ -144,6 +152,10 @@ BAD_TABLES = {
     "open quote": (HEAD + '0,0,"1\n', ["row", "CSV"]),
     "not UTF-8": (HEAD.encode() + b"0,0,1\n0,0,\xff\n", ["row 3", "0xff", "UTF-8"]),
     "UTF-16": (HEAD.encode("utf-16"), ["row 1", "UTF-8"]),
+    "half a session": ("session," + HEAD + "0,0,0,1\n0.5,0,0,1\n", ["row 3", "column session", "0.5", "whole number"]),
+    "two sessions": ("session," + HEAD + "0,0,0,1\n1,0,0,1\n", ["row 3", "column session", "throughout a scan"]),
+    "negative session": ("session," + HEAD + "-1,0,0,1\n", ["row 2", "column session", "from 0"]),
+    "missing session": ("session," + HEAD + "1,0,0,1\n1,0,0,1\n,0,0,1\n", ["row 4", "column session"]),
     "unknown pattern": ("pattern," + HEAD + "white,0,0,1\nred,0,0,1\n", ["row 3", "column pattern", "'red'", "white"]),
     "semicolons": ("x_mm;y_mm;reading\n0;0;1\n", ["row 1", "column x_mm", "comma-separated"]),
 }  # fmt: skip

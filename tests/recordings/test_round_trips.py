@@ -68,6 +68,7 @@ def plans(draw):
     steps = draw(st.lists(st.sampled_from((0, 1)), min_size=n, max_size=n))
     scan = np.cumsum([0, *steps[1:]])
     known = draw(st.dictionaries(names, patterns, min_size=1, max_size=3))
+    sessions = tuple(draw(st.integers(0, 3)) for _ in range(scan[-1] + 1))
     return Plan(
         x_mm=columns[0],
         y_mm=columns[1],
@@ -80,6 +81,7 @@ def plans(draw):
         patterns=known,
         covariates={"battery_mv": columns[3]} if draw(st.booleans()) else {},
         instrumentation=draw(instruments),
+        sessions=sessions if len(set(sessions)) > 1 else (),
     )
 
 
@@ -95,6 +97,7 @@ def assert_same(one: Plan, two: Plan) -> None:
     for name in ("x_mm", "y_mm", "orientation_rad", "time_s", "scan", "pattern"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
     assert one.scan_names == two.scan_names
+    assert one.sessions == two.sessions
     assert one.pattern_names == two.pattern_names
     assert one.patterns == two.patterns
     assert one.instrumentation == two.instrumentation

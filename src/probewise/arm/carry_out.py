@@ -203,7 +203,8 @@ def _can_lift(arm: OwnInstrument | SimulatedArm) -> bool:
 def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
     """Build a recording of the plan's first rows with true places, orientations, times, battery voltage and heights.
 
-    A covariate that a reading lacks is the planned one, or NaN if none is planned.
+    A covariate that a reading lacks is the planned one, or NaN if none is planned. The sessions of a plan that was read
+    from joined recordings are left out.
 
     Parameters
     ----------
@@ -227,6 +228,7 @@ def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
         orientation_rad=np.array([reading.pose.orientation_rad for reading in readings]),
         time_s=np.array([reading.time_s for reading in readings]),
         covariates={**rows.covariates, **covariates},
+        sessions=(),
     )
     return Recording(taken, np.array([reading.value for reading in readings]))
 

@@ -50,7 +50,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
     notes = [note for recording in recordings for note in recording.notes]
     plan = join_plans([recording.plan for recording in recordings])
     return Recording(
-        replace(plan, sessions=_sessions([recording.plan for recording in recordings])),
+        replace(plan, sessions=_joined_sessions([recording.plan for recording in recordings])),
         np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
         " + ".join(r.source for r in recordings if r.source),
         (*notes, *_notes_on_missing_covariates(recordings), *_notes_on_other_instrumentation(recordings)),
@@ -61,7 +61,7 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
     """Concatenate plans, with the covariates of the first and commanded columns (LED, height) of all.
 
     Commanded columns are NaN (as at calibration) where a plan lacks them, unless it declares another height than the
-    first; other covariates keep their last known value.
+    first; other covariates keep their last known value. If a plan has sessions, each of the others is a further one.
     """
     first = plans[0]
     plans = [with_declared_height_commanded(plan, first.instrumentation.height_mm) for plan in plans]
@@ -97,10 +97,11 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         patterns=patterns,
         covariates={name: _joined_covariate(plans, name) for name in sorted({*first.covariates, *commanded})},
         instrumentation=first.instrumentation,
+        sessions=_joined_sessions(plans) if any(plan.sessions for plan in plans) else (),
     )
 
 
-def _sessions(plans: Sequence[Plan]) -> tuple[int, ...]:
+def _joined_sessions(plans: Sequence[Plan]) -> tuple[int, ...]:
     """Return the number of the recording that each of the joined scans is from."""
     found: list[int] = []
     for plan in plans:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import FloatArray, IntArray, floats
+from probewise._arrays import BoolArray, FloatArray, IntArray, floats
 from probewise._kinds import require_kind, require_mapping
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.patterns import PATTERNS, Pattern
@@ -19,6 +19,11 @@ from probewise.recordings.table import MISSING, count_numbers
 _A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
 _THE_ONLY = "pattern"  # name of a single pattern that was given without one
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
+
+
+SESSION = "session"
+"""Name of the column of `Plan.sessions`."""
+A_SESSION = "a whole number from 0, the same throughout a scan"
 
 
 class TableLike(Protocol):
@@ -120,7 +125,7 @@ def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -
         "covariates", columns, "what was logged beside the readings, by name: {'temperature_c': [21.3, ...]}"
     )
     for name in columns:
-        if name in _KNOWN:
+        if name in (*_KNOWN, SESSION):
             raise ParameterError("covariates", name, "a name that is no column of a recording; see its own argument")
     return {name: numbers_per_reading(name, values, n_points) for name, values in columns.items()}
 
@@ -170,6 +175,19 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
     begins = np.zeros(n_points, dtype=np.int64)
     begins[starts[1:]] = 1
     return np.cumsum(begins), tuple(cells[k] for k in starts)
+
+
+def sessions_of_scans(session: FloatArray, scan: IntArray) -> tuple[int, ...]:
+    """Return the session of each scan, in their order, from that of each reading, (n_points,); () where all are one."""
+    first = session[np.unique(scan, return_index=True)[1]]
+    return tuple(int(number) for number in first) if len(set(first.tolist())) > 1 else ()
+
+
+def no_session_mask(session: FloatArray, scan: IntArray) -> BoolArray:
+    """Mark the readings whose session is not `A_SESSION`, that of their scan's first reading: (n_points,)."""
+    _, first, which = np.unique(scan, return_index=True, return_inverse=True)
+    whole = np.isfinite(session) & (session >= 0) & (session == np.floor(session))
+    return np.asarray(~(whole & (session == session[first][which.reshape(-1)])))
 
 
 def patterns_by_name(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:

@@ -16,6 +16,7 @@ from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
+from probewise.recordings.columns import A_SESSION, SESSION, no_session_mask, sessions_of_scans
 from probewise.recordings.description import Description, description_text, read_description, shortest_degrees
 from probewise.recordings.images import image_bytes, is_file_name_without_path
 from probewise.recordings.patterns import Image, Pattern
@@ -115,7 +116,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
         if name != name.strip() or not name.isprintable():
             raise ParameterError("name", name, _A_NAME)
-    clash = [name for name in plan.covariates if name in (*_KNOWN, "")]
+    clash = [name for name in plan.covariates if name in (*_KNOWN, SESSION, "")]
     if clash:
         raise ParameterError("covariate", clash[0], "a name that is no column of the format")
     if np.any(np.diff(plan.scan) < 0):
@@ -131,6 +132,8 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
         "orientation_deg": _degree_cells(plan.orientation_rad),
         "time_s": _number_cells("time_s", plan.time_s),
     }
+    if len({plan.sessions[k] for k in names} if plan.sessions else ()) > 1:
+        columns[SESSION] = [str(plan.sessions[k]) for k in plan.scan]
     return columns | {name: _number_cells(name, values) for name, values in plan.covariates.items()}
 
 
@@ -224,6 +227,11 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     orientation_deg = (
         table.column_of_numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
     )
+    covariates = _covariate_columns(table, notes)
+    session = covariates.pop(SESSION, np.zeros(len(table)))
+    if (wrong := no_session_mask(session, scan)).any():
+        k = int(np.argmax(wrong))
+        raise FileError(path, shown(table.cells(SESSION)[k]), A_SESSION, row=table.row_number(k), column=SESSION)
     plan = Plan(
         x_mm=table.column_of_numbers("x_mm", largest=_LARGEST_PLACE_MM),
         y_mm=table.column_of_numbers("y_mm", largest=_LARGEST_PLACE_MM),
@@ -234,8 +242,9 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
         pattern=_pattern_codes_in_file(table, description),
         pattern_names=tuple(description.patterns),
         patterns=description.patterns,
-        covariates=_covariate_columns(table, notes),
+        covariates=covariates,
         instrumentation=description.instrumentation,
+        sessions=sessions_of_scans(session, scan),
     )
     notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]
     readings = _readings_column(table, description) if "reading" in table.columns else None

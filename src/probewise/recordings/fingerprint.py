@@ -15,8 +15,8 @@ from probewise.recordings.table import csv_text, number_text
 def fingerprint(recording: Recording) -> str:
     """Return the SHA-256, in hexadecimal, of a recording's content, written in a fixed order.
 
-    The content is its rows, readings, scans, covariates, patterns and instrument; not the free-text description, file
-    names, column order or line ends.
+    The content is its rows, readings, scans, sessions, covariates, patterns and instrument; not the free-text
+    description, file names, column order or line ends.
     """
     plan = recording.plan
     columns = plan_columns(plan) | {"reading": [number_text(value) for value in recording.readings]}

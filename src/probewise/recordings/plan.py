@@ -12,14 +12,17 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int, read_only_floats, require_finite
 from probewise._display import ShowsItself
-from probewise._kinds import checked_finite_number, require_kind, warn_of_likely_degrees
+from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
+    A_SESSION,
+    SESSION,
     TableLike,
     checked_covariates,
     columns_by_name,
     dates_to_seconds,
     how_to_describe_pattern,
+    no_session_mask,
     numbers_per_reading,
     numeric_covariates_and_notes,
     pattern_codes,
@@ -27,6 +30,7 @@ from probewise.recordings.columns import (
     require_patterns,
     scan_codes_and_names,
     selected_row_numbers,
+    sessions_of_scans,
     texts_to_numbers,
 )
 from probewise.recordings.patterns import Pattern
@@ -80,7 +84,7 @@ class Plan:
     All arrays have shape (n_points,). `scan` numbers the scans from 0 in the order they are taken
     (a name that returns later is a new scan); `pattern` indexes `pattern_names`. A pattern
     name may be missing from `patterns` only where a hypothesis takes its place. `sessions` numbers the recording that
-    each scan is from, where several were joined; empty for one recording.
+    each scan is from, from 0, where several were joined; empty for one recording.
     """
 
     x_mm: FloatArray
@@ -100,6 +104,7 @@ class Plan:
         if len(self.sessions) not in (0, len(self.scan_names)):
             allowed = f"one number per scan ({len(self.scan_names)}), or none"
             raise ParameterError("sessions", self.sessions, allowed)
+        object.__setattr__(self, "sessions", tuple(checked_whole("sessions", each, least=0) for each in self.sessions))
         for name in ("scan_names", "pattern_names"):
             names: object = getattr(self, name)
             if isinstance(names, str) or not all(isinstance(n, str) for n in getattr(self, name)):
@@ -139,6 +144,7 @@ class Plan:
         orientation_rad: ArrayLike = 0.0,
         time_s: ArrayLike | None = None,
         scan: str | Sequence[object] | None = None,
+        session: ArrayLike | None = None,
         covariates: Mapping[str, ArrayLike] | None = None,
         min: float | None = None,
         max: float | None = None,
@@ -166,6 +172,8 @@ class Plan:
             apart.
         scan
             Name or number of the scan of each reading; a change begins a new scan. By default all are one scan.
+        session
+            Number of the recording of each reading, from 0, where scans are of several; by default they are of one.
         covariates
             Further numbers by name, one per reading each, such as `battery_mv`.
         min, max, step
@@ -195,6 +203,9 @@ class Plan:
         warn_of_likely_degrees("orientation_rad", turns)
         described = patterns_by_name(patterns)
         code, scan_names = scan_codes_and_names(scan, n_points)
+        number = numbers_per_reading("session", 0.0 if session is None else session, n_points)
+        if (wrong := no_session_mask(number, code)).any():
+            raise ParameterError(f"session[{np.argmax(wrong)}]", float(number[wrong][0]), A_SESSION)
         return cls(
             x_mm=x,
             y_mm=numbers_per_reading("y_mm", y_mm, n_points),
@@ -211,6 +222,7 @@ class Plan:
             instrumentation=Instrumentation(
                 unit=unit, min=min, max=max, step=step, sensor=sensor, height_mm=height_mm, controls=controls
             ),
+            sessions=sessions_of_scans(number, code),
         )
 
     def __len__(self) -> int:
@@ -317,6 +329,7 @@ class Recording(ShowsItself):
         orientation_rad: ArrayLike = 0.0,
         time_s: ArrayLike | None = None,
         scan: str | Sequence[object] | None = None,
+        session: ArrayLike | None = None,
         covariates: Mapping[str, ArrayLike] | None = None,
         min: float | None = None,
         max: float | None = None,
@@ -338,7 +351,7 @@ class Recording(ShowsItself):
             What lay under the sensor: patterns by name, or one pattern under every reading.
         unit
             Unit of a reading, such as "V" or "LEGO".
-        pattern, orientation_rad, time_s, scan, covariates, min, max, step, sensor, height_mm, controls
+        pattern, orientation_rad, time_s, scan, session, covariates, min, max, step, sensor, height_mm, controls
             As in `Plan.from_arrays`.
         source
             Origin of the readings, for reports.
@@ -372,6 +385,7 @@ class Recording(ShowsItself):
             orientation_rad=orientation_rad,
             time_s=time_s,
             scan=scan,
+            session=session,
             covariates=covariates,
             min=min,
             max=max,
@@ -406,7 +420,8 @@ class Recording(ShowsItself):
         ----------
         table
             Columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
-            `scan`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are ignored.
+            `scan`, `session`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are
+            ignored.
         patterns, unit, min, max, step, sensor, height_mm, controls, source
             As in `Recording.from_arrays`.
 
@@ -447,6 +462,7 @@ class Recording(ShowsItself):
             orientation_rad=turn_rad,
             time_s=columns.get("time_s"),
             scan=columns.get("scan"),
+            session=covariates.pop(SESSION, None),
             covariates=covariates,
             min=min,
             max=max,

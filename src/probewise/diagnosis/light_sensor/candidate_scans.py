@@ -138,6 +138,7 @@ def rows_as_new_scan(plan: Plan, rows: IntArray, start_s: float, gap_s: float, n
         scan=np.zeros(len(rows), dtype=np.int64),
         scan_names=(name,),
         covariates={k: v for k, v in taken.covariates.items() if k in COMMANDED or k in controls},
+        sessions=(),
     )
 
 

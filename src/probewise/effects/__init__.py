@@ -2,6 +2,9 @@
 
 The paper's model (eq. modelI) holds the footprint and two levels and nothing else; these are the named
 departures from it. A new effect is one class (a `NamedEffect`) and one line in `VOCABULARY`.
+
+Drifts, gradients, scales and the phases of waves count from an `Origin`: time 0 and place (0, 0), or, where a recording
+begins farther from 0 than ten of its own lengths, its first time and the middle of its places.
 """
 
 from collections.abc import Mapping

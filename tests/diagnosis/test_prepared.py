@@ -3,15 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from probewise.calibration import FittedSensor, predict
-from probewise.diagnosis import audit_plan
+from probewise.diagnosis import SensorAndShape, audit_plan
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import prepare
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import VOCABULARY, Extent
+from probewise.errors import ParameterError
 from probewise.recordings import Recording, paper_plan
+from probewise.scene import Circle
 from probewise.sensor import SSFField, mixture_names
 
 SENSOR: Apparatus = LightSensor()
@@ -81,6 +84,9 @@ def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     samples = ModelSamples(chain, np.tile(tilted, (500, 1)), np.full(500, 0.5), ("sensor_tilt",), 1)
     repaired = samples.fitted_sensor(replace(whole, plan=high), rng=np.random.default_rng(0))
     np.testing.assert_allclose(predict(repaired, high).mean, expected[0])
+    over_shape = SensorAndShape(prepared.null, Circle(), np.zeros((1, 10))).chain(high, (), n_nodes=16)
+    circled = np.concatenate([prepared.null.theta(np.zeros((1, 7))), [[5.0, 5.0, 30.0]]], axis=1)
+    np.testing.assert_array_equal(over_shape.predict(circled, high), over_shape.predict(circled, commanded))
     offered = SENSOR.candidate_measurements(high)
     assert {scan.plan.instrumentation.height_mm for scan in offered} == {20.0}
     for scan in offered:
@@ -92,3 +98,14 @@ def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     assert audited.plan.instrumentation.height_mm == 20.0
     assert "height_mm" not in audited.plan.covariates
     assert {cure.plan.instrumentation.height_mm for cure in audited.cures} <= {20.0}
+
+
+def test_no_reading_is_refused():
+    with pytest.raises(ParameterError, match="usable readings"):
+        prepare(replace(recording(), readings=np.full(408, np.nan)), apparatus=SENSOR)
+
+
+def test_an_effect_of_ones_own_stands_beside_the_vocabulary():
+    own = LightSensor({"backlash": VOCABULARY["backlash"]}).effects(recording(), None)
+    assert "backlash" in own
+    assert "lag" not in own

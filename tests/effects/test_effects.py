@@ -147,8 +147,8 @@ def test_lines_are_found_whichever_way_they_were_scanned():
     c, s = np.cos(0.4), np.sin(0.4)
     (found,) = distinct_scan_lines(replace(line, x_mm=c * line.x_mm - s * 7, y_mm=s * line.x_mm + c * 7))
     assert (found.angle_rad, found.offset_mm, found.length_mm) == pytest.approx((0.4, 7.0, 100.0))
-    x, y = found.place(np.array([3.0]), np.array([-2.0]))
-    np.testing.assert_allclose(found.coordinates(x, y), [[3.0], [-2.0]], atol=1e-12)
+    x, y = found.lab_coordinates_mm(np.array([3.0]), np.array([-2.0]))
+    np.testing.assert_allclose(found.line_coordinates_mm(x, y), [[3.0], [-2.0]], atol=1e-12)
 
 
 def test_a_spot_shows_alike_on_its_line_however_far_beside_it_lies():

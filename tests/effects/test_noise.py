@@ -19,8 +19,8 @@ from probewise.effects import (
     RandomWalk,
     SignalDependentNoise,
     lattice_step,
-    lattice_step_sd,
     log_density,
+    sd_of_estimated_lattice_step,
 )
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene
@@ -116,7 +116,7 @@ def test_a_lattice_shows_through_printing(digits):
         readings = np.concatenate([rng.uniform(10, 60, 200), rng.choice([10.3, 59.2], 200) + rng.normal(0, 0.5, 200)])
         step = float(np.exp(rng.uniform(np.log(0.25), np.log(3.0))))
         printed = np.round(step * np.round(readings / step), digits)
-        missed += abs(lattice_step(printed) - step) > 5 * lattice_step_sd(printed, step)
+        missed += abs(lattice_step(printed) - step) > 5 * sd_of_estimated_lattice_step(printed, step)
         assert lattice_step(np.round(readings, digits)) in (pytest.approx(10.0**-digits), 0.0)
     assert missed <= 1  # a step that happens to be nearly a round number
 

@@ -19,7 +19,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
 from probewise.calibration.gaussian_responses import SingleGaussianResponses, total_light_by_gaussian
 from probewise.calibration.whole_coordinates import WholeFootprintCoordinates
-from probewise.effects.density import log_mass_between
+from probewise.effects.density import log_gaussian_mass_between
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled_rows
 
@@ -69,7 +69,7 @@ class CompensatingShift:
         low, high, _ = CompensatingShift(self.shift, self.mean, true_sd)._light_share_bounds_in_sds(
             np.full(len(self.mean), most)
         )
-        log_mass = log_mass_between(low, high)
+        log_mass = log_gaussian_mass_between(low, high)
         return np.asarray(0.5 * (self.mean / true_sd) ** 2 + log_mass + np.log(true_sd / most) + _LOG_ROOT_2PI)
 
     def draw_light_share(self, most: FloatArray, *, rng: np.random.Generator) -> FloatArray:
@@ -83,7 +83,7 @@ class CompensatingShift:
     def log_light_share_density(self, share: FloatArray, most: FloatArray) -> FloatArray:
         """Natural log of the density from which `draw_light_share` draws, at `share`, all (n,)."""
         low, high, _ = self._light_share_bounds_in_sds(most)
-        log_mass = log_mass_between(low, high)
+        log_mass = log_gaussian_mass_between(low, high)
         z = (share - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - _LOG_ROOT_2PI - np.log(self.sd) - log_mass)
 

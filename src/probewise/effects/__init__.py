@@ -22,11 +22,11 @@ from probewise.effects.heavy_tailed_prior import HeavyTailedPrior, LogHeavyTaile
 from probewise.effects.height import HeightGradient, HeightOffset
 from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Estimated, Informed, Known
-from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
+from probewise.effects.lattice import Quantisation, lattice_step, sd_of_estimated_lattice_step
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
 from probewise.effects.motion import orientation_deg, scan_indicator, sign_of_motion
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
-from probewise.effects.noise_distribution import FittedReadings, log_density, variance
+from probewise.effects.noise_distribution import FittedReadings, log_density, reading_variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.origin import CountsFromOrigin, Origin, origins_of
 from probewise.effects.pose import Backlash, PositionScale
@@ -105,14 +105,14 @@ AGAIN = "~again"
 """Suffix of an effect's second copy: the same physics twice, as two steps of the light."""
 
 
-def public_name(name: str) -> str:
+def name_without_copy_suffix(name: str) -> str:
     """Return the vocabulary's name of an effect, without the suffix of a second copy."""
     return name.removesuffix(AGAIN)
 
 
 def spoken_name(name: str) -> str:
     """Return an effect's name with spaces for underscores; unchanged if it names a user's target ("drifts:k_1")."""
-    own = public_name(name)
+    own = name_without_copy_suffix(name)
     return own if ":" in own else own.replace("_", " ")
 
 
@@ -127,8 +127,17 @@ sign_of_move = sign_of_motion
 first_of = name_of_first_copy
 """The old name of `name_of_first_copy`."""
 
+public_name = name_without_copy_suffix
+"""The old name of `name_without_copy_suffix`."""
+
 in_scans = scan_indicator
 """The old name of `scan_indicator`."""
+
+lattice_step_sd = sd_of_estimated_lattice_step
+"""The old name of `sd_of_estimated_lattice_step`."""
+
+variance = reading_variance
+"""The old name of `reading_variance`."""
 
 NoiseRows = FittedReadings
 """The old name of `FittedReadings`."""
@@ -205,14 +214,14 @@ __all__ = [
     "StickSlip",
     "is_out_of_vocabulary",
     "lattice_step",
-    "lattice_step_sd",
     "log_density",
     "name_of_first_copy",
+    "name_without_copy_suffix",
     "orientation_deg",
     "origins_of",
-    "public_name",
+    "reading_variance",
     "scan_indicator",
+    "sd_of_estimated_lattice_step",
     "sign_of_motion",
     "spoken_name",
-    "variance",
 ]

@@ -109,18 +109,18 @@ class RegionWithGradient:
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
-        return self.region.albedo(points_mm) * self._brightness_factor(points_mm)
+        return self.region.albedo(points_mm) * self._albedo_factor_at_points(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over pixels, with the gradient's value at their centres: (n_regions, n_points)."""
-        return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._brightness_factor(centers_mm)
+        return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._albedo_factor_at_points(centers_mm)
 
-    def _brightness_factor(self, points_mm: FloatArray) -> FloatArray:
+    def _albedo_factor_at_points(self, points_mm: FloatArray) -> FloatArray:
         return np.asarray(1 + self.per_mm @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
 
 
 @mean_albedo_under_one.register
-def _mean_albedo_over_gradient(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under each Gaussian, by Stein's lemma.
 
     It is the gradient's factor at the centre times the region's mean albedo, plus a central difference of the latter.
@@ -167,7 +167,7 @@ class RegionWithPatch:
 
 
 @mean_albedo_under_one.register
-def _mean_albedo_over_patch(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_with_patch(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under each Gaussian: the region's, plus the patch's, a bell of covariance C + r^2."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
     from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
@@ -185,7 +185,7 @@ def _regions_with_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
 
 @edge_distance.register(RegionWithGradient)
 @edge_distance.register(RegionWithPatch)
-def _edge_distance_of_changed_region(
+def _distance_to_unchanged_edge(
     region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
 ) -> FloatArray:
     """Return the distance of points from the nearest edge of the region itself, which the effect leaves in place."""

@@ -13,7 +13,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
-from probewise.effects.vocabulary import Gates, NamedEffect, V
+from probewise.effects.vocabulary import NamedEffect, V, VariantMasks
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 
@@ -72,7 +72,7 @@ class ChangePointEffect(NamedEffect[V]):
         stride = -(-(len(self.times_s) - 1) // _FEW)
         return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
 
-    def variant_masks(self, plan: Plan) -> Gates:
+    def variant_masks(self, plan: Plan) -> VariantMasks:
         """Return the masks of the readings after each candidate change point, and a bank entry that acts on all.
 
         A candidate is put at the middle of its interval.
@@ -80,7 +80,7 @@ class ChangePointEffect(NamedEffect[V]):
         always = self.bank()[0]
         always[:, -1] = -np.inf
         middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]
-        return Gates(always, np.array([plan.time_s > at for at in middles]))
+        return VariantMasks(always, np.array([plan.time_s > at for at in middles]))
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Redraw the time of change: for each sample an interval with probability `weights`, then a time within it.
@@ -93,7 +93,7 @@ class ChangePointEffect(NamedEffect[V]):
         return np.concatenate([theta[:, :-1], at_s[:, None]], axis=1)
 
 
-def change_point_times(extent: Extent) -> tuple[float, ...] | None:
+def candidate_change_times_s(extent: Extent) -> tuple[float, ...] | None:
     """Return the times of a recording's readings, thinned to at most 512 intervals; None where there is only one."""
     times = np.unique(extent.plan.time_s)
     if len(times) < 2:

@@ -16,7 +16,9 @@ def log_gaussian_density(readings: FloatArray, mean: FloatArray | float, sd: Flo
     return np.asarray(-0.5 * z * z - np.log(sd) - 0.5 * math.log(2 * math.pi))
 
 
-def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float | FloatArray) -> FloatArray:
+def log_rounding_cell_density(
+    readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float | FloatArray
+) -> FloatArray:
     """Return the natural log of the mean normal density over each reading's rounding cell, reading ± step / 2.
 
     The two tail masses are subtracted in logs, so the result stays finite however far the reading lies from the mean.
@@ -26,10 +28,10 @@ def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, ste
     # Mirror cells above the mean: log_ndtr keeps its precision in the lower tail only.
     above = low + high > 0
     near, far = np.where(above, -low, high), np.where(above, -high, low)
-    return log_mass_between(far, near) - np.log(step)
+    return log_gaussian_mass_between(far, near) - np.log(step)
 
 
-def log_mass_between(low: FloatArray, high: FloatArray) -> FloatArray:
+def log_gaussian_mass_between(low: FloatArray, high: FloatArray) -> FloatArray:
     """Return the log of a standard normal's mass from `low` to `high`; inexact where both lie far in the upper tail."""
     log_low, log_high = log_ndtr(low), log_ndtr(high)
     return np.asarray(log_high + np.log(-np.expm1(np.minimum(log_low - log_high, -1e-15))))

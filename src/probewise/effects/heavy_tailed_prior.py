@@ -39,22 +39,22 @@ class HeavyTailedPrior:
             raise ParameterError("HeavyTailedPrior(smallest)", self.smallest, f"0 < smallest < {self.largest:g}")
 
     @cached_property
-    def _sds(self) -> FloatArray:
-        return self.typical * _relative_sds(self.smallest, self.largest)
+    def _component_sds(self) -> FloatArray:
+        return self.typical * _relative_component_sds(self.smallest, self.largest)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape."""
-        x = np.asarray(value, dtype=np.float64)[..., None] / self._sds
-        terms = np.exp(-0.5 * x * x) / (self._sds * math.sqrt(2 * math.pi))
+        x = np.asarray(value, dtype=np.float64)[..., None] / self._component_sds
+        terms = np.exp(-0.5 * x * x) / (self._component_sds * math.sqrt(2 * math.pi))
         with np.errstate(divide="ignore"):
             density = np.log(terms.mean(axis=-1))
         if not self.positive:
             return np.asarray(density)
         return np.where(np.asarray(value) >= 0, density + math.log(2.0), -np.inf)
 
-    def _upper_tail(self, x: FloatArray) -> FloatArray:
+    def _upper_tail_probability(self, x: FloatArray) -> FloatArray:
         """Return the probability above x of the two-sided mixture."""
-        return np.asarray(0.5 * erfc(x[..., None] / (self._sds * math.sqrt(2))).mean(axis=-1))
+        return np.asarray(0.5 * erfc(x[..., None] / (self._component_sds * math.sqrt(2))).mean(axis=-1))
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Evaluate the quantile function, any shape."""
@@ -71,7 +71,7 @@ class HeavyTailedPrior:
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, any shape."""
         value = np.asarray(value, dtype=np.float64)
-        tail = self._upper_tail(np.abs(value))
+        tail = self._upper_tail_probability(np.abs(value))
         if self.positive:
             return np.where(value > 0, 1.0 - 2.0 * tail, 0.0)
         return np.where(value < 0, tail, 1.0 - tail)
@@ -100,7 +100,7 @@ class _QuantileTable:
         return np.asarray(x)
 
 
-def _relative_sds(smallest: float, largest: float) -> FloatArray:
+def _relative_component_sds(smallest: float, largest: float) -> FloatArray:
     """Return the sds of the mixture, in typical sizes."""
     decades = math.log(largest / SMALLEST_AND_LARGEST[1]) / math.log(SMALLEST_AND_LARGEST[1] / SMALLEST_AND_LARGEST[0])
     return np.asarray(np.geomspace(smallest, largest, _N_SCALES + max(math.ceil((_N_SCALES - 1) * decades), 0)))
@@ -109,7 +109,7 @@ def _relative_sds(smallest: float, largest: float) -> FloatArray:
 @lru_cache(maxsize=16)
 def _tabulate_quantiles(smallest: float, largest: float) -> _QuantileTable:
     """Tabulate the quantiles of the mixture of typical size one, from size 0 upwards."""
-    sds = _relative_sds(smallest, largest)
+    sds = _relative_component_sds(smallest, largest)
     size = np.concatenate([[0.0], np.geomspace(1e-5, 12.0 * largest, 600)])
     upper = 0.5 * erfc(size[:, None] / (sds * math.sqrt(2))).mean(axis=-1)
     return _QuantileTable(sds, -np.log(2 * upper), size)

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.change_points import ChangePointEffect, change_point_times
+from probewise.effects.change_points import ChangePointEffect, candidate_change_times_s
 from probewise.effects.extent import Extent
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
@@ -32,7 +32,7 @@ class ArmKnock(ChangePointEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical displacement to 0.5 % of the longest scan's length; None if all readings share one time."""
-        times = change_point_times(extent)
+        times = candidate_change_times_s(extent)
         return None if times is None else cls(times, typical_mm=0.005 * extent.length_mm)
 
     @property
@@ -71,7 +71,7 @@ class GainStep(ChangePointEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search all times between readings; None if all readings share one time."""
-        times = change_point_times(extent)
+        times = candidate_change_times_s(extent)
         return None if times is None else cls(times)
 
     @property

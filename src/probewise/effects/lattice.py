@@ -74,11 +74,11 @@ def lattice_step(readings: FloatArray) -> float:
     if len(values) < 3:
         return 0.0
     least = 1e-6 * float(values[-1] - values[0])
-    exact = _common_step(values, least)
+    exact = _greatest_common_step(values, least)
     return _step_of_rounded_lattice(values, exact or 10 * least) or exact
 
 
-def lattice_step_sd(readings: FloatArray, step: float) -> float:
+def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
     """Estimate the sd of a lattice's step, as fitted to distinct readings that were printed to some digits.
 
     It is the sd of the printing's rounding error over the norm of the readings' lattice numbers, centred; at least a
@@ -112,7 +112,7 @@ def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:
     return step if float(off.max()) <= 0.75 * rounding else 0.0
 
 
-def _common_step(values: FloatArray, tolerance: float) -> float:
+def _greatest_common_step(values: FloatArray, tolerance: float) -> float:
     """Find the greatest common step of sorted values; 0 where it is below ten times the tolerance.
 
     Euclid's algorithm on their differences; a remainder below the tolerance counts as rounding.

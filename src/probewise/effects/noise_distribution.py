@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._renamed import renamed_arguments
-from probewise.effects.density import log_cell_density, log_gaussian_density
+from probewise.effects.density import log_gaussian_density, log_rounding_cell_density
 from probewise.sensor.stages import NoiseParameters
 
 _NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
@@ -36,7 +36,7 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
     predicted
         Noise-free readings, (n_samples, n_points).
     """
-    noise = _with_walk_variance(noise)
+    noise = _noise_with_walk_variance(noise)
     of_kept = _log_density_rounded(readings, predicted, noise.sd, noise.step)
     with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
         if np.any(noise.wide_share):
@@ -49,14 +49,14 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
 
 
 @renamed_arguments(level="noise")
-def variance(noise: NoiseParameters) -> FloatArray:
+def reading_variance(noise: NoiseParameters) -> FloatArray:
     """Return the variance of a reading that is not lost, with outliers, random walk and rounding; it broadcasts."""
-    noise = _with_walk_variance(noise)
+    noise = _noise_with_walk_variance(noise)
     wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
     return np.asarray(noise.sd**2 * wide + noise.step**2 / 12)
 
 
-def _with_walk_variance(noise: NoiseParameters) -> NoiseParameters:
+def _noise_with_walk_variance(noise: NoiseParameters) -> NoiseParameters:
     """Return the noise with the random walk's marginal variance at each row included in its sd."""
     if not np.any(noise.walk):
         return noise
@@ -68,5 +68,5 @@ def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray,
     if not np.any(step):
         return log_gaussian_density(readings, mean, sd)
     width = np.where(step > 0, step, 1.0)
-    in_cell = log_cell_density(readings, mean, sd, width)
+    in_cell = log_rounding_cell_density(readings, mean, sd, width)
     return in_cell if np.all(step) else np.where(step > 0, in_cell, log_gaussian_density(readings, mean, sd))

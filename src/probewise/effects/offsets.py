@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.change_points import ChangePointEffect, change_point_times
+from probewise.effects.change_points import ChangePointEffect, candidate_change_times_s
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.origin import CountsPlaceFromOrigin, CountsTimeFromOrigin
@@ -99,7 +99,7 @@ class AmbientStep(ChangePointEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical step to 1 % of the readings' range; None where all readings share one time."""
-        times = change_point_times(extent)
+        times = candidate_change_times_s(extent)
         return None if times is None else cls(times, typical=0.01 * extent.span, unit=extent.reading_unit)
 
     @property

@@ -47,13 +47,13 @@ class ScanLine:
         """Length of the line, mm."""
         return self.high_mm - self.low_mm
 
-    def place(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def lab_coordinates_mm(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return X and Y of places given by their position along the line and their distance from it; all broadcast."""
         c, s, n = np.cos(self.angle_rad), np.sin(self.angle_rad), self.offset_mm + beside_mm
         return c * along_mm - s * n, s * along_mm + c * n
 
-    def coordinates(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the position along the line and the distance from it of places X, Y: the inverse of `place`."""
+    def line_coordinates_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the position along the line and the distance from it of places X, Y: `lab_coordinates_mm` inverted."""
         c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
         return c * x_mm + s * y_mm, c * y_mm - s * x_mm - self.offset_mm
 
@@ -71,7 +71,7 @@ def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
             continue
         t = places[-1] - places[0]  # sorted by X, then Y: never against X
         angle = float(np.arctan2(t[1], t[0]))
-        along, across = ScanLine(angle, 0.0, 0.0, 1.0).coordinates(*places.T)
+        along, across = ScanLine(angle, 0.0, 0.0, 1.0).line_coordinates_mm(*places.T)
         if np.ptp(across) > _STRAIGHT * np.ptp(along):
             continue
         line = ScanLine(angle, float(across.mean()), float(along.min()), float(along.max()))
@@ -119,7 +119,7 @@ class PatchPrior:
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map unit-cube coordinates to height, x, y, r; both (n_samples, 4)."""
         on_line, along, beside, r = self._prior_seen_by_scan.from_unit_cube(u).T
-        x, y = self.line.place(along, beside * r)
+        x, y = self.line.lab_coordinates_mm(along, beside * r)
         return np.stack([on_line * np.exp(0.5 * beside**2), x, y, r], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
@@ -135,7 +135,7 @@ class PatchPrior:
     def _parameters_seen_by_scan(self, theta: FloatArray) -> FloatArray:
         """Convert height, x, y, r to height on the line, place along it, distance in radii, radius: (n_samples, 4)."""
         height, x, y, r = theta.T
-        along, beside_mm = self.line.coordinates(x, y)
+        along, beside_mm = self.line.line_coordinates_mm(x, y)
         beside = beside_mm / r
         return np.stack([height * np.exp(-0.5 * beside**2), along, beside, r], axis=-1)
 
@@ -166,6 +166,6 @@ class PatchEffect(NamedEffect[V]):
         for share in _RADII:
             r = share * self.line.length_mm
             along = np.arange(self.line.low_mm, self.line.high_mm + r / 2, r)
-            x, y = self.line.place(along, np.zeros_like(along))
+            x, y = self.line.lab_coordinates_mm(along, np.zeros_like(along))
             patches.append(single_column_bank(self.typical, x, y, r))
         return np.concatenate(patches)

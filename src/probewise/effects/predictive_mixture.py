@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._renamed import renamed_arguments
-from probewise.effects.noise_distribution import log_density, variance
+from probewise.effects.noise_distribution import log_density, reading_variance
 from probewise.sensor.stages import NoiseParameters
 
 
@@ -50,8 +50,8 @@ class PredictiveMixture:
         self.n_samples += len(mean)
         self._total += (mean - self._center).sum(axis=0)
         self._squares += ((mean - self._center) ** 2).sum(axis=0)
-        self._of_noise += np.broadcast_to(variance(noise), mean.shape).sum(axis=0)
-        if self.step is not None:  # `variance` above leaves it out: the pooled sd includes a declared rounding
+        self._of_noise += np.broadcast_to(reading_variance(noise), mean.shape).sum(axis=0)
+        if self.step is not None:  # `reading_variance` above leaves it out: the pooled sd includes a declared rounding
             noise = replace(noise, step=np.full((1, 1), self.step))
         if between is not None:
             noise = replace(noise, sd=np.hypot(np.broadcast_to(noise.sd, mean.shape), between))

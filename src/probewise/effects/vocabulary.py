@@ -23,7 +23,7 @@ _LEAST_WITH_POINT = 1e-7  # a smaller sd has no two digits among eight after the
 
 
 @dataclass(frozen=True, eq=False)
-class Gates:
+class VariantMasks:
     """Masks of variants that differ only in the readings they act on: one prediction serves all of them.
 
     `always` is a bank entry that acts on all readings, (n_columns, n_params); `opened`
@@ -133,7 +133,7 @@ class NamedEffect(Effect[V], Protocol[V]):
         """
         return (self,)
 
-    def variant_masks(self, plan: Plan) -> Gates | None:
+    def variant_masks(self, plan: Plan) -> VariantMasks | None:
         """Return the masks of variants that differ only in the readings they act on; None for other variants."""
         return None
 
@@ -244,6 +244,9 @@ def value_with_sd(mean: float, sd: float, unit: str = "", *, factor: float = 1.0
         written = f"{mean:.4g}"
     return f"{written} {unit}".rstrip()
 
+
+Gates = VariantMasks
+"""The old name of `VariantMasks`."""
 
 give_or_take = value_with_sd
 """The old name of `value_with_sd`."""

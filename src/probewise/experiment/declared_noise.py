@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.effects.density import log_cell_density, log_gaussian_density
+from probewise.effects.density import log_gaussian_density, log_rounding_cell_density
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inference.rounded import ScaleEnds
@@ -57,7 +57,7 @@ class DeclaredNoise:
         sd, step = self.sd if sd is None else sd, self.step if step is None else step
         if not step:
             return self._with_ends(readings, predicted, sd, log_gaussian_density(readings, predicted, sd))
-        within = log_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
+        within = log_rounding_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
         return self._with_ends(readings, predicted, sd, within)
 
     def quick_log_density(self, readings: FloatArray, predicted: FloatArray, *, sd: float) -> FloatArray:

@@ -12,7 +12,7 @@ from scipy.special import log_ndtr
 
 from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import checked_number
-from probewise.effects.density import log_mass_between
+from probewise.effects.density import log_gaussian_mass_between
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 
@@ -126,4 +126,4 @@ class Rounded:
 
     def _exact_log_cell_probability(self, away: FloatArray) -> FloatArray:
         half = 0.5 * self.step / self.sd
-        return log_mass_between(-half - away, half - away)
+        return log_gaussian_mass_between(-half - away, half - away)

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import ALARM, Diagnosis, Place
-from probewise.effects import UNNAMED, public_name
+from probewise.effects import UNNAMED, name_without_copy_suffix
 from probewise.recordings import Plan
 from probewise.report.covariate import (
     axis_label,
@@ -237,7 +237,7 @@ def _covariates_to_fold(
     """
     if found.get("hz", 0.0) > 0:
         return [(table.time_s, 1 / found["hz"], *covariate_words_and_unit(diagnosis, "time"))]
-    column = public_name(effect).partition(":")[2]
+    column = name_without_copy_suffix(effect).partition(":")[2]
     return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
 
 

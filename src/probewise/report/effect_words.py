@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, NoisePerRun, RandomWalk, public_name, spoken_name
+from probewise.effects import (
+    EFFECTS,
+    NUISANCES,
+    PROPOSAL,
+    NoisePerRun,
+    RandomWalk,
+    name_without_copy_suffix,
+    spoken_name,
+)
 from probewise.systems.forms import WORDS
 
 EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
@@ -23,13 +31,13 @@ FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
 
 def effect_has_words(name: str) -> bool:
     """Return whether an effect has a name in words."""
-    kind = public_name(name).partition(":")[0]
+    kind = name_without_copy_suffix(name).partition(":")[0]
     return name in EFFECTS_IN_WORDS or kind in FORMS_IN_WORDS or name.startswith(PROPOSAL)
 
 
 def effect_in_words(name: str) -> str:
     """Return an effect's name in words; a user's own effect keeps its name."""
-    kind, *targets = public_name(name).split(":")
+    kind, *targets = name_without_copy_suffix(name).split(":")
     if name.startswith(PROPOSAL):
         return f"a term {targets[-1]} in {'the rate of ' if targets[0] == 'rate' else ''}{targets[1]}"
     if targets and kind in FORMS_IN_WORDS:

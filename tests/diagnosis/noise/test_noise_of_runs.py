@@ -8,7 +8,7 @@ import pytest
 from scipy.special import gammaln, logsumexp
 
 from probewise.diagnosis.noise.law import NoiseLaw, white_noise
-from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, variance
+from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, reading_variance
 from probewise.sensor import NoiseParameters
 
 
@@ -45,7 +45,7 @@ def test_draws_of_a_walk_scatter_as_it_says():
     )
     white, steps = np.random.default_rng(3).standard_normal((2, 2000, 50))
     draws = level.sd * (white + level.walk * np.cumsum(steps, axis=1))
-    np.testing.assert_allclose(draws.var(axis=0), variance(level)[0], rtol=5 * math.sqrt(2 / 2000))
+    np.testing.assert_allclose(draws.var(axis=0), reading_variance(level)[0], rtol=5 * math.sqrt(2 / 2000))
 
 
 def test_the_evidence_of_noise_per_run_is_that_of_brute_force():

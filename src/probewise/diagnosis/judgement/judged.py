@@ -12,7 +12,7 @@ from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary, noise_effects_in_vocabulary
-from probewise.effects import public_name
+from probewise.effects import name_without_copy_suffix
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
@@ -30,7 +30,7 @@ class Hypothesis:
     @property
     def label(self) -> str:
         """Label in a credible set."""
-        return "+".join(sorted(map(public_name, self.effects))) or "clean"
+        return "+".join(sorted(map(name_without_copy_suffix, self.effects))) or "clean"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.density import log_mass_between
+from probewise.effects.density import log_gaussian_mass_between
 
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 
@@ -60,7 +60,7 @@ class RoundedNormal:
 
     def _log_density(self, x: FloatArray) -> FloatArray:
         half, away = np.asarray(self.half), np.abs(x)
-        return np.asarray(log_mass_between(-half - away, half - away) - np.log(2 * half))
+        return np.asarray(log_gaussian_mass_between(-half - away, half - away) - np.log(2 * half))
 
     def _score(self, x: FloatArray) -> FloatArray:
         """Return minus the derivative of the log density."""

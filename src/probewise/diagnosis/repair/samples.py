@@ -23,7 +23,15 @@ from probewise.diagnosis.repair.annealing import Density, draw_by_annealing, imp
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 from probewise.diagnosis.repair.surrogate import SurrogatePosterior
-from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd, origins_of
+from probewise.effects import (
+    NUISANCES,
+    Extent,
+    NamedEffect,
+    NoiseEffect,
+    Quantisation,
+    origins_of,
+    sd_of_estimated_lattice_step,
+)
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.progress import Progress, silent
 from probewise.recordings import fingerprint
@@ -159,7 +167,7 @@ def sample_model(
     names = tuple(effect.name for effect in chain.effects)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
     for i in of_lattice:
-        sd = lattice_step_sd(recording.readings[recording.usable], float(theta[0, i]))
+        sd = sd_of_estimated_lattice_step(recording.readings[recording.usable], float(theta[0, i]))
         theta[:, i] += sd * rng.standard_normal(n_samples)
     rounding = theta[:, of_lattice].sum(axis=1)
     if law.flat:  # sd at each noise node, without rounding if that is an effect, else including it

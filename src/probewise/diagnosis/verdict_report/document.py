@@ -11,7 +11,7 @@ from typing import Any
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, require_diagnosis
 from probewise.diagnosis.verdict_report.findings import ParameterFound
-from probewise.effects import public_name
+from probewise.effects import name_without_copy_suffix
 
 NEXT_PLAN = "next_plan.csv"
 
@@ -42,7 +42,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         ],
         "effects": [
             {
-                "name": public_name(e.name),
+                "name": name_without_copy_suffix(e.name),
                 "probability": e.probability,
                 "size_lambda": e.size_lambda,
                 "sentence": e.sentence,
@@ -105,7 +105,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 def _public_names(effects: Iterable[str]) -> list[str]:
     """Return the public names of effects, sorted; an effect that occurs twice is listed twice."""
-    return sorted(map(public_name, effects))
+    return sorted(map(name_without_copy_suffix, effects))
 
 
 def _weighing_json(twice: Weighing) -> dict[str, Any]:

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 
 from probewise.systems import FittedSystem, Noise, RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, forms_of
-from probewise.systems.forms.rebinding import extract_recorded
+from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.rebinding import extract_stored_fit
 
 FILE = """\
 import numpy as np
@@ -60,7 +60,7 @@ ABOUT = ReferenceFit(System.of(SIMULATOR, TABLE), TABLE, np.array([0.5, -0.4, 0.
 
 def fitted(effects=(), *, seed=0):
     """Samples about a setting, with as many columns as the effects have parameters."""
-    forms = forms_of(ABOUT)
+    forms = bind_forms(ABOUT)
     chain = ABOUT.system.chain(TABLE, [forms[name] for name in effects])
     middle = {"tau_s": 15.0, "gain": 3.0, "start_c[1]": 20.0, "start_c[2]": 21.0, "start_c[3]": 19.0}
     at = [middle.get(name, 0.1) for name in chain.names]
@@ -71,6 +71,6 @@ def fitted(effects=(), *, seed=0):
         samples=samples,
         noise_sd=np.full(500, 0.05),
         effects=tuple(effect.name for effect in chain.effects),
-        known=extract_recorded(ABOUT) if effects else None,
+        known=extract_stored_fit(ABOUT) if effects else None,
         level=(20.0, 30.0),
     )

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from probewise.systems import Law, RunTable
-from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_of
-from probewise.systems.motion import Limit, Motion, RowsInRuns, integrate_states
+from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_for_table
+from probewise.systems.motion import LawWithEffects, Limit, RowsInRuns, integrate_states
 
 
 def _pendulum(s, p, u):
@@ -51,12 +51,12 @@ class _Case:
     def problem(self, theta):
         def of_some(samples):
             own = dict(zip(("l_m", "c", "phi0"), theta[samples].T[:, :, None], strict=True))
-            return self.effect(Motion(self.law), theta[samples]), own, self.columns
+            return self.effect(LawWithEffects(self.law), theta[samples]), own, self.columns
 
         return of_some
 
     def near(self, theta):
-        steps = steps_of(self.table, 0.02)
+        steps = steps_for_table(self.table, 0.02)
         return integrate_from_known_trajectories(
             self.problem(theta), steps, self.memory, effects="effects", theta=theta, n_own=3
         )
@@ -85,7 +85,7 @@ def test_near_a_known_trajectory_a_derivative_costs_a_fraction_of_stepping():
     found, cost = case.near(theta)
     slopes, expected = (np.diff(v["phi"], axis=0) / 1e-5 for v in (found, case.stepped(theta)))
     np.testing.assert_allclose(slopes, expected, atol=1e-5)
-    assert cost < 0.2 * len(steps_of(case.table, 0.02).gap_of_step)
+    assert cost < 0.2 * len(steps_for_table(case.table, 0.02).gap_of_step)
 
 
 def test_a_sample_that_diverges_is_as_infinite_as_in_steps():

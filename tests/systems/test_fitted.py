@@ -9,8 +9,8 @@ from heater import ABOUT, SIMULATOR, TABLE, fitted
 
 from probewise.errors import FileError, ParameterError
 from probewise.systems import FittedSystem
-from probewise.systems.forms import forms_of
-from probewise.systems.forms.rebinding import extract_recorded, rebind_forms
+from probewise.systems.forms import bind_forms
+from probewise.systems.forms.rebinding import extract_stored_fit, rebind_forms
 
 
 def test_what_is_written_is_read_back_bit_for_bit():
@@ -48,8 +48,8 @@ def test_fewer_than_500_samples_are_refused():
 
 def test_every_form_that_is_bound_again_does_what_it_did():
     """About the fit and from what is in the file, with any parameters: the same readings, to the last bit."""
-    forms = forms_of(ABOUT)
-    again = rebind_forms(forms, SIMULATOR, extract_recorded(ABOUT))
+    forms = bind_forms(ABOUT)
+    again = rebind_forms(forms, SIMULATOR, extract_stored_fit(ABOUT))
     assert again.keys() == forms.keys()
     rng = np.random.default_rng(3)
     for name, form in forms.items():

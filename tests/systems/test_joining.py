@@ -7,18 +7,18 @@ import pytest
 from heater import runs
 
 from probewise.errors import ParameterError
-from probewise.systems import RunTable, join_tables
+from probewise.systems import RunTable, concatenate_tables
 
 
 def test_runs_of_one_name_in_two_tables_are_two_runs():
-    joined, _ = join_tables([runs((20.0, 21.0)), runs((25.0,))], ["a.csv", "b.csv"])
+    joined, _ = concatenate_tables([runs((20.0, 21.0)), runs((25.0,))], ["a.csv", "b.csv"])
     assert joined.scan_names == ("1", "2", "1 (2)")
 
 
 def test_a_column_that_the_second_lacks_is_missing_there_and_noted():
     second = runs((25.0,), names="7")
     bare = dataclasses.replace(second, columns={k: v for k, v in second.columns.items() if k != "room_c"})
-    joined, notes = join_tables([runs(), bare], ["a.csv", "b.csv"])
+    joined, notes = concatenate_tables([runs(), bare], ["a.csv", "b.csv"])
     assert np.isnan(joined.columns["room_c"][len(runs()) :]).all()
     assert notes == ("b.csv has no column room_c: missing there",)
 
@@ -26,30 +26,30 @@ def test_a_column_that_the_second_lacks_is_missing_there_and_noted():
 def test_a_column_that_the_first_lacks_is_left_out_and_noted():
     first = runs()
     bare = dataclasses.replace(first, columns={k: v for k, v in first.columns.items() if k != "room_c"})
-    joined, notes = join_tables([bare, runs((25.0,), names="7")], ["a.csv", "b.csv"])
+    joined, notes = concatenate_tables([bare, runs((25.0,), names="7")], ["a.csv", "b.csv"])
     assert "room_c" not in joined.columns
     assert notes == ("column room_c of b.csv left out: a.csv has none",)
 
 
 def test_the_same_table_twice_is_refused():
     with pytest.raises(ParameterError, match=r"a.csv and a.csv"):
-        join_tables([runs(), runs()], ["a.csv", "a.csv"])
+        concatenate_tables([runs(), runs()], ["a.csv", "a.csv"])
 
 
 def test_texts_where_the_first_has_numbers_are_refused():
     first, second = runs(), runs((25.0,), names="7")
     texts = second.with_columns({"room_c": np.full(len(second), "warm")})
     with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv"):
-        join_tables([first, texts], ["a.csv", "b.csv"])
+        concatenate_tables([first, texts], ["a.csv", "b.csv"])
 
 
 def test_tables_without_runs_are_a_run_each():
     first, second = RunTable({"x": [1.0, 2.0]}), RunTable({"x": [3.0]})
-    joined, _ = join_tables([first, second], ["a.csv", "b.csv"])
+    joined, _ = concatenate_tables([first, second], ["a.csv", "b.csv"])
     assert joined.scan_names == ("a.csv", "b.csv")
 
 
 def test_a_renamed_run_is_not_merged_with_another_run_of_its_table():
-    joined, _ = join_tables([runs((20.0,)), runs((25.0, 26.0), names=("1", "1 (2)"))], ["a.csv", "b.csv"])
+    joined, _ = concatenate_tables([runs((20.0,)), runs((25.0, 26.0), names=("1", "1 (2)"))], ["a.csv", "b.csv"])
     assert joined.scan_names == ("1", "1 (3)", "1 (2)")
     assert len(set(joined.scan.tolist())) == 3

@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 from probewise.errors import ParameterError
 from probewise.systems import Law, RunTable, Simulator, System
-from probewise.systems.motion import Limit, Motion, RowsInRuns, integrate_states
+from probewise.systems.motion import LawWithEffects, Limit, RowsInRuns, integrate_states
 
 
 def _pendulum(s, p, u):
@@ -60,7 +60,9 @@ def test_runs_go_on_side_by_side_as_each_would_alone():
 
 def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts():
     """v = v0 - a t until 0, then it sticks."""
-    motion = Motion(Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]})).with_friction("v", np.full((1, 1), 0.5))
+    motion = LawWithEffects(Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]})).with_friction(
+        "v", np.full((1, 1), 0.5)
+    )
     table = _table(np.linspace(0, 4, 81))
     found = _states(motion, table, {}, 0.05)["v"]
     np.testing.assert_allclose(found, np.maximum(1 - 0.5 * table.time_s, 0), atol=0.03)
@@ -70,7 +72,7 @@ def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts(
 def test_a_body_at_rest_sticks_until_the_force_is_larger_than_its_friction():
     law = Law({"v": 0.0}, lambda s, p, u: {"v": u["force"] + 0 * s["v"]}, hold="linear")
     table = _table(np.linspace(0, 4, 401), force=np.linspace(0, 4, 401))
-    found = _states(Motion(law).with_friction("v", np.full((1, 1), 2.0)), table, {}, 0.01)["v"]
+    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 2.0)), table, {}, 0.01)["v"]
     assert np.all(found[table.time_s < 1.99] == 0)
     assert found[-1] == pytest.approx(0.5 * 2.0**2, abs=0.05)
 
@@ -79,7 +81,7 @@ def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction()
     """Closed form: a force of 2 t exceeds a friction of 1 at 0.5, amid the first step, and v = (t - 0.5)^2 after it."""
     law = Law({"v": 0.0}, lambda s, p, u: {"v": 2 * u["t_s"] + 0 * s["v"]})
     table = _table(np.linspace(0, 4, 6))
-    found = _states(Motion(law).with_friction("v", np.full((1, 1), 1.0)), table, {}, 0.8)["v"]
+    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 1.0)), table, {}, 0.8)["v"]
     np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
 
 
@@ -91,7 +93,7 @@ def test_a_coarse_step_is_split_where_friction_brings_a_damped_body_to_rest():
     law = Law({"x": 0.0, "v": 1.0}, lambda s, p, u: {"x": s["v"], "v": -s["v"]})
     table = _table(np.linspace(0, 2, 5))
     free = _states(law, table, {}, 0.5)["x"][-1] - (1 - np.exp(-2))
-    found = _states(Motion(law).with_friction("v", np.full((1, 1), 0.5)), table, {}, 0.5)["x"][-1]
+    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 0.5)), table, {}, 0.5)["x"][-1]
     assert abs(found - (1 - 0.5 * np.log(3))) < 2 * abs(free)
 
 
@@ -99,7 +101,7 @@ def test_a_coarse_step_is_split_where_friction_brings_a_damped_body_to_rest():
 def test_friction_that_vanishes_holds_nothing_at_rest(size):
     law = Law({"x": 0.0, "v": 0.0}, lambda s, p, u: {"x": 1 - s["x"], "v": s["x"] - s["v"]})
     table = _table(np.linspace(0, 5, 11))
-    held = _states(Motion(law).with_friction("v", np.full((1, 1), size)), table, {}, 0.5)["v"]
+    held = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), size)), table, {}, 0.5)["v"]
     np.testing.assert_allclose(held, _states(law, table, {}, 0.5)["v"], atol=1e-8)
 
 
@@ -107,7 +109,7 @@ def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_en
     law = Law({"level": 0.0}, lambda s, p, u: {"level": u["inflow"] - 0.5 * s["level"]})
     times = np.linspace(0, 10, 201)
     table = _table(times, inflow=np.where(times < 5, 1.0, 0.0))
-    found = _states(Motion(law).with_limit(Limit("level", np.full((1, 1), 1.2))), table, {}, 0.05)["level"]
+    found = _states(LawWithEffects(law).with_limit(Limit("level", np.full((1, 1), 1.2))), table, {}, 0.05)["level"]
     assert found.max() == pytest.approx(1.2)
     after = times >= 5
     np.testing.assert_allclose(found[after], 1.2 * np.exp(-0.5 * (times[after] - 5)), atol=1e-3)
@@ -121,7 +123,7 @@ def test_what_a_tank_spills_into_the_next_one_is_there():
     law = Law({"upper": 0.0, "lower": 0.0}, lambda s, p, u: {"upper": 1 - 0.5 * s["upper"], "lower": 0.5 * s["upper"]})
     table = _table(np.linspace(0, 6, 121))
     bound = Limit("upper", np.full((1, 1), 1.0), spilt={"lower": np.full((1, 1), 0.6)})
-    found = _states(Motion(law).with_limit(bound), table, {}, 0.05)
+    found = _states(LawWithEffects(law).with_limit(bound), table, {}, 0.05)
     spilt = 0.5 * np.maximum(table.time_s - 2 * np.log(2), 0)
     np.testing.assert_allclose(found["upper"], np.minimum(2 * (1 - np.exp(-0.5 * table.time_s)), 1), atol=1e-3)
     np.testing.assert_allclose(found["upper"] + found["lower"] + 0.4 * spilt, table.time_s, atol=1e-3)
@@ -129,7 +131,7 @@ def test_what_a_tank_spills_into_the_next_one_is_there():
 
 def test_time_that_falls_within_a_run_is_refused_with_the_row():
     with pytest.raises(ParameterError, match=r"row 4.*allowed: a time that does not fall"):
-        _ = RowsInRuns(_table([0.0, 1.0, 0.5])).row_at_place
+        _ = RowsInRuns(_table([0.0, 1.0, 0.5])).row_by_position_and_run
 
 
 @pytest.mark.slow

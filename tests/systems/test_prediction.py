@@ -9,8 +9,8 @@ from heater import ABOUT, SIMULATOR, fitted, runs
 from probewise.diagnosis.system.commands import in_sequence, possible_run_commands
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system, write_system_prediction
-from probewise.systems.forms import ReferenceFit, forms_of
-from probewise.systems.forms.rebinding import Recorded, extract_recorded
+from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit
 
 RNG = 7
 
@@ -110,7 +110,7 @@ def _line_with(effect, **sizes):
     simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], time="t")
     samples = np.tile([3.0, *sizes.values()], (500, 1))
     names = ("a", *(f"{effect}.{name}" for name in sizes))
-    known = Recorded(table, table.columns["y"])
+    known = StoredFit(table, table.columns["y"])
     return FittedSystem(simulator, names, samples, np.full(500, 0.1), effects=(effect,), known=known), table
 
 
@@ -155,14 +155,14 @@ def _model_with_a_step_at_a_row():
     table = RunTable({"x": x, "y": 1.0 + x + 2.0 * (np.arange(40) > _STEP_AT)})
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"])
     about = ReferenceFit(System.of(simulator, table), table, np.zeros(1), 0.1)
-    names = ("a", *(f"offset_step.{name}" for name in forms_of(about)["offset_step"].prior.names))
+    names = ("a", *(f"offset_step.{name}" for name in bind_forms(about)["offset_step"].prior.names))
     model = FittedSystem(
         simulator,
         names=names,
         samples=np.tile([1.0, 2.0, _STEP_AT], (500, 1)),
         noise_sd=np.full(500, 0.1),
         effects=("offset_step",),
-        known=extract_recorded(about),
+        known=extract_stored_fit(about),
     )
     return model, table
 
@@ -228,7 +228,7 @@ def test_an_effect_with_a_memory_goes_on_after_a_row_that_lacks_an_input(effect)
     """The power is on a straight line there, so that all other rows are as if it were there."""
     table = runs().with_columns({"power_w": np.tile([1.0, 2, 3, 4, 5, 6, 7, 6, 5, 4, 3, 2], 3)})
     about = dataclasses.replace(ABOUT, table=table)
-    form = forms_of(about)[effect]
+    form = bind_forms(about)[effect]
     model = fitted()
     names = (*model.names, *(f"{effect}.{name}" for name in form.prior.names))
     setting = np.tile(form.bank()[0, 0], (500, 1))
@@ -237,7 +237,7 @@ def test_an_effect_with_a_memory_goes_on_after_a_row_that_lacks_an_input(effect)
         names=names,
         samples=np.concatenate([model.samples, setting], axis=1),
         effects=(effect,),
-        known=extract_recorded(about),
+        known=extract_stored_fit(about),
     )
     whole = predicted(model, table).mean
     with pytest.warns(DoubtfulResultWarning, match=r"1 rows .* first row 5"):
@@ -301,7 +301,7 @@ def test_a_column_with_a_colon_in_its_name_that_an_effect_reads_must_be_there():
         samples=np.tile([0.0, 1.0], (500, 1)),
         noise_sd=np.full(500, 0.1),
         effects=(effect,),
-        known=extract_recorded(about),
+        known=extract_stored_fit(about),
     )
     np.testing.assert_allclose(predicted(model, table).mean, x[0] + x[1] - x[1].mean())
     with pytest.raises(ParameterError, match="room:c"):

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from probewise.systems.motion import Limit, Motion, Stepper
+from probewise.systems.motion import LawWithEffects, Limit, Stepper
 from probewise.systems.runge_kutta import FOURTH_ORDER, StepSchedule, eighth_order_method
 from probewise.systems.simulator import Law
 
 EIGHTH_ORDER = eighth_order_method()
-SWINGS = Motion(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -s["x"] + 0 * u["t"]}))
+SWINGS = LawWithEffects(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -s["x"] + 0 * u["t"]}))
 
 
 def _error(method, n_steps):
@@ -54,7 +54,9 @@ def test_the_method_is_the_one_whose_accuracy_costs_least(in_gap, method, steps)
 
 def test_a_state_that_meets_its_bound_within_a_step_of_eighth_order_stays_there():
     """A filling of rate 1 with a bound at 2.5: what an eighth-order step weighs negatively must not take it back."""
-    fills = Motion(Law({"x": 0.0}, lambda s, p, u: {"x": 1.0 + 0 * s["x"]})).with_limit(Limit("x", np.array([[2.5]])))
+    fills = LawWithEffects(Law({"x": 0.0}, lambda s, p, u: {"x": 1.0 + 0 * s["x"]})).with_limit(
+        Limit("x", np.array([[2.5]]))
+    )
     stepper = Stepper(fills, EIGHTH_ORDER, lambda share: ({}, {}), np.array([[1.0]]))
     s, found = {"x": np.zeros((1, 1))}, []
     for _ in range(4):

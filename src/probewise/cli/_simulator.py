@@ -39,11 +39,11 @@ def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunT
     Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,
     ParameterError if two tables are the same.
     """
-    from probewise.systems import join_tables, read_run_table
+    from probewise.systems import concatenate_tables, read_run_table
 
     tables = []
     for path in paths:
         if path.suffix == ".jsonl":
             raise FileError(path, "a journal", "a CSV table; the journal of an explore run goes with --sensor")
         tables.append(read_run_table(path, time=simulator.time, run=simulator.run))
-    return join_tables(tables, [path.name for path in paths])
+    return concatenate_tables(tables, [path.name for path in paths])

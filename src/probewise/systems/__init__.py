@@ -3,7 +3,7 @@
 from probewise.systems.calls import ProgressWithCallCount
 from probewise.systems.file import read_simulator
 from probewise.systems.fitted import FittedSystem, read_fitted_system, samples_csv, write_fitted_system
-from probewise.systems.joining import join_tables
+from probewise.systems.joining import concatenate_tables
 from probewise.systems.prediction import SystemPrediction, as_recording, predict_system, write_system_prediction
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, table_for
 from probewise.systems.system import System, SystemChain
@@ -11,6 +11,9 @@ from probewise.systems.table import RunRecording, RunTable, read_run_table, run_
 
 CountedCalls = ProgressWithCallCount
 """The old name of `ProgressWithCallCount`."""
+
+join_tables = concatenate_tables
+"""The old name of `concatenate_tables`."""
 
 write_run_table = run_table_csv
 """The old name of `run_table_csv`."""
@@ -28,7 +31,7 @@ __all__ = [
     "SystemChain",
     "SystemPrediction",
     "as_recording",
-    "join_tables",
+    "concatenate_tables",
     "predict_system",
     "read_fitted_system",
     "read_run_table",

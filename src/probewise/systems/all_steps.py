@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dtbtrs
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.systems.motion import (
     LawInputs,
-    Motion,
+    LawWithEffects,
     RowsInRuns,
     Stepper,
     initial_states,
@@ -48,7 +48,7 @@ _WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at th
 # evaluations of all steps suffice, and far from them, where a dozen are needed.
 _FEW_NEAR, _FEW_FAR = 300, 40
 
-LawAndInputs = Callable[[IntArray], tuple[Motion, Mapping[str, FloatArray], Mapping[str, NDArray[Any]]]]
+LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Mapping[str, FloatArray], Mapping[str, NDArray[Any]]]]
 """Function of the numbers of some samples: their law with its effects, their parameters, and the columns."""
 
 
@@ -75,35 +75,35 @@ class Steps:
         return np.repeat(np.arange(len(self.n_steps_by_gap)), self.n_steps_by_gap)
 
     @cached_property
-    def n_steps_before(self) -> IntArray:
+    def n_steps_before_position(self) -> IntArray:
         """Number of steps before each position in the runs, (n_places,)."""
         return np.concatenate([[0], np.cumsum(self.n_steps_by_gap)])
 
     @property
     def n_runs(self) -> int:
         """Number of runs."""
-        return int(self.places.row_at_place.shape[1])
+        return int(self.places.row_by_position_and_run.shape[1])
 
     @cached_property
-    def begin_share(self) -> FloatArray:
+    def begin_share_of_gap(self) -> FloatArray:
         """Share of the gap between rows at which each step begins, (n_steps * n_runs,): the runs of a step in turn."""
         gap = self.gap_of_step
-        share = (np.arange(len(gap)) - self.n_steps_before[gap]) / self.n_steps_by_gap[gap]
+        share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.n_steps_by_gap[gap]
         return np.repeat(share, self.n_runs)
 
     @cached_property
-    def length_share(self) -> FloatArray:
+    def length_share_of_gap(self) -> FloatArray:
         """Share of the gap between rows that each step takes, (n_steps * n_runs,): the runs of a step in turn."""
         return np.repeat(1.0 / self.n_steps_by_gap[self.gap_of_step], self.n_runs)
 
     def states_at_rows(self, states: FloatArray) -> FloatArray:
         """Select states (n_states, n_samples, n_steps + 1, n_runs) at every row: (n_states, n_samples, n_points)."""
-        place, run = self.places.place_and_run
-        return np.asarray(states[:, :, self.n_steps_before[place], run])
+        place, run = self.places.position_and_run_by_row
+        return np.asarray(states[:, :, self.n_steps_before_position[place], run])
 
 
 @lru_cache(maxsize=16)
-def steps_of(table: RunTable, max_step: float) -> Steps:
+def steps_for_table(table: RunTable, max_step: float) -> Steps:
     """Return the steps of an integration over a table."""
     return Steps(RowsInRuns(table), max_step)
 
@@ -124,7 +124,7 @@ class TrajectoryCache:
     known: dict[tuple[Hashable, Hashable], list[KnownTrajectory]] = field(default_factory=dict)
     useless: bool = False
 
-    def nearest_known(
+    def known_and_nearest_indices(
         self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
     ) -> tuple[list[KnownTrajectory], IntArray]:
         """Return the cached trajectories of these steps and effects, and the number of the nearest to each sample.
@@ -142,7 +142,7 @@ class TrajectoryCache:
         apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
         return own, np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
 
-    def keep(self, steps: Hashable, effects: Hashable, more: Sequence[KnownTrajectory]) -> None:
+    def add(self, steps: Hashable, effects: Hashable, more: Sequence[KnownTrajectory]) -> None:
         """Add trajectories to the cache; drop the oldest of steps and effects that were added to least recently."""
         if not more:
             return
@@ -173,7 +173,7 @@ class SolvedSteps:
     moved: FloatArray
     n_evaluated: int
 
-    def new_trajectories(self, theta: FloatArray) -> list[KnownTrajectory]:
+    def new_trajectories_to_cache(self, theta: FloatArray) -> list[KnownTrajectory]:
         """Return the converged trajectories of samples theta that are far enough from known ones to be cached."""
         worth = np.flatnonzero(self.done & (self.moved > _FAR))[:_MOST_NEW]
         return [
@@ -216,14 +216,14 @@ def integrate_from_known_trajectories(
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
         return integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step), n_steps
     states, left, cost = None, np.arange(n_samples), 0
-    known, nearest = memory.nearest_known(steps, effects, theta, n_own)
+    known, nearest = memory.known_and_nearest_indices(steps, effects, theta, n_own)
     if known:
         try:
             with np.errstate(all="ignore"):
                 solved = solve_all_steps(law_and_inputs, steps, known, nearest)
             states, left = solved.states, np.flatnonzero(~solved.done)
             cost = -(-solved.n_evaluated // _WORTH_A_STEP)
-            memory.keep(steps, effects, solved.new_trajectories(theta))
+            memory.add(steps, effects, solved.new_trajectories_to_cache(theta))
         except Exception:  # rates that take no more columns than there are runs
             memory.useless = True
     if left.size:
@@ -236,7 +236,7 @@ def integrate_from_known_trajectories(
             states[:, left] = there
         cost += n_steps
         finite = np.isfinite(there).all(axis=(0, 2, 3))
-        memory.keep(
+        memory.add(
             steps,
             effects,
             [KnownTrajectory(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()],
@@ -286,7 +286,7 @@ def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTr
                 at = known[number].states[:, None]
                 known[number].bands.append(search.jacobian_bands(samples[own][:1], at)[0])
             correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
-        search.correct(samples, correction)
+        search.apply_correction(samples, correction)
         far = ~(search.change < _FAR)
         if samples.size == len(nearest) and far.sum() * search.steps.n_runs > _FEW_FAR:
             search.possible &= ~far
@@ -304,7 +304,7 @@ def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
         bands = search.jacobian_bands(samples, search.states[:, samples])
         correction = _solved_corrections(np.concatenate(bands), search.step_residuals(samples), shared=False)
         last |= dict(zip(samples.tolist(), bands, strict=True))
-        search.correct(samples, correction)
+        search.apply_correction(samples, correction)
     return last
 
 
@@ -324,7 +324,7 @@ class _NewtonState:
         self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
         self._chosen = np.zeros(0, dtype=np.int64)
         motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
-        start = motion.correct_step_end({}, initial_states(motion.law, self.steps.places, parameters, n_samples))
+        start = motion.clip_and_stop_states({}, initial_states(motion.law, self.steps.places, parameters, n_samples))
         self.states[:, :, 0] = np.stack(list(start.values()))
 
     @property
@@ -332,7 +332,7 @@ class _NewtonState:
         """Mask of the samples that have not converged and may yet, (n_samples,)."""
         return self.possible & ~self.done
 
-    def states_at_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
+    def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
         """Return the states to which each step leads from those at its beginning, (n_states, n, n_steps, n_runs)."""
         if not np.array_equal(samples, self._chosen):
             self._chosen, self._end = samples, _stepping_function(self.law_and_inputs, self.steps, samples)
@@ -342,20 +342,20 @@ class _NewtonState:
     def step_residuals(self, samples: IntArray) -> FloatArray:
         """Return the end of each step minus the state that should equal it, (n_states, n, n_steps, n_runs)."""
         states = self.states[:, samples]
-        return self.states_at_ends(samples, states) - states[:, :, 1:]
+        return self.states_at_step_ends(samples, states) - states[:, :, 1:]
 
     def jacobian_bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
         """Return each sample's Jacobian about states (n_states, n, n_steps + 1, n_runs), as `_bands_of_jacobian`."""
-        at_end, columns = self.states_at_ends(samples, states), []
+        at_end, columns = self.states_at_step_ends(samples, states), []
         for values in states:
             nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
             before = values.copy()
             values += nudge
-            columns.append((self.states_at_ends(samples, states) - at_end) / nudge)
+            columns.append((self.states_at_step_ends(samples, states) - at_end) / nudge)
             values[:] = before
         return _bands_of_jacobian(np.stack(columns, axis=1))
 
-    def correct(self, samples: IntArray, correction: FloatArray) -> None:
+    def apply_correction(self, samples: IntArray, correction: FloatArray) -> None:
         """Add a correction (n_states, n, n_steps, n_runs) to samples' states, and mark those that have converged."""
         change = _largest_relative_change(correction, self.states[:, samples])
         self.states[:, samples, 1:] += correction
@@ -374,14 +374,15 @@ def _stepping_function(
     motion, parameters, columns = law_and_inputs(samples)
     n_states = len(motion.law.states)
     first = {state: np.zeros((len(samples), steps.n_runs)) for state in motion.law.states}
-    between = LawInputs.of(motion, steps.places, parameters, columns, first).interpolator_of_steps(steps.gap_of_step)
+    inputs = LawInputs.arranged_by_runs(motion, steps.places, parameters, columns, first)
+    between = inputs.interpolator_of_steps(steps.gap_of_step)
     passing = time_gaps(steps.places, columns)[:, steps.gap_of_step]
     stepper = Stepper(motion, steps.schedule.method, between, passing.reshape(len(passing), -1))
 
     def states_after(begins: FloatArray) -> FloatArray:
         shape = begins.shape
         s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
-        after = stepper.step(s, steps.begin_share, steps.length_share)
+        after = stepper.step(s, steps.begin_share_of_gap, steps.length_share_of_gap)
         return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
 
     return states_after

@@ -90,7 +90,7 @@ class Caller:
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         if broadcasts:
             together = cls(simulate, broadcasts=True, name=name)
-            if not np.isfinite(_readings_of_some_samples(together, samples, columns)).any():
+            if not np.isfinite(_readings_or_nan(together, samples, columns)).any():
                 raise ParameterError(name, "NaN at every place of the prior that was tried", "finite readings")
             return together
         alone = one(samples, columns, strict=True)
@@ -102,7 +102,7 @@ class Caller:
                 return together
         except Exception:
             pass
-        by_row = frozenset(per_run) | _names_taken_by_row(one, samples, columns, alone, per_run)
+        by_row = frozenset(per_run) | _parameters_accepted_by_row(one, samples, columns, alone, per_run)
         return cls(simulate, broadcasts=False, by_row=by_row, name=name)
 
     def __call__(
@@ -121,7 +121,7 @@ class Caller:
                 return np.concatenate(
                     [
                         self._call_together(
-                            *_sample_with_plain_columns(parameters, columns, k), (1, n_points), strict=strict
+                            *_parameters_and_columns_of_sample(parameters, columns, k), (1, n_points), strict=strict
                         )
                         for k in range(n_samples)
                     ]
@@ -129,7 +129,7 @@ class Caller:
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
                 own = {
-                    name: _value_of_sample(values, k, by_row=n_points == 1 and name in self.by_row)
+                    name: _parameter_value_of_sample(values, k, by_row=n_points == 1 and name in self.by_row)
                     for name, values in parameters.items()
                 }
                 table = {
@@ -179,7 +179,7 @@ class Caller:
                     for own, n in halves
                 ]
             )
-        return _checked_readings(readings, shape, self.name)
+        return _readings_broadcast_to_shape(readings, shape, self.name)
 
     def _takes_changed_columns_together(
         self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
@@ -195,12 +195,15 @@ class Caller:
         if changed not in self._taken_together:
             trial = Caller(self.simulate, broadcasts=True, name=self.name)
             own = {name: values[[0, -1]] for name, values in parameters.items()}
-            given = {name: _two_unlike_rows(columns[name][0]) if name in changed else columns[name] for name in columns}
+            given = {
+                name: _column_and_altered_copy(columns[name][0]) if name in changed else columns[name]
+                for name in columns
+            }
             shape = 2, max(np.shape(v)[-1] for v in columns.values())
             try:
                 together = trial._call_together(own, given, shape, strict=True)
                 apart = [
-                    trial._call_together(*_sample_with_plain_columns(own, given, k), (1, shape[1]), strict=True)
+                    trial._call_together(*_parameters_and_columns_of_sample(own, given, k), (1, shape[1]), strict=True)
                     for k in range(2)
                 ]
                 self._taken_together[changed] = _nearly_equal(together, np.concatenate(apart))
@@ -218,7 +221,7 @@ class Caller:
         if known is None:
             self._count_call()
             returned = np.array(self.simulate(dict(own), dict(columns)), dtype=np.float64)
-            known = _checked_readings(returned, (n_points,), self.name)
+            known = _readings_broadcast_to_shape(returned, (n_points,), self.name)
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
@@ -274,7 +277,7 @@ class ProgressWithCallCount:
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
 
 
-def _readings_of_some_samples(
+def _readings_or_nan(
     together: Caller, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
 ) -> FloatArray:
     """Return the readings of samples, NaN where `simulate` raises; its error if it raises for all of them."""
@@ -289,7 +292,7 @@ def _readings_of_some_samples(
         return readings
 
 
-def _names_taken_by_row(
+def _parameters_accepted_by_row(
     one: Caller,
     samples: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
@@ -312,7 +315,7 @@ def _names_taken_by_row(
     return frozenset(taken)
 
 
-def _value_of_sample(values: FloatArray, k: int, *, by_row: bool) -> Any:
+def _parameter_value_of_sample(values: FloatArray, k: int, *, by_row: bool) -> Any:
     """Return a parameter's value in sample k, a number or one per row; the same for all if there is only one.
 
     `by_row`: it is one per row even if there is only one row.
@@ -326,7 +329,7 @@ def _values_of_samples(values: Mapping[str, Any], samples: slice) -> dict[str, A
     return {name: v[samples] if np.ndim(v) == 2 and len(v) > 1 else v for name, v in values.items()}
 
 
-def _sample_with_plain_columns(
+def _parameters_and_columns_of_sample(
     parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], k: int
 ) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]]]:
     """Return the parameters of sample k, (1, 1 or n_points) each, and its columns, (n_points,) each."""
@@ -334,7 +337,7 @@ def _sample_with_plain_columns(
     return own, {name: v[min(k, len(v) - 1)] if np.ndim(v) == 2 else v for name, v in columns.items()}
 
 
-def _two_unlike_rows(values: FloatArray) -> FloatArray:
+def _column_and_altered_copy(values: FloatArray) -> FloatArray:
     """Return a column (n_points,) and a slightly different one in the same order, (2, n_points)."""
     size = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
     return np.stack([values, 1.01 * values + 0.01 * size])
@@ -364,7 +367,7 @@ def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
     )
 
 
-def _checked_readings(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:
+def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:
     """Return the readings broadcast to the wanted shape; raise ShapeError if they do not fit it."""
     if readings.shape == wanted:
         return readings

@@ -90,7 +90,7 @@ def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulato
         per_run=_checked_texts(said, "per_run"),
         controls=_checked_texts(said, "controls"),
         noise=Noise.of(said.get("noise", {})),
-        extra={name: _checked_extra(name, each) for name, each in _checked_mapping(said, "extra").items()},
+        extra={name: _parse_extra(name, each) for name, each in _checked_mapping(said, "extra").items()},
         vectorized=bool(said.get("vectorized", False)),
         source=path.name,
         fingerprint=hashlib.sha256(text.encode()).hexdigest()[:16],
@@ -125,7 +125,7 @@ def _checked_function(said: Mapping[str, Any], name: str) -> Any:
     return value
 
 
-def _checked_extra(name: str, given: object) -> Extra:
+def _parse_extra(name: str, given: object) -> Extra:
     if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
         raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
     return Extra(parse_prior(name, given["prior"]), float(given["null"]), str(given["says"]))

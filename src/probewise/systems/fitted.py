@@ -27,7 +27,7 @@ from probewise.errors import FileError, ParameterError, ProbewiseError
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
-from probewise.systems.forms.rebinding import Recorded, counts_from_far_origin
+from probewise.systems.forms.rebinding import StoredFit, counts_from_far_origin
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
@@ -79,7 +79,7 @@ class FittedSystem(NamedSamples):
     absent: Mapping[str, BoolArray] = field(default_factory=dict)
     level: tuple[float, float] = (0.0, 1.0)
     max_step: float = math.inf
-    known: Recorded | None = None
+    known: StoredFit | None = None
     recording: str = ""
     source: str = ""
     notes: tuple[str, ...] = ()
@@ -136,7 +136,7 @@ class FittedSystem(NamedSamples):
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {"mean": float(self.noise_sd.mean()), "sd": self.noise_sd.tolist()},
             "level": list(self.level),
-            "bound_about": None if self.known is None else _recorded_to_json(self.known),
+            "bound_about": None if self.known is None else _stored_fit_to_json(self.known),
             **({"origins": _ORIGINS} if self._counts_from_far_origin else {}),
             "notes": list(self.notes),
             "samples": self.samples.tolist(),
@@ -175,10 +175,12 @@ class FittedSystem(NamedSamples):
                 samples=samples,
                 noise_sd=np.array(document["noise"]["sd"], dtype=np.float64),
                 effects=tuple(document["effects"]),
-                absent={name: _mask_of_samples(rows, len(samples)) for name, rows in document["absent"].items()},
+                absent={
+                    name: _mask_from_sample_numbers(rows, len(samples)) for name, rows in document["absent"].items()
+                },
                 level=(float(document["level"][0]), float(document["level"][1])),
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
-                known=None if known is None else _recorded_from_json(known, simulator),
+                known=None if known is None else _stored_fit_from_json(known, simulator),
                 recording=str(document["recording"]["fingerprint"]),
                 source=str(document["recording"]["source"]),
                 notes=tuple(document["notes"]),
@@ -225,7 +227,7 @@ def require_fitted_system(fitted: object) -> None:
     require_kind("fitted", fitted, FittedSystem, allowed)
 
 
-def _recorded_to_json(known: Recorded) -> dict[str, Any]:
+def _stored_fit_to_json(known: StoredFit) -> dict[str, Any]:
     table = known.table
     return {
         "time": table.time,
@@ -244,14 +246,14 @@ def _column_to_json(values: NDArray[Any]) -> list[Any]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _recorded_from_json(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
+def _stored_fit_from_json(document: Mapping[str, Any], simulator: Simulator) -> StoredFit:
     columns = {name: _column_from_json(values) for name, values in document["columns"].items()}
     table = RunTable(columns, document["time"], document["run"])
     states = {name: np.array(values, dtype=np.float64) for name, values in document["states"].items()}
     held = document.get("held")  # a file of an earlier version has none: only a law's columns were held then
     if held is None:
         held = table.covariates if simulator.law is not None and simulator.law.hold == "previous" else ()
-    return Recorded(table, np.array(document["predicted"], dtype=np.float64), states, tuple(held))
+    return StoredFit(table, np.array(document["predicted"], dtype=np.float64), states, tuple(held))
 
 
 def _column_from_json(values: list[Any]) -> NDArray[Any]:
@@ -260,7 +262,7 @@ def _column_from_json(values: list[Any]) -> NDArray[Any]:
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def _mask_of_samples(rows: list[int], n_samples: int) -> BoolArray:
+def _mask_from_sample_numbers(rows: list[int], n_samples: int) -> BoolArray:
     """Return the mask, (n_samples,), of the samples with these numbers."""
     out = np.zeros(n_samples, dtype=np.bool_)
     out[np.array(rows, dtype=np.int64)] = True

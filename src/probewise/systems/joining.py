@@ -16,7 +16,7 @@ from probewise.systems.table import RunTable
 _FILE = "file"
 
 
-def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:
+def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:
     """Concatenate tables: columns are those of the first, and runs of different tables remain distinct.
 
     A column that a later table lacks is missing there. Without a column of runs, each table is one run.
@@ -52,7 +52,7 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
         beyond = [name for name in table.columns if name not in first.columns]
         notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
     columns = {
-        name: _joined_column(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
+        name: _concatenated_column(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
         for name in first.columns
     }
     run = first.run or unused_name(_FILE, columns)
@@ -66,7 +66,7 @@ def append_tables(table: RunTable, more: Sequence[RunTable]) -> RunTable:
     return replace(table, columns=columns, like={key: value for t in (table, *more) for key, value in t.like.items()})
 
 
-def _joined_column(
+def _concatenated_column(
     name: str, parts: Sequence[NDArray[Any] | None], lengths: Sequence[int], sources: Sequence[str]
 ) -> NDArray[Any]:
     first = parts[0]

@@ -34,7 +34,7 @@ class Limit:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class LawWithEffects:
     """A law with the contributions of effects: additional terms of rates, dry friction, bounds.
 
     `friction` is, by state, the size of the force against its motion, (n_samples, 1): a state at rest sticks until the
@@ -46,25 +46,25 @@ class Motion:
     friction: Mapping[str, FloatArray] = field(default_factory=dict)
     limits: tuple[Limit, ...] = ()
 
-    def with_term(self, state: str, term: Term) -> Motion:
-        """Return the motion with a term added to the rate of a state."""
+    def with_term(self, state: str, term: Term) -> LawWithEffects:
+        """Return the law with a term added to the rate of a state."""
         return replace(self, terms=(*self.terms, (state, term)))
 
-    def with_friction(self, state: str, size: FloatArray) -> Motion:
-        """Return the motion with dry friction of this size, (n_samples, 1), added to a state."""
+    def with_friction(self, state: str, size: FloatArray) -> LawWithEffects:
+        """Return the law with dry friction of this size, (n_samples, 1), added to a state."""
         known = dict(self.friction)
         known[state] = known[state] + size if state in known else size
         return replace(self, friction=known)
 
-    def with_limit(self, limit: Limit) -> Motion:
-        """Return the motion with a bound of a state added."""
+    def with_limit(self, limit: Limit) -> LawWithEffects:
+        """Return the law with a bound of a state added."""
         return replace(self, limits=(*self.limits, limit))
 
     @cached_property
-    def _is_bare(self) -> bool:
+    def _has_no_effects(self) -> bool:
         return not (self.terms or self.friction or self.limits)
 
-    def friction_directions(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
+    def directions_of_motion(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
         """Return the direction of motion of each state with friction during the next step: 1, -1, or 0 if it sticks."""
         if not self.friction:
             return {}
@@ -81,7 +81,7 @@ class Motion:
     ) -> Mapping[str, Any]:
         """Return the rate of each state, with bounds, and with friction against the directions `ways`."""
         given = self.law.rates(s, p, u)
-        if self._is_bare:
+        if self._has_no_effects:
             return given
         out = {state: given[state] for state in self.law.states}
         for state, term in self.terms:
@@ -96,7 +96,7 @@ class Motion:
                 out[other] = out[other] + share * np.where(stopped, rate, 0.0)
         return out
 
-    def correct_step_end(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+    def clip_and_stop_states(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
         """Clip the states after a step to their bounds, stop those that friction brought to rest, and return them."""
         for state, way in ways.items():
             after[state] = np.where(way * after[state] < 0, 0.0, after[state])
@@ -121,7 +121,7 @@ class RowsInRuns:
     table: RunTable
 
     @cached_property
-    def row_at_place(self) -> IntArray:
+    def row_by_position_and_run(self) -> IntArray:
         """Row of the table at each position of each run, (n_places, n_runs)."""
         table, by_run = self.table, self.table.rows_by_scan()
         for name, rows in zip(table.scan_names, by_run, strict=True):
@@ -136,10 +136,10 @@ class RowsInRuns:
     @cached_property
     def gaps(self) -> FloatArray:
         """Time from each position to the next, (n_places - 1, n_runs)."""
-        return np.diff(self.table.time_s[self.row_at_place], axis=0)
+        return np.diff(self.table.time_s[self.row_by_position_and_run], axis=0)
 
     @cached_property
-    def place_and_run(self) -> tuple[IntArray, IntArray]:
+    def position_and_run_by_row(self) -> tuple[IntArray, IntArray]:
         """Position in its run, and number of its run, of each row, (n_points,) each."""
         place = np.empty(len(self.table), dtype=np.int64)
         for rows in self.table.rows_by_scan():
@@ -155,7 +155,7 @@ class RowsInRuns:
 
 
 def integrate_readings(
-    motion: Motion,
+    motion: LawWithEffects,
     places: RowsInRuns,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
@@ -194,7 +194,7 @@ def readings_of_states(
 
 
 def integrate_states(
-    motion: Motion | Law,
+    motion: LawWithEffects | Law,
     places: RowsInRuns,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
@@ -202,7 +202,7 @@ def integrate_states(
     max_step: float,
 ) -> dict[str, FloatArray]:
     """Integrate a law as `integrate_readings` does; return every state at every row, by name, (n_samples, n_points)."""
-    motion = Motion(motion) if isinstance(motion, Law) else motion
+    motion = LawWithEffects(motion) if isinstance(motion, Law) else motion
     schedule = places.step_schedule(max_step)
     at_row = np.concatenate([[0], np.cumsum(schedule.n_steps)])
     kept: dict[str, FloatArray] = {}
@@ -212,27 +212,27 @@ def integrate_states(
             continue
         for state, values in s.items():
             if k == 0:
-                kept[state] = np.empty((len(values), *places.row_at_place.shape))
+                kept[state] = np.empty((len(values), *places.row_by_position_and_run.shape))
             kept[state][:, k] = values
         k += 1
-    place, run = places.place_and_run
+    place, run = places.position_and_run_by_row
     return {state: values[:, place, run] for state, values in kept.items()}
 
 
 def states_by_step(
-    motion: Motion,
+    motion: LawWithEffects,
     places: RowsInRuns,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
     schedule: StepSchedule,
 ) -> Iterator[dict[str, FloatArray]]:
-    """Integrate the motion: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
+    """Integrate the law: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
     start = initial_states(motion.law, places, parameters, n_samples)
     gaps = time_gaps(places, columns)
-    s = motion.correct_step_end({}, dict(start))
+    s = motion.clip_and_stop_states({}, dict(start))
     with np.errstate(all="ignore"):
-        given_there = LawInputs.of(motion, places, parameters, columns, start)
+        given_there = LawInputs.arranged_by_runs(motion, places, parameters, columns, start)
         yield s
         for k, n in enumerate(schedule.n_steps.tolist()):
             stepper = Stepper(motion, schedule.method, given_there.interpolator_of_gap(k), gaps[:, k])
@@ -246,7 +246,7 @@ def time_gaps(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatA
 
     An effect on the clock changes the time column, and so these gaps.
     """
-    return np.asarray(np.diff(_values_at_rows(columns[str(places.table.time)], places.row_at_place), axis=1))
+    return np.asarray(np.diff(_values_at_rows(columns[str(places.table.time)], places.row_by_position_and_run), axis=1))
 
 
 def initial_states(
@@ -255,7 +255,7 @@ def initial_states(
     """Return the states in which runs start, (n_samples, n_runs) each."""
     start = {}
     for state, given in law.states.items():
-        first = places.row_at_place[:1]
+        first = places.row_by_position_and_run[:1]
         at = (
             _values_at_rows(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
         )
@@ -265,13 +265,13 @@ def initial_states(
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """Steps of a motion by a Runge-Kutta method within a gap between rows.
+    """Steps of a law by a Runge-Kutta method within a gap between rows.
 
     `gap` is the gap's time; `between` is a function of a share of it that returns parameters and columns. In the
     methods `begin` and `length` are shares of the gap: numbers, or one for each column of the states.
     """
 
-    motion: Motion
+    motion: LawWithEffects
     method: RungeKutta
     between: Callable[[Any], Pair]
     gap: FloatArray
@@ -287,7 +287,7 @@ class Stepper:
             for k in range(N_LONGER):
                 s = shorter.step(s, begin + k * part, part)
             return s
-        ways = motion.friction_directions(s, *between(begin))
+        ways = motion.directions_of_motion(s, *between(begin))
         after = self._step_without_split(s, begin, length, ways)
         for state, way in ways.items():
             at_rest = way == 0
@@ -306,19 +306,23 @@ class Stepper:
             ends = last < 0
             if not ends.any():
                 continue
-            until = np.where(ends, _zero_between(0.0, first, 1.0, last), 1.0)
+            until = np.where(ends, _zero_of_straight_line(0.0, first, 1.0, last), 1.0)
             there = self._step_without_split(s, begin, until * length, ways)
             left = margin_to_transition(there, begin + until * length)
-            closer = np.where(left > 0, _zero_between(until, left, 1.0, last), _zero_between(0.0, first, until, left))
+            closer = np.where(
+                left > 0,
+                _zero_of_straight_line(until, left, 1.0, last),
+                _zero_of_straight_line(0.0, first, until, left),
+            )
             until = np.where(ends, closer, 1.0)
             there = self._step_without_split(s, begin, until * length, ways)
             there[state] = np.where(ends, 0.0, there[state])
-            anew = motion.friction_directions(there, *between(begin + until * length))
+            anew = motion.directions_of_motion(there, *between(begin + until * length))
             free = motion.rates(after, *between(begin + length), {})[state]
             anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
             after = self._step_without_split(there, begin + until * length, (1 - until) * length, anew)
             ways = anew
-        return motion.correct_step_end(ways, after) if ways or motion.limits else after
+        return motion.clip_and_stop_states(ways, after) if ways or motion.limits else after
 
     def _step_without_split(
         self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]
@@ -350,7 +354,7 @@ def _advanced_states(
     return out
 
 
-def _zero_between(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:
+def _zero_of_straight_line(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:
     """Return where a straight line between two values of opposite sign is zero; `low` if both are equal."""
     apart = at_low - at_high
     return low + (high - low) * np.where(apart > 0, at_low / np.where(apart > 0, apart, 1.0), 0.0)
@@ -373,9 +377,9 @@ class LawInputs:
     sloping: Mapping[str, FloatArray]  # columns
 
     @classmethod
-    def of(
+    def arranged_by_runs(
         cls,
-        motion: Motion,
+        motion: LawWithEffects,
         places: RowsInRuns,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
@@ -385,7 +389,7 @@ class LawInputs:
 
         Columns that the law does not read are left out; it is evaluated once, at the states `start`, to find them.
         """
-        rows, law, time = places.row_at_place, motion.law, places.table.time
+        rows, law, time = places.row_by_position_and_run, motion.law, places.table.time
         constant: dict[str, Any] = {}
         moving: dict[str, FloatArray] = {}
         for name, values in parameters.items():

@@ -150,14 +150,16 @@ def predict_system(
     require_rng(rng)
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = replace(cast(RunTable, recording.plan), first_row=_number_of_first_row(fitted, recording))
-    system = replace(System.of(fitted.simulator, _interpolated(fitted.simulator, own)), max_step=fitted.max_step)
+    system = replace(
+        System.of(fitted.simulator, _table_with_interpolated_inputs(fitted.simulator, own)), max_step=fitted.max_step
+    )
     chain = system.chain(own, bind_effects(fitted, own))
-    theta, is_drawn = _samples_for_chain(fitted, chain, rng=rng)
+    theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
-    given, lost = _table_without_gaps(chain, theta, own)
+    given, lost = _filled_table_and_unpredictable_mask(chain, theta, own)
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed = 0
-    between = _kernel_width(chain, theta, given) if is_drawn else None
+    between = _smoothing_width_by_row(chain, theta, given) if is_drawn else None
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
@@ -225,7 +227,9 @@ def _first_column_of_block(block: FloatArray, within: FloatArray) -> int | None:
     return int(starts[0])
 
 
-def _table_without_gaps(chain: SystemChain, theta: FloatArray, table: RunTable) -> tuple[RunTable, BoolArray]:
+def _filled_table_and_unpredictable_mask(
+    chain: SystemChain, theta: FloatArray, table: RunTable
+) -> tuple[RunTable, BoolArray]:
     """Interpolate the missing cells that predictions need, and find the rows that cannot be predicted without them.
 
     Returns
@@ -240,8 +244,8 @@ def _table_without_gaps(chain: SystemChain, theta: FloatArray, table: RunTable) 
         If no row can be predicted.
     """
     few, lost = theta[:_FEW], np.zeros(len(table), dtype=np.bool_)
-    lacking = _inputs_with_gaps(chain.system.simulator, table)
-    whole = _interpolated(chain.system.simulator, table)
+    lacking = _incomplete_input_columns(chain.system.simulator, table)
+    whole = _table_with_interpolated_inputs(chain.system.simulator, table)
     if not lacking or not np.isfinite(chain.predict(few, whole)).any():
         return table, lost
     bare, needed = chain.system.chain(table, ()), []
@@ -258,13 +262,13 @@ def _table_without_gaps(chain: SystemChain, theta: FloatArray, table: RunTable) 
     return table.with_columns({name: whole.covariates[name] for name in needed}), lost
 
 
-def _interpolated(simulator: Simulator, table: RunTable) -> RunTable:
+def _table_with_interpolated_inputs(simulator: Simulator, table: RunTable) -> RunTable:
     """Return a table with all missing cells of its inputs interpolated within runs."""
-    lacking = _inputs_with_gaps(simulator, table)
+    lacking = _incomplete_input_columns(simulator, table)
     return table.with_columns({name: table.interpolated_within_runs(values) for name, values in lacking.items()})
 
 
-def _inputs_with_gaps(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
+def _incomplete_input_columns(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
     """Return the columns of numbers, except readings and their sd, in which cells are missing."""
     columns = {k: v for k, v in table.covariates.items() if k not in (simulator.reading, simulator.noise.sd)}
     return {name: values for name, values in columns.items() if not np.isfinite(values).all()}
@@ -285,7 +289,7 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
         forms = rebind_forms(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
         if any(form.needs_rising_time for form in forms.values()):
             table.require_rising_time()
-        lacking = _columns_of_effects(fitted, forms) - set(table.covariates)
+        lacking = _column_names_read_by_effects(fitted, forms) - set(table.covariates)
         if lacking:
             name = min(lacking)
             raise ParameterError(
@@ -310,7 +314,7 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
     return cast(list[NamedEffect[Any]], out)
 
 
-def _columns_of_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
+def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
     """Return the names of the recording's columns of numbers that effects read: targets, and those in formulas."""
     assert fitted.known is not None
     known_names = [name for name in fitted.effects if not name.startswith(PROPOSAL)]
@@ -321,7 +325,7 @@ def _columns_of_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[s
     return named | {name for name in columns if covariate_of_column(name) in in_formulas}
 
 
-def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
+def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
     """Return the kernel width for smoothing over samples in each row, (n_points,), by Silverman's rule.
 
     A parameter of a new run is drawn from its prior some thousand times. If the prior is wide, the predictions are
@@ -336,7 +340,7 @@ def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> Flo
     return np.asarray(0.9 * spread * len(theta) ** -0.2)
 
 
-def _samples_for_chain(
+def _chain_samples_and_whether_drawn(
     fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
 ) -> tuple[FloatArray, bool]:
     """Arrange the samples by the columns of a chain, and draw the parameters of runs outside the recording.
@@ -358,12 +362,12 @@ def _samples_for_chain(
             effect = next(own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}."))
             known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
             positive = effect == NoisePerRun.name  # positive parameters scatter in the logarithm
-            drawn = draw_for_new_run(np.log(known) if positive else known, rng=rng)
+            drawn = draw_value_for_new_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
     return out, any(name not in at for name in chain.names)
 
 
-def draw_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+def draw_value_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
     """Draw the value of a new run given those of other runs: (n_samples, n_runs) -> (n_samples,).
 
     Mean and variance of the runs are unknown; the prior of the variance counts as two more runs with the same scatter.

@@ -17,10 +17,10 @@ from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
-from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_of
+from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_for_table
 from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.mistakes import user_function_error
-from probewise.systems.motion import Motion, RowsInRuns, integrate_readings, readings_of_states
+from probewise.systems.motion import LawWithEffects, RowsInRuns, integrate_readings, readings_of_states
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
@@ -123,7 +123,9 @@ class System:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
                 readings.append(
-                    integrate_readings(Motion(law), RowsInRuns(table), parameters, columns, max_step=self.max_step)
+                    integrate_readings(
+                        LawWithEffects(law), RowsInRuns(table), parameters, columns, max_step=self.max_step
+                    )
                 )
             except ProbewiseError:
                 raise
@@ -162,7 +164,7 @@ class System:
                 out[name] = theta[:, at[name] : at[name] + 1]
         return out | {name: np.full((1, 1), extra.null) for name, extra in own.extra.items()}
 
-    def with_runs(self, table: RunTable) -> System:
+    def with_added_runs(self, table: RunTable) -> System:
         """Return the system with the runs of another table added; their parameters per run have the prior."""
         return replace(self, runs=tuple(dict.fromkeys((*self.runs, *table.scan_names))))
 
@@ -289,7 +291,9 @@ class System:
 
     def _has_affordable_steps(self, places: RowsInRuns) -> bool:
         """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
-        return bool(places.step_schedule(self.max_step).n_steps.sum() <= _MOST_STEPS + len(places.row_at_place))
+        return bool(
+            places.step_schedule(self.max_step).n_steps.sum() <= _MOST_STEPS + len(places.row_by_position_and_run)
+        )
 
 
 def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
@@ -338,20 +342,20 @@ class SystemChain:
 
         def law_and_inputs_of_samples(
             samples: IntArray,
-        ) -> tuple[Motion, dict[str, FloatArray], dict[str, NDArray[Any]]]:
-            def of_samples(values: Any) -> Any:
+        ) -> tuple[LawWithEffects, dict[str, FloatArray], dict[str, NDArray[Any]]]:
+            def values_of_samples(values: Any) -> Any:
                 return values[samples] if np.ndim(values) == 2 and len(values) > 1 else values
 
             return (
-                self._apply_stage(Stage.RATE, Motion(law), theta[samples], plan),
-                {name: of_samples(values) for name, values in parameters.items()},
-                {name: of_samples(values) for name, values in columns.items()},
+                self._apply_stage(Stage.RATE, LawWithEffects(law), theta[samples], plan),
+                {name: values_of_samples(values) for name, values in parameters.items()},
+                {name: values_of_samples(values) for name, values in columns.items()},
             )
 
         try:
             states, cost = integrate_from_known_trajectories(
                 law_and_inputs_of_samples,
-                steps_of(plan, system.max_step),
+                steps_for_table(plan, system.max_step),
                 system.trajectories,
                 effects=(system.runs, self.effects),
                 theta=theta,
@@ -366,13 +370,13 @@ class SystemChain:
                 system.tally.n_failed += 1
                 return np.full((1, len(plan)), np.nan)
 
-        def of_sample(values: Any, k: int) -> Any:
+        def values_of_sample(values: Any, k: int) -> Any:
             return values[min(k, len(values) - 1)][None] if np.ndim(values) == 2 else values
 
         each = [
             self._integrated_readings(
-                {name: of_sample(values, k) for name, values in parameters.items()},
-                {name: of_sample(values, k) for name, values in columns.items()},
+                {name: values_of_sample(values, k) for name, values in parameters.items()},
+                {name: values_of_sample(values, k) for name, values in columns.items()},
                 theta[k : k + 1],
                 plan,
             )
@@ -382,7 +386,7 @@ class SystemChain:
 
     def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
-        for effect, columns in self._columns_of_effects:
+        for effect, columns in self._effects_with_theta_columns:
             if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
@@ -390,11 +394,11 @@ class SystemChain:
     look, read = simulated_view, readings_from_simulated_view  # their earlier names
 
     def _apply_stage(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
-        for effect, columns in self._columns_of_effects:
+        for effect, columns in self._effects_with_theta_columns:
             if effect.stage is stage:
                 value = effect.apply(value, theta[:, columns], plan)
         return value
 
     @cached_property
-    def _columns_of_effects(self) -> list[tuple[AnyEffect, slice]]:
+    def _effects_with_theta_columns(self) -> list[tuple[AnyEffect, slice]]:
         return effects_with_columns(self.effects, self.system.n_params)

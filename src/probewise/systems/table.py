@@ -98,7 +98,7 @@ class RunTable:
         return self.first_row + np.arange(float(len(self)))
 
     @cached_property
-    def _run_of_row_and_names(self) -> tuple[IntArray, tuple[str, ...]]:
+    def _run_numbers_and_names(self) -> tuple[IntArray, tuple[str, ...]]:
         if self.run is None:
             return np.zeros(len(self), dtype=np.int64), (_ONE_RUN,)
         texts = [number_text(v) if isinstance(v, float) else str(v) for v in self.columns[self.run].tolist()]
@@ -109,12 +109,12 @@ class RunTable:
     @property
     def scan(self) -> IntArray:
         """Number of each row's run, from 0 in the order in which they begin, (n_points,)."""
-        return self._run_of_row_and_names[0]
+        return self._run_numbers_and_names[0]
 
     @property
     def scan_names(self) -> tuple[str, ...]:
         """Names of the runs."""
-        return self._run_of_row_and_names[1]
+        return self._run_numbers_and_names[1]
 
     @cached_property
     def covariates(self) -> dict[str, FloatArray]:

@@ -8,7 +8,7 @@ from probewise.challenge.systems.held_out import predict_runs
 from probewise.diagnosis import ModelSamples
 from probewise.priors import Normal, Uniform
 from probewise.systems import RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, forms_of
+from probewise.systems.forms import ReferenceFit, bind_forms
 
 X = np.array([0.0, 1.0, 2.0])
 
@@ -21,7 +21,7 @@ def _samples(per_run, effect=""):
     )  # fmt: skip
     system = System.of(simulator, table)
     about = ReferenceFit(system, table, np.zeros(system.n_params), 0.1)
-    effects = [forms_of(about)[effect]] if effect else []
+    effects = [bind_forms(about)[effect]] if effect else []
     theta = np.tile([2.0, 1.0, 1.5][: system.n_params] + [0.5, -0.5] * len(effects), (50, 1))
     own = tuple(form.name for form in effects)
     return ModelSamples(system.chain(table, effects), theta, np.full(50, 0.1), own, 0), about

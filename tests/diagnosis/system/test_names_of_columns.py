@@ -13,8 +13,8 @@ from probewise.diagnosis.residuals.outlying import FAR_OUT, clustering_log_bayes
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.diagnosis.verdict_report.document import diagnosis_json
 from probewise.systems import Law, Simulator, table_for
-from probewise.systems.forms import forms_of
-from probewise.systems.forms.proposals import proposals
+from probewise.systems.forms import bind_forms
+from probewise.systems.forms.proposals import formula_forms
 from probewise.systems.table import covariate_of_column, published_covariate
 
 _N = 60
@@ -47,7 +47,7 @@ def test_covariates_that_are_no_columns_keep_their_values_beside_columns_of_that
 def test_every_effect_of_a_column_shows_in_it(name):
     about = _prepared({name: _OWN[name]}).apparatus.about
     known = set(_prepared({name: _OWN[name]}).apparatus.covariates_by_row(about.predicted))
-    for form in (forms_of(about)[f"sensitivity:{name}"], *(p for p in proposals(about) if name in p.name)):
+    for form in (bind_forms(about)[f"sensitivity:{name}"], *(p for p in formula_forms(about) if name in p.name)):
         assert covariate_of_column(name) in form.covariates or "time" in form.covariates
         assert set(form.covariates) <= known
 
@@ -55,7 +55,7 @@ def test_every_effect_of_a_column_shows_in_it(name):
 def test_a_formula_of_time_shows_in_time():
     about = _prepared({}).apparatus.about
     (square,) = (
-        form for form in proposals(about) if form.expression.startswith("a (t_s - ") and "^2" in form.name[-3:]
+        form for form in formula_forms(about) if form.expression.startswith("a (t_s - ") and "^2" in form.name[-3:]
     )
     assert square.covariates == ("time",)
 
@@ -82,7 +82,7 @@ def test_a_place_and_a_family_of_unknown_effects_have_the_name_that_results_have
     problem = Linearised(ones, residual, white_noise(_N), 1.0, _N)
     draws = problem.draw_null_residuals(199, rng=np.random.default_rng(0))
     (place,) = significant_places(problem, [covariate], ("all",), residual, draws)
-    effect, plan = forms_of(prepared.apparatus.about)[f"sensitivity:{name}"], prepared.recording.plan
+    effect, plan = bind_forms(prepared.apparatus.about)[f"sensitivity:{name}"], prepared.recording.plan
     (of_effect,) = places_of_effect(effect, bump, covariate, None, plan, residual, p_value=0.001, size=8.0, sd=1.0)
     assert place.covariate == of_effect.covariate == published
     bank = bank_of_unknown_effects([covariate], _X - _X.min(), _X, np.zeros(_N, dtype=int))
@@ -96,7 +96,7 @@ def test_a_column_with_the_name_of_a_state_is_no_second_variable_of_that_name():
     simulator = Simulator("y", "V", {"a": (0.01, 1)}, law=law, time="t_s")
     y = 0.5 * np.exp(-0.1 * _T) + 0.001 * _X
     about = prepare_system(simulator, table_for(simulator, {"t_s": _T, "s": 3.0 + _X, "y": y})).apparatus.about
-    of_rate = [form for form in proposals(about) if form.name.startswith("formula:rate")]
+    of_rate = [form for form in formula_forms(about) if form.name.startswith("formula:rate")]
     assert of_rate
     assert all(set(form.covariates) <= {"state:s", "time"} for form in of_rate)
 

@@ -6,9 +6,9 @@ from scipy.special import ndtr
 
 from probewise.effects import is_out_of_vocabulary
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, forms_of
-from probewise.systems.forms.proposals import proposals
-from probewise.systems.motion import Motion
+from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.proposals import formula_forms
+from probewise.systems.motion import LawWithEffects
 
 SD = 0.01
 N_ROWS = 60
@@ -45,7 +45,7 @@ def _about(simulator):
 
 
 ABOUT = _about(_simulator())
-FORMS = forms_of(ABOUT)
+FORMS = bind_forms(ABOUT)
 NOTHING = ABOUT.predicted
 
 
@@ -92,7 +92,7 @@ def test_a_gain_counts_from_the_reading_of_nothing():
         reading="y", unit="V", parameters={"gain": (0, 4)}, simulate=lambda p, u: 1.0 + p["gain"] * u["drive"],
         time="t_s", run="run", noise=Noise(sd=SD, zero=1.0),
     ))  # fmt: skip
-    found = _read("gain_drift", 0.1, about=about, forms=forms_of(about))
+    found = _read("gain_drift", 0.1, about=about, forms=bind_forms(about))
     np.testing.assert_allclose(found, 1.0 + (about.predicted - 1.0) * (1 + 0.1 * _T))
 
 
@@ -124,7 +124,7 @@ def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
         extra={"bend": Extra(_simulator().parameters["gain"], 0.0, "the amplifier bends by {value} per V")},
     )  # fmt: skip
     about = _about(simulator)
-    form = forms_of(about)["bend"]
+    form = bind_forms(about)["bend"]
     expected = about.theta[0, 0] * TABLE.columns["drive"] * (1 + 0.25 * TABLE.columns["drive"])
     np.testing.assert_allclose(_read("bend", 0.25, about=about, forms={"bend": form}), expected)
     np.testing.assert_allclose(_read("bend", 0.0, about=about, forms={"bend": form}), about.predicted)
@@ -140,7 +140,7 @@ def test_forms_of_a_rate_add_to_the_law():
         time="t_s", run="run", noise=Noise(sd=SD),
     )  # fmt: skip
     about = _about(simulator)
-    forms = forms_of(about)
+    forms = bind_forms(about)
     found = _read("damping:x", 0.7, about=about, forms=forms)
     rate = 2.0 * ndtr(0.0)
     np.testing.assert_allclose(found, rate / 0.7 * (1 - np.exp(-0.7 * _T)), atol=1e-6)
@@ -158,7 +158,7 @@ def test_an_input_that_is_held_comes_late_also_where_rows_are_far_apart_and_clos
     simulator = Simulator("y", "V", {"rate": (0.5, 1.5)}, law=law, time="t_s", noise=Noise(sd=1e-3))
     system = System.of(simulator, table)
     about = ReferenceFit(system, table, np.zeros(1), 1e-3)
-    form = forms_of(about)["input_delay:u"]
+    form = bind_forms(about)["input_delay:u"]
     theta = np.concatenate([about.theta[0], [tau]])[None, :]
     found = system.chain(table, [form]).predict(theta, table)[0]
     exact, rate = [0.0], about.theta[0, 0]
@@ -169,7 +169,7 @@ def test_an_input_that_is_held_comes_late_also_where_rows_are_far_apart_and_clos
 
 
 def test_a_switch_is_proposed_for_each_column_that_takes_many_values():
-    (switch,) = [form for form in proposals(_about(_simulator())) if form.name.endswith("sign(room_c - at)) / 2")]
+    (switch,) = [form for form in formula_forms(_about(_simulator())) if form.name.endswith("sign(room_c - at)) / 2")]
     assert switch.expression == "a (1 + sign(room_c - at)) / 2"
     shifted = switch.apply(np.zeros((1, N_ROWS)), np.array([[0.3, 20.5]]), TABLE)
     np.testing.assert_array_equal(shifted[0], np.where(TABLE.columns["room_c"] > 20.5, 0.3, 0.0))
@@ -184,7 +184,7 @@ def test_a_state_stops_at_a_floor_as_well_as_at_a_ceiling():
         time="t_s", run="run", noise=Noise(sd=SD),
     )  # fmt: skip
     about = _about(simulator)
-    form = forms_of(about)["limit:x"]
+    form = bind_forms(about)["limit:x"]
     falling = about.predicted
     level = falling.min() + 0.2 * np.ptp(falling)
     floored = _read("limit:x", level, about=about, forms={"limit:x": form})
@@ -205,7 +205,7 @@ def test_a_clock_that_gains_hastens_a_law():
         time="t_s", run="run", noise=Noise(sd=SD),
     )  # fmt: skip
     about = _about(simulator)
-    found = _read("clock_drift", 0.03, about=about, forms=forms_of(about))
+    found = _read("clock_drift", 0.03, about=about, forms=bind_forms(about))
     np.testing.assert_allclose(found, about.theta[0, 0] * 2 * np.log(1 + 0.4 * 1.03 * _T), atol=1e-6)
 
 
@@ -236,14 +236,14 @@ def test_an_overflow_goes_to_waste_or_into_a_state_that_it_drives():
         }, max_step_s=0.02),
         time="t_s", run="run", noise=Noise(sd=SD),
     )  # fmt: skip
-    forms = forms_of(_about(simulator))
+    forms = bind_forms(_about(simulator))
     wasted, taken = forms["limit:upper"].variants()
     assert (wasted.fixed, taken.fixed) == (("share[lower]",), ())
     assert [variant.fixed for variant in forms["limit:lower"].variants()] == [("share[upper]",)]
     level = forms["limit:upper"].bank()[3, 0, 0]
     theta = np.array([[level, 0.0], [level, 0.5], [level, 1.0]])
     law = simulator.law
-    motions = [wasted.apply(Motion(law), theta[k : k + 1], TABLE) for k in range(3)]
+    motions = [wasted.apply(LawWithEffects(law), theta[k : k + 1], TABLE) for k in range(3)]
     full = {"upper": np.full((1, 1), level), "lower": np.full((1, 1), 0.1)}
     given = {"rate": np.full((1, 1), 2.0)}
     into_lower = [float(motion.rates(full, given, {}, {})["lower"][0, 0]) for motion in motions]
@@ -270,7 +270,7 @@ def test_a_loop_that_holds_its_input_is_told_from_a_formula_of_the_row():
 
 
 def _proposed(ending, about=ABOUT):
-    (form,) = [form for form in proposals(about) if form.name.endswith(ending)]
+    (form,) = [form for form in formula_forms(about) if form.name.endswith(ending)]
     return form
 
 
@@ -310,7 +310,7 @@ def test_a_dose_is_the_integral_since_the_start_of_the_run_and_saturates():
 
 
 def test_the_influence_of_a_column_is_a_quadratic_function_of_the_reading():
-    (form,) = [form for form in proposals(ABOUT) if "(a + b z + c z^2) (room_c" in form.name]
+    (form,) = [form for form in formula_forms(ABOUT) if "(a + b z + c z^2) (room_c" in form.name]
     column, level = TABLE.columns["room_c"], np.linspace(NOTHING.min(), NOTHING.max(), N_ROWS)
     found = form.apply(level[None, :], np.array([[0.2, -0.1, 0.3]]), TABLE)[0] - level
     z = np.linspace(-1, 1, N_ROWS)
@@ -332,7 +332,7 @@ def test_a_law_is_tried_with_as_many_waves_as_its_rows_tell_apart():
         {"t_s": times, "run": np.repeat([1.0, 2.0], 200), "y": np.zeros(400)}, time="t_s", run="run"
     )  # fmt: skip
     system = System.of(simulator, table)
-    tried = forms_of(ReferenceFit(system, table, np.zeros(system.n_params), SD))["periodic_forcing:x"].bank()[:, 0, 1]
+    tried = bind_forms(ReferenceFit(system, table, np.zeros(system.n_params), SD))["periodic_forcing:x"].bank()[:, 0, 1]
     assert np.diff(tried).max() <= 0.52 / 6.0
     assert tried[-1] == pytest.approx(0.5 / np.diff(times)[0])
 
@@ -356,7 +356,7 @@ def test_a_form_that_looks_back_to_earlier_times_says_so():
     moved = _T.copy()
     moved[10] += 0.05
     later, others = TABLE.with_columns({"t_s": moved}), np.arange(N_ROWS) != 10
-    for form in (*FORMS.values(), *proposals(ABOUT)):
+    for form in (*FORMS.values(), *formula_forms(ABOUT)):
         theta = np.concatenate([ABOUT.theta[0], form.bank()[len(form.bank()) // 2, 0]])[None, :]
         chain = ABOUT.system.chain(TABLE, [form])
         change = (chain.predict(theta, later) - chain.predict(theta, TABLE))[0]
@@ -367,7 +367,7 @@ def test_a_form_that_looks_back_to_earlier_times_says_so():
 
 def test_a_dose_is_the_integral_over_time_in_a_table_of_one_row_too():
     """At the start of a run nothing has been taken up yet; before, the one row was added up as where no time is."""
-    dose = next(form for form in proposals(ABOUT) if "integral over t_s of |room_c|" in form.name)
+    dose = next(form for form in formula_forms(ABOUT) if "integral over t_s of |room_c|" in form.name)
     theta = np.concatenate([ABOUT.theta[0], [1.0, 5.0]])[None, :]
     for n_rows in (1, 2):
         first = TABLE.take(np.arange(n_rows))

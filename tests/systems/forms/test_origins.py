@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
-from probewise.effects import public_name
+from probewise.effects import name_without_copy_suffix
 from probewise.effects.vocabulary import sentence_from_samples
 from probewise.errors import FileError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
-from probewise.systems.forms import ReferenceFit, forms_of
+from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.origins import origin_of_column, rounded_to_spread, text_rounded_to_spread, time_origin
-from probewise.systems.forms.proposals import proposals
-from probewise.systems.forms.rebinding import extract_recorded
+from probewise.systems.forms.proposals import formula_forms
+from probewise.systems.forms.rebinding import extract_stored_fit
 
 EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
 FAR = 2.0**21  # of a column
@@ -82,7 +82,7 @@ def test_a_recording_that_begins_within_ten_of_its_lengths_is_counted_from_0():
 @pytest.mark.parametrize("how", [_function, _law])
 def test_every_form_of_a_recording_by_the_epoch_is_that_of_the_same_recording_from_0(how):
     near, later = (_about(shift, 0.0, how) for shift in (0.0, EPOCH))
-    expected, found = forms_of(near), forms_of(later)
+    expected, found = bind_forms(near), bind_forms(later)
     assert found.keys() == expected.keys()
     for name, form in expected.items():
         setting = form.bank()[len(form.bank()) // 3, 0]
@@ -97,7 +97,7 @@ def test_every_form_of_a_recording_by_the_epoch_is_that_of_the_same_recording_fr
 
 def test_every_formula_of_a_recording_by_the_epoch_is_that_of_the_same_recording_from_0():
     near, later = (_about(shift, 0.0, _function) for shift in (0.0, EPOCH))
-    expected, found = (list(proposals(about)) for about in (near, later))
+    expected, found = (list(formula_forms(about)) for about in (near, later))
     assert len(found) == len(expected)
     for one, other in zip(expected, found, strict=True):
         setting = one.bank()[len(one.bank()) // 3, 0]
@@ -107,7 +107,7 @@ def test_every_formula_of_a_recording_by_the_epoch_is_that_of_the_same_recording
 
 def test_a_periodic_error_of_a_column_far_from_0_has_its_phase_from_there():
     near, away = (_about(0.0, far, _function) for far in (0.0, FAR))
-    form, found = forms_of(near)["periodic_error:drive"], forms_of(away)["periodic_error:drive"]
+    form, found = bind_forms(near)["periodic_error:drive"], bind_forms(away)["periodic_error:drive"]
     least = _DRIVE.min()
     for setting in ([0.1, 0.7, 0.4], [0.05, 0.31, -1.0]):
         shifted = [*setting[:2], setting[2] - 2 * np.pi * least / setting[1]]  # that from 0 has it at 0
@@ -120,24 +120,24 @@ def test_a_periodic_error_of_a_column_far_from_0_has_its_phase_from_there():
 )
 def test_what_counts_from_a_far_time_says_so_and_nothing_else_does(how, name):
     """The drift of a gain is 0 at the first time: without that time its size alone says nothing."""
-    near, later = (forms_of(_about(shift, 0.0, how)) for shift in (0.0, EPOCH))
+    near, later = (bind_forms(_about(shift, 0.0, how)) for shift in (0.0, EPOCH))
     setting = near[name].bank()[:1, 0]
     plain = sentence_from_samples(near[name], setting)
     assert sentence_from_samples(later[name], setting) == f"{plain} (t_s counts from 1700000000 s)"
     assert not [each for each, form in near.items() if form.counted_from]
-    counting = {public_name(each) for each, form in later.items() if form.counted_from}
+    counting = {name_without_copy_suffix(each) for each, form in later.items() if form.counted_from}
     assert counting <= set(COUNTS_TIME)
 
 
 def test_a_column_that_is_far_from_0_is_named_in_the_sentence_of_its_wave():
-    form = forms_of(_about(0.0, FAR, _function))["periodic_error:drive"]
+    form = bind_forms(_about(0.0, FAR, _function))["periodic_error:drive"]
     said = sentence_from_samples(form, form.bank()[:1, 0])
     assert said.endswith(f" (drive counts from {FAR + _DRIVE.min():.12g})")
 
 
 def test_the_proposal_of_a_square_wave_says_from_which_time_it_counts():
     near, later = (
-        next(form for form in proposals(_about(shift, 0.0, _function)) if "mod 1" in form.name)
+        next(form for form in formula_forms(_about(shift, 0.0, _function)) if "mod 1" in form.name)
         for shift in (0.0, EPOCH)
     )
     assert (near.counted_from, later.counted_from) == ("", "t_s counts from 1700000000 s")
@@ -155,7 +155,7 @@ def test_a_mean_is_rounded_no_coarser_than_the_spread_about_it():
 def test_a_model_keeps_the_origin_of_its_recording_for_other_tables_and_through_its_file():
     about = _about(EPOCH, 0.0, _function)
     names = ("interference", "offset_drift")
-    forms = forms_of(about)
+    forms = bind_forms(about)
     columns = [*about.system.prior.names, *(f"{n}.{p}" for n in names for p in forms[n].prior.names)]
     theta = np.array([1.0, 2.0, 0.5, 0.3, 0.4, 0.1])
     model = FittedSystem(
@@ -164,7 +164,7 @@ def test_a_model_keeps_the_origin_of_its_recording_for_other_tables_and_through_
         samples=np.tile(theta, (500, 1)),
         noise_sd=np.full(500, 0.01),
         effects=names,
-        known=extract_recorded(about),
+        known=extract_stored_fit(about),
     )
     later = _table(EPOCH + 1e5)  # its own origin would be another one
     since = later.columns["t_s"] - EPOCH
@@ -205,7 +205,7 @@ def test_a_recording_by_the_epoch_has_the_diagnosis_of_the_same_recording_from_0
 
 
 def _model(about, *effects):
-    forms = forms_of(about)
+    forms = bind_forms(about)
     parameters = [f"{name}.{p}" for name in effects for p in forms[name].prior.names]
     theta = np.concatenate([[1.0, 2.0], *(forms[name].bank()[0, 0] for name in effects)])
     return FittedSystem(
@@ -214,7 +214,7 @@ def _model(about, *effects):
         samples=np.tile(theta, (500, 1)),
         noise_sd=np.full(500, 0.01),
         effects=effects,
-        known=extract_recorded(about),
+        known=extract_stored_fit(about),
     )
 
 

@@ -6,7 +6,7 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.system.fitted import repaired_of
 from probewise.systems import Noise, RunTable, Simulator, as_recording, predict_system
-from probewise.systems.forms.stop import find_meter_stop
+from probewise.systems.forms.stop import find_meter_stop_and_mask
 
 _N, _SD = 240, 0.05
 
@@ -24,7 +24,7 @@ def _table(readings):
 
 def _stop(table, **more):
     simulator = _simulator(**more)
-    return find_meter_stop(as_recording(simulator, RunTable(table, time=None, run=None)))
+    return find_meter_stop_and_mask(as_recording(simulator, RunTable(table, time=None, run=None)))
 
 
 def test_a_meter_that_stops_after_its_noise_is_seen():

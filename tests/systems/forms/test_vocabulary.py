@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from probewise.effects import public_name
+from probewise.effects import name_without_copy_suffix
 from probewise.report.effect_words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.systems import Law, Noise, RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, forms_of
+from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.world.systems.vocabulary import FAMILIES
 
 _T = np.tile(np.arange(0.0, 6.0, 0.2), 2)
@@ -33,7 +33,10 @@ def _names():
     )
     simulator = Simulator("y", "m", {"k": (0.5, 2.0)}, law=law, time="t_s", run="run", noise=Noise(sd=0.01))
     system = System.of(simulator, TABLE)
-    return {public_name(name) for name in forms_of(ReferenceFit(system, TABLE, np.zeros(system.n_params), 0.01))}
+    return {
+        name_without_copy_suffix(name)
+        for name in bind_forms(ReferenceFit(system, TABLE, np.zeros(system.n_params), 0.01))
+    }
 
 
 def test_every_form_has_a_counterpart_in_the_world_that_conceals(names):

@@ -16,8 +16,8 @@ from probewise.effects.density import log_gaussian_density
 from probewise.errors import NotConvergedError
 from probewise.systems import RunTable
 from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.rebinding import extract_recorded, has_value_per_run, rebind_forms
-from probewise.systems.prediction import draw_for_new_run
+from probewise.systems.forms.rebinding import extract_stored_fit, has_value_per_run, rebind_forms
+from probewise.systems.prediction import draw_value_for_new_run
 from probewise.systems.system import SystemChain
 from probewise.world.systems import SystemCase, right_predictions
 
@@ -85,9 +85,9 @@ def predict_runs(
         Random generator, for the choice of samples and for what a new run has of its own.
     """
     chain = cast(SystemChain, samples.chain)
-    system = chain.system.with_runs(table)
+    system = chain.system.with_added_runs(table)
     own = [effect.name for effect in chain.effects if has_value_per_run(effect.name)]
-    longer = rebind_forms(own, system.simulator, extract_recorded(about), more_runs=table.scan_names)
+    longer = rebind_forms(own, system.simulator, extract_stored_fit(about), more_runs=table.scan_names)
     effects = tuple(longer.get(effect.name, effect) for effect in chain.effects)
     wider = replace(chain, system=system, effects=effects)
     of_run = [name for name in wider.names if name not in chain.names]
@@ -100,7 +100,7 @@ def predict_runs(
             drawn[name] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
         else:
             effect = next(own_name for own_name in own if name.startswith(f"{own_name}."))
-            drawn[name] = draw_for_new_run(samples.effect_samples(effect)[chosen], rng=rng)
+            drawn[name] = draw_value_for_new_run(samples.effect_samples(effect)[chosen], rng=rng)
     theta = np.stack([(known | drawn)[name] for name in wider.names], axis=1)
     with np.errstate(all="ignore"):
         predicted = np.concatenate([wider.predict(part, table) for part in np.array_split(theta, max(n // 500, 1))])

@@ -30,8 +30,8 @@ from probewise.effects import (
 )
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, System
-from probewise.systems.forms import ReferenceFit, forms_of
-from probewise.systems.forms.proposals import proposals
+from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.proposals import formula_forms
 from probewise.systems.forms.stop import MeterStop
 from probewise.systems.table import covariate_of_column
 
@@ -103,13 +103,13 @@ class SimulatorApparatus:
         """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""
         extent = Extent.of(recording)
         on_noise = [effect for kind in ON_NOISE if (effect := kind.for_extent(extent)) is not None]
-        forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
+        forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
         stops = {} if self.stop is None else {self.stop.name: self.stop}
         return forms | {effect.name: effect for effect in on_noise} | stops
 
     def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
         """Return by name the formulas to propose: short expressions of columns and states."""
-        return cast(dict[str, NamedEffect[Any]], {form.name: form for form in proposals(self.about)})
+        return cast(dict[str, NamedEffect[Any]], {form.name: form for form in formula_forms(self.about)})
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Return the names of those of these effects that the user's simulator file adds."""

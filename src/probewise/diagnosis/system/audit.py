@@ -17,7 +17,7 @@ from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, name_of_first
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.forms import ReferenceFit, driving_columns, forms_of
+from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
 
 _STANDS_STILL = 0.02  # noise sds by which predictions may change when the integration step is halved
 _NOISE = 0.01  # of the range of the readings, if no noise is declared
@@ -52,7 +52,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
     system = system.with_converged_step(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
     about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
-    forms = {name: form for name, form in forms_of(about).items() if name_of_first_copy(name) is None}
+    forms = {name: form for name, form in bind_forms(about).items() if name_of_first_copy(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
     on_noise: dict[str, NamedEffect[Any]] = {str(kind.name): kind() for kind in kinds}
     if len(own.scan_names) > 1:

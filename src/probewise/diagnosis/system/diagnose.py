@@ -25,7 +25,7 @@ from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Sim
 from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.readings import time_since_start_of_run
-from probewise.systems.forms.stop import MeterStop, find_meter_stop
+from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
 
 _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
@@ -194,7 +194,7 @@ def without_readings_at_stop(
     -------
     The recording without them, and the stop; None if there is none.
     """
-    found = find_meter_stop(as_recording(simulator, table), simulator.reading)
+    found = find_meter_stop_and_mask(as_recording(simulator, table), simulator.reading)
     if found is None:
         return recording, None
     stop, rows = found

@@ -16,7 +16,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, System, run_table_csv
 from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.rebinding import Recorded, extract_recorded
+from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit
 
 
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
@@ -49,16 +49,16 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
     )
 
 
-def recorded_table_if_needed(about: ReferenceFit, model: ModelSamples) -> Recorded | None:
+def recorded_table_if_needed(about: ReferenceFit, model: ModelSamples) -> StoredFit | None:
     """Return the recorded table with the first fit's predictions if a model's file needs them, else None.
 
     It does if the model has effects, whose scales that fit set, or if a column holds the noise sds.
     """
-    return extract_recorded(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
+    return extract_stored_fit(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
 
 
 def fitted_system_from_samples(
-    system: System, model: ModelSamples, recording: Recording, predicted: FloatArray, *, known: Recorded | None = None
+    system: System, model: ModelSamples, recording: Recording, predicted: FloatArray, *, known: StoredFit | None = None
 ) -> FittedSystem:
     """Return posterior samples of a system with effects as a FittedSystem, which can be written to a file.
 

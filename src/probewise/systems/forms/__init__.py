@@ -16,7 +16,7 @@ from probewise.systems.forms.parameters import forms_on_parameters
 from probewise.systems.forms.rates import forms_on_rates
 from probewise.systems.forms.readings import forms_on_readings
 
-__all__ = ["WORDS", "Form", "ReferenceFit", "driving_columns", "forms_of"]
+__all__ = ["WORDS", "Form", "ReferenceFit", "bind_forms", "driving_columns"]
 
 About = ReferenceFit
 """The old name of `ReferenceFit`."""
@@ -25,9 +25,13 @@ WORDS: Mapping[str, str] = MappingProxyType(readings.WORDS | inputs.WORDS | para
 """A noun phrase for each form, with places for its targets."""
 
 
-def forms_of(about: ReferenceFit) -> dict[str, Form]:
+def bind_forms(about: ReferenceFit) -> dict[str, Form]:
     """Bind every form that could be detectable about this fit; return them by name, waves also as a second copy."""
     named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
     found = [*named, *forms_of_extras(about)]
     waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]
     return {form.name: form for form in [*found, *waves]}
+
+
+forms_of = bind_forms
+"""The old name of `bind_forms`."""

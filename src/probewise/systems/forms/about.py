@@ -62,7 +62,7 @@ class ReferenceFit:
         )
         return {state: values[0] for state, values in found.items()}
 
-    def drives_rate_of(self, state: str, other: str) -> bool:
+    def state_drives_rate(self, state: str, other: str) -> bool:
         """Return whether the rate of the state `other` depends on `state` at some row of the table."""
         law = self.system.simulator.law
         if law is None:
@@ -115,7 +115,7 @@ class ReferenceFit:
         )[0]
         return bool(np.any(change[rows] != 0) and not np.any(change[there > 0]))
 
-    def rms_change(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+    def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the rms change of the readings by each setting, (n_settings,), in sds; NaN or infinite if it diverges.
 
         `settings` (n_settings, n_params) are values of a trial form's parameters.
@@ -146,7 +146,7 @@ class ReferenceFit:
         `entries` (n_entries, n_columns, n_params) have the amplitude `guess`, to which the change is proportional.
         """
         settings = entries.reshape(-1, entries.shape[-1])
-        rms = self.rms_change(stage, act, settings[:: max(len(settings) // 16, 1)])
+        rms = self.rms_change_in_sds(stage, act, settings[:: max(len(settings) // 16, 1)])
         rms = rms[np.isfinite(rms)]
         if not rms.size or rms.max() <= _UNSEEN:
             return None
@@ -157,16 +157,16 @@ class ReferenceFit:
         plain = HeavyTailedPrior(typical, positive=positive)
         return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
 
-    def range_of_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
+    def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
         """Return the least and the largest tried size, (n_tried,), that changes the readings plausibly; or None."""
-        rms = self.rms_change(stage, act, tried[:, None])
+        rms = self.rms_change_in_sds(stage, act, tried[:, None])
         there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST * max(self.misfit, 1.0)))
         if not there.size:
             return None
         low, high = int(there.min()), int(there.max())
         return float(tried[low]), float(tried[min(high + 1, len(tried) - 1)] if high == low else tried[high])
 
-    def log_uniform_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
+    def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
         """Return a log-uniform prior over the range of tried sizes that change the readings plausibly; or None."""
-        between = self.range_of_sizes(stage, act, tried)
+        between = self.range_of_plausible_sizes(stage, act, tried)
         return None if between is None or not between[0] < between[1] else LogUniform(*between)

@@ -21,7 +21,7 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
         values = np.asarray(extra.prior.from_unit((np.arange(_N_VALUES) + 0.5) / _N_VALUES))
         values = values[values != extra.null]
         act = _parameter_setter(name)
-        rms = about.rms_change(Stage.PARAMETER, act, values[:, None])
+        rms = about.rms_change_in_sds(Stage.PARAMETER, act, values[:, None])
         seen = np.isfinite(rms) & (rms > _UNSEEN)
         if seen.any():
             yield Form(

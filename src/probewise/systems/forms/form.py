@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import name_of_first_copy
-from probewise.effects.vocabulary import Gates, value_with_sd
+from probewise.effects.vocabulary import VariantMasks, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable
@@ -180,14 +180,16 @@ class Form:
         """Return the form with a thinned set of change points."""
         return self if self.change_points is None else replace(self, change_points=self.change_points.thinned())
 
-    def variant_masks(self, plan: Any) -> Gates | None:
+    def variant_masks(self, plan: Any) -> VariantMasks | None:
         """Return the masks of the rows after each change point, at the middle of its interval; None if not gated."""
         if self.change_points is None or not self.change_points.gated:
             return None
         always = self.entries[0].copy()
         always[:, -1] = -np.inf
         along = self.change_points.variable_at_rows(plan)
-        return Gates(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.change_points.at)]))
+        return VariantMasks(
+            always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.change_points.at)])
+        )
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Redraw the change point of each sample: an interval with probability `weights`, then a position within it."""

@@ -40,8 +40,10 @@ def driving_columns(about: ReferenceFit) -> list[str]:
         spread = float(np.nanstd(values))
         if name == own.reading or name == own.noise.sd or spread == 0:
             continue
-        rms = about.rms_change(Stage.INPUT, _column_changer(name, _column_with_offset), np.array([[_NUDGE * spread]]))
-        wave = about.rms_change(Stage.INPUT, _column_changer(name, _scaled_column), np.array([[_NUDGE]]))
+        rms = about.rms_change_in_sds(
+            Stage.INPUT, _column_changer(name, _column_with_offset), np.array([[_NUDGE * spread]])
+        )
+        wave = about.rms_change_in_sds(Stage.INPUT, _column_changer(name, _scaled_column), np.array([[_NUDGE]]))
         if max(float(rms[0]), float(wave[0])) > 0:
             out.append(name)
     return out
@@ -113,7 +115,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
     if time is not None:
         says = partial(_fill_sentence, "the true time is the recorded time times (1 + a), a = {}")
         origin = time_origin(table)
-        clock = _column_changer(time, _clock_at_rate(origin))
+        clock = _column_changer(time, _clock_scaler(origin))
         for form in _linear_form(about, "clock_drift", clock, 1e-5, "1", says, "time"):
             yield replace(form, counted_from=origin_in_words(time, origin, about.time_unit))
 
@@ -130,7 +132,7 @@ def _scaled_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatAr
     return np.asarray(c * (1 + theta[:, :1]))
 
 
-def _clock_at_rate(origin: float) -> Change:
+def _clock_scaler(origin: float) -> Change:
     """Return the function of a clock that runs fast or slow, and is right at the origin."""
     return lambda c, theta, table: np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
 
@@ -161,7 +163,7 @@ def _linear_form(
 def _log_uniform_form(
     about: ReferenceFit, name: str, parameter: str, act: Act, most: float, unit: str, says: Say, *covariates: str
 ) -> Iterator[Form]:
-    prior = about.log_uniform_prior(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
+    prior = about.log_uniform_size_prior(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
     if prior is not None:
         entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
         yield Form(name, Stage.INPUT, {parameter: prior}, (unit,), covariates, act, entries, (), says, absent={0: 0.0})
@@ -177,7 +179,7 @@ def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float
         return np.asarray(np.where(level > ends.least_ceiling, np.minimum(c, level), np.maximum(c, level)))
 
     act = _column_changer(name, clip)
-    if np.nanmax(about.rms_change(Stage.INPUT, act, ends.trial_levels[:, None]), initial=0.0) > 0.05:
+    if np.nanmax(about.rms_change_in_sds(Stage.INPUT, act, ends.trial_levels[:, None]), initial=0.0) > 0.05:
         yield Form(
             f"input_saturation:{name}",
             Stage.INPUT,

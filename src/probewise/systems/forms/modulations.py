@@ -41,17 +41,17 @@ class Modulation:
     counted_from: str = ""
 
 
-def _single_entry(size: float) -> FloatArray:
+def _single_entry_bank(size: float) -> FloatArray:
     return np.full((1, 1, 1), size)
 
 
-def linear_drift(table: RunTable, time_unit: str) -> Modulation:
+def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
     """Return a linear drift in time as recorded: a t, with t from `time_origin`."""
     origin = time_origin(table)
     return Modulation(
         at_rows=lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
         marginals=lambda a: {"a": a},
-        entries=_single_entry,
+        entries=_single_entry_bank,
         units=lambda unit: (f"{unit}/{time_unit}",),
         says=lambda what, unit, mean, sd: f"{what} drifts by {mean_with_sd(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
@@ -59,7 +59,7 @@ def linear_drift(table: RunTable, time_unit: str) -> Modulation:
     )
 
 
-def proportional_to_column(name: str, table: RunTable) -> Modulation:
+def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
     values = table.covariates[name]
     middle = float(np.nanmean(values))
@@ -70,14 +70,14 @@ def proportional_to_column(name: str, table: RunTable) -> Modulation:
     return Modulation(
         at_rows=at_rows,
         marginals=lambda a: {"a": a},
-        entries=_single_entry,
+        entries=_single_entry_bank,
         units=lambda unit: (f"{unit} per {name}",),
         says=lambda what, unit, mean, sd: f"{what} changes by {mean_with_sd(mean[0], sd[0], unit)} per unit of {name}",
         covariates=(covariate_of_column(name),),
     )
 
 
-def step_at_change_point(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
+def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
     """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number."""
     by_row = not table.has_varying_time
     along = np.unique(np.arange(float(len(table))) if by_row else table.time_s)
@@ -103,7 +103,7 @@ def step_at_change_point(table: RunTable, time_unit: str, *, gated: bool) -> Mod
     )
 
 
-def value_per_run(table: RunTable) -> Modulation:
+def value_per_run_modulation(table: RunTable) -> Modulation:
     """Return a variation by one value per run: a_run; 0 for runs outside the recording."""
     names = table.scan_names
 
@@ -155,7 +155,7 @@ def frequency_prior(frequencies: FloatArray) -> LogUniform:
     return LogUniform(float(0.9 * frequencies[0]), float(frequencies[-1] * 1.02))
 
 
-def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
+def sinusoid_modulation(table: RunTable, time_unit: str) -> Modulation:
     """Return a sinusoid in time: a sin(2 pi hz t + phase), with t from `time_origin`."""
     origin = time_origin(table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan())

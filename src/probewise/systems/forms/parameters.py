@@ -21,21 +21,21 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     values = system.parameters(about.theta, table)
     over: dict[str, Modulation] = {}
     if table.has_varying_time:
-        over["drifts"] = modulations.linear_drift(table, about.time_unit)
-    over["steps"] = modulations.step_at_change_point(table, about.time_unit, gated=False)
+        over["drifts"] = modulations.linear_drift_modulation(table, about.time_unit)
+    over["steps"] = modulations.change_point_step_modulation(table, about.time_unit, gated=False)
     columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and np.nanstd(v) > 0]
     for name in own.parameters:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or 1.0)
         each = dict(over)
         if name not in own.per_run and about.can_fit_value_per_run:
-            each["differs"] = modulations.value_per_run(table)
+            each["differs"] = modulations.value_per_run_modulation(table)
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)
             yield from modulated_form(
                 about, f"{kind}:{name}", Stage.PARAMETER, how, _parameter_shifter(name, how), size, name, ""
             )
         for column in columns:
-            how = modulations.proportional_to_column(column, table)
+            how = modulations.column_proportional_modulation(column, table)
             size = guess / float(np.nanstd(table.covariates[column]))
             yield from modulated_form(
                 about, f"depends:{name}:{column}", Stage.PARAMETER, how, _parameter_shifter(name, how), size, name, ""

@@ -19,9 +19,9 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, ChangePoints, Form, mean_with_sd
 from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
-from probewise.systems.forms.proposals_in_time import proposals_in_time
-from probewise.systems.forms.proposals_of_columns import proposals_of_columns
-from probewise.systems.motion import Motion
+from probewise.systems.forms.proposals_in_time import formula_forms_in_time
+from probewise.systems.forms.proposals_of_columns import formula_forms_of_columns
+from probewise.systems.motion import LawWithEffects
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
@@ -61,18 +61,18 @@ class _Term:
         return self.function(*(variable.scaled(look_up(variable.name)) for variable in self.variables)) / self.scale
 
 
-def proposals(about: ReferenceFit) -> Iterator[Form]:
+def formula_forms(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each term that could be added to the reading or to the rate of a state."""
-    yield from _reading_proposals(about)
-    columns = _varying_covariates(about)
+    yield from _reading_formula_forms(about)
+    columns = _varying_columns_by_name(about)
     for name in columns:
-        yield from _threshold_proposal(about, name)
-    yield from proposals_of_columns(about, columns)
+        yield from _threshold_form(about, name)
+    yield from formula_forms_of_columns(about, columns)
     if about.table.has_varying_time:
-        yield from proposals_in_time(about)
+        yield from formula_forms_in_time(about)
     for state in about.states:
-        yield from _rate_proposals(about, state)
-        yield from _one_sided_proposals(about, state)
+        yield from _rate_formula_forms(about, state)
+        yield from _one_sided_rate_forms(about, state)
 
 
 def _terms_of_variables(variables: list[_ScaledVariable]) -> Iterator[_Term]:
@@ -96,7 +96,7 @@ def _terms_of_variables(variables: list[_ScaledVariable]) -> Iterator[_Term]:
         yield _Term(f"{x.text} |{z.text}|", (x, z), lambda v, w: v * np.abs(w), 1 / (x.scale * z.scale))
 
 
-def _varying_covariates(about: ReferenceFit) -> dict[str, FloatArray]:
+def _varying_columns_by_name(about: ReferenceFit) -> dict[str, FloatArray]:
     """Return the covariates that vary and are never missing, without the reading and its declared sd."""
     own = about.system.simulator
     kept = {c: v for c, v in about.table.covariates.items() if c not in (own.reading, own.noise.sd)}
@@ -108,9 +108,9 @@ def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _Scaled
     return _ScaledVariable(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0)
 
 
-def _reading_proposals(about: ReferenceFit) -> Iterator[Form]:
+def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
     own = about.system.simulator
-    columns = _varying_covariates(about)
+    columns = _varying_columns_by_name(about)
     if about.table.has_varying_time and about.table.time is not None:
         columns[about.table.time] = about.table.time_s
     variables = [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
@@ -126,10 +126,10 @@ def _reading_proposals(about: ReferenceFit) -> Iterator[Form]:
 
         shape = act(about.predicted[None, :], np.ones((1, 1)), about.table)[0] - about.predicted
         if _add_if_new(shape, known):
-            yield from _term_proposal(about, "reading", own.reading, Stage.OFFSET, act, term)
+            yield from _single_term_form(about, "reading", own.reading, Stage.OFFSET, act, term)
 
 
-def _threshold_proposal(about: ReferenceFit, name: str) -> Iterator[Form]:
+def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     """Yield a shift of the reading where a column is above an unknown threshold."""
     own, values = about.system.simulator, np.unique(about.table.covariates[name])
     if len(values) <= 2:
@@ -163,7 +163,7 @@ def _threshold_proposal(about: ReferenceFit, name: str) -> Iterator[Form]:
     )
 
 
-def _one_sided_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
+def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     """Yield terms of a state's rate that grow with its distance beyond a threshold, either way: a stop, a spring."""
     values = about.states[state]
     low, high = float(values.min()), float(values.max())
@@ -171,7 +171,7 @@ def _one_sided_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
         return
     for sign, text in ((1.0, f"max({state} - at, 0)"), (-1.0, f"max(at - {state}, 0)")):
 
-        def act(value: Motion, theta: FloatArray, table: RunTable, sign: float = sign) -> Motion:
+        def act(value: LawWithEffects, theta: FloatArray, table: RunTable, sign: float = sign) -> LawWithEffects:
             a, at = theta[:, :1], theta[:, 1:2]
             return value.with_term(state, lambda s, p, u: a * np.maximum(sign * (s[state] - at), 0.0))
 
@@ -198,17 +198,17 @@ def _one_sided_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
         )
 
 
-def _rate_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
+def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     states = about.states
     variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if np.ptp(values) > 0]
-    columns = {name: values for name, values in _varying_covariates(about).items() if name not in states}
+    columns = {name: values for name, values in _varying_columns_by_name(about).items() if name not in states}
     variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
     known: list[FloatArray] = []
     for term in _terms_of_variables(variables):
         if term.text == f"sign({state})":
             continue  # dry friction, which has a name
 
-        def act(value: Motion, theta: FloatArray, table: RunTable, term: _Term = term) -> Motion:
+        def act(value: LawWithEffects, theta: FloatArray, table: RunTable, term: _Term = term) -> LawWithEffects:
             a = theta[:, :1]
             return value.with_term(
                 state, lambda s, p, u: a * term.evaluate(lambda name: s[name] if name in s else u[name])
@@ -216,7 +216,7 @@ def _rate_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
 
         shape = np.asarray(term.evaluate(lambda name: states.get(name, about.table.covariates.get(name))))
         if _add_if_new(shape, known):
-            yield from _term_proposal(about, "rate", state, Stage.RATE, act, term)
+            yield from _single_term_form(about, "rate", state, Stage.RATE, act, term)
 
 
 def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
@@ -232,7 +232,7 @@ def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
     return True
 
 
-def _covariate_of_variable(about: ReferenceFit, side: str, name: str) -> str:
+def _covariate_name_of_variable(about: ReferenceFit, side: str, name: str) -> str:
     """Return the name of the covariate that a variable of a term is."""
     reading = about.system.simulator.reading
     if name in about.states and (side == "rate" or name == reading):
@@ -240,13 +240,15 @@ def _covariate_of_variable(about: ReferenceFit, side: str, name: str) -> str:
     return "level" if name == reading else "time" if name == about.table.time else covariate_of_column(name)
 
 
-def _term_proposal(about: ReferenceFit, side: str, target: str, stage: Stage, act: Act, term: _Term) -> Iterator[Form]:
+def _single_term_form(
+    about: ReferenceFit, side: str, target: str, stage: Stage, act: Act, term: _Term
+) -> Iterator[Form]:
     guess = about.sd if stage is Stage.OFFSET else 1e-6
     typical = about.typical_amplitude(stage, act, np.full((1, 1, 1), guess), guess)
     if typical is None or not np.isfinite(typical):
         return
     where = tuple(
-        _covariate_of_variable(about, side, c) for c in dict.fromkeys(variable.name for variable in term.variables)
+        _covariate_name_of_variable(about, side, c) for c in dict.fromkeys(variable.name for variable in term.variables)
     )
     text = f"a {term.text}"
     what = target if side == "reading" else f"the rate of {target}"

@@ -25,14 +25,14 @@ _SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the record
 _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart they are in the row of those
 
 
-def proposals_in_time(about: ReferenceFit) -> Iterator[Form]:
+def formula_forms_in_time(about: ReferenceFit) -> Iterator[Form]:
     """Yield the proposals that add to the reading along time."""
-    yield from _square_wave_proposal(about)
-    yield from _swept_wave_proposal(about)
-    yield from _two_settlings_proposal(about)
+    yield from _square_wave_form(about)
+    yield from _swept_wave_form(about)
+    yield from _double_settling_form(about)
 
 
-def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
+def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
     own, table, origin = about.system.simulator, about.table, time_origin(about.table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
@@ -76,7 +76,7 @@ def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     )
 
 
-def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
+def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a sinusoid whose frequency rises or falls steadily along the recording, by a machine that runs up, say."""
     own, table = about.system.simulator, about.table
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
@@ -123,7 +123,7 @@ def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     )
 
 
-def _two_settlings_proposal(about: ReferenceFit) -> Iterator[Form]:
+def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a settling of the reading with two time constants from the start of each run."""
     own = about.system.simulator
 

@@ -19,14 +19,14 @@ _N_DOSES = 9  # doses that are tried as the one at which the reading has changed
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
 
-def proposals_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
+def formula_forms_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
     """Yield proposals of what each column could add to the reading, together with the reading or with its own past."""
     for name, values in columns.items():
-        yield from _varying_influence_proposal(about, name, values)
-        yield from _dose_proposals(about, name, values)
+        yield from _varying_influence_form(about, name, values)
+        yield from _dose_forms(about, name, values)
 
 
-def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
+def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
     """Yield a column's influence on the reading, its coefficient a quadratic function of the reading."""
     own, level = about.system.simulator, about.predicted
     middle, half = 0.5 * float(level.max() + level.min()), 0.5 * float(np.ptp(level))
@@ -65,7 +65,7 @@ def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArr
     )
 
 
-def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
+def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
     """Yield a change of the reading that saturates with the column's integral (dose) since the start of the run."""
     own, table = about.system.simulator, about.table
     spread = float(np.std(values))

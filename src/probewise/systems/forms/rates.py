@@ -17,7 +17,7 @@ from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, mean_with_sd
 from probewise.systems.forms.modulations import frequency_prior, max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.origins import origin_in_words, time_origin
-from probewise.systems.motion import Limit, Motion
+from probewise.systems.motion import LawWithEffects, Limit
 
 _N_SIZES = 9
 _NO_SHARE = 1e-9  # of what a bound stops: none
@@ -67,7 +67,7 @@ def _rate_term_form(
     what: str,
     unit: str | None = None,
 ) -> Iterator[Form]:
-    def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
+    def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
         a = theta[:, :1]
         return value.with_term(state, lambda s, p, u: a * term(s[other]))
 
@@ -90,11 +90,11 @@ def _rate_term_form(
 
 
 def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
-    def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
+    def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
         return value.with_friction(state, theta[:, :1])
 
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
-    prior = about.log_uniform_prior(Stage.RATE, act, _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31))
+    prior = about.log_uniform_size_prior(Stage.RATE, act, _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31))
     if prior is not None:
         entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
         yield Form(
@@ -119,7 +119,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
     time, origin = table.time, time_origin(table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), max_n_trial_frequencies(len(table)))
 
-    def act(value: Motion, theta: FloatArray, rows: Any) -> Motion:
+    def act(value: LawWithEffects, theta: FloatArray, rows: Any) -> LawWithEffects:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[str(time)] - origin) + phase))
 
@@ -157,7 +157,7 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
         return
     others = [other for other in about.states if other != state]
 
-    def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
+    def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
         level = theta[:, :1]
         above = level > ends.least_ceiling
         spilt = {other: theta[:, k : k + 1] for k, other in enumerate(others, 1) if theta[:, k].any()}
@@ -197,10 +197,12 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
         absent={0: ends.level_out_of_reach},
         fixed=names_of_fixed_shares(None),
     )
-    if np.nanmax(about.rms_change(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
+    if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
         # Downstream only: states that drive each other, as an angle and its rate, are no vessels.
         into = [
-            other for other in others if about.drives_rate_of(state, other) and not about.drives_rate_of(other, state)
+            other
+            for other in others
+            if about.state_drives_rate(state, other) and not about.state_drives_rate(other, state)
         ]
         spilling = [
             replace(alone, marginals=marginals(other), entries=entries(other), fixed=names_of_fixed_shares(other))

@@ -56,10 +56,10 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     span = float(np.ptp(about.predicted)) or about.sd
     over: dict[str, Modulation] = {}
     if table.has_varying_time:
-        over["drift"] = modulations.linear_drift(table, about.time_unit)
-    over["step"] = modulations.step_at_change_point(table, about.time_unit, gated=True)
+        over["drift"] = modulations.linear_drift_modulation(table, about.time_unit)
+    over["step"] = modulations.change_point_step_modulation(table, about.time_unit, gated=True)
     if about.can_fit_value_per_run:
-        over["per_run"] = modulations.value_per_run(table)
+        over["per_run"] = modulations.value_per_run_modulation(table)
     for kind, how in over.items():
         yield from modulated_form(
             about, f"offset_{kind}", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
@@ -76,7 +76,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
             ("level",),
         )
     if table.has_varying_time:
-        how = modulations.sinusoid_in_time(table, about.time_unit)
+        how = modulations.sinusoid_modulation(table, about.time_unit)
         yield from modulated_form(
             about, "interference", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
         )
@@ -85,7 +85,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         yield from _delay_form(about)
     for name, values in table.covariates.items():
         if name not in (reading, about.system.simulator.noise.sd) and np.nanstd(values) > 0:
-            how = modulations.proportional_to_column(name, table)
+            how = modulations.column_proportional_modulation(name, table)
             yield from modulated_form(
                 about, f"sensitivity:{name}", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
             )
@@ -157,7 +157,7 @@ def _lag_form(about: ReferenceFit) -> Iterator[Form]:
                 out[:, rows[k]] = carry[:, k - 1] * out[:, rows[k - 1]] + (1 - carry[:, k - 1]) * out[:, rows[k]]
         return out
 
-    prior = about.log_uniform_prior(Stage.LAG, act, about.median_gap * np.geomspace(0.02, 200.0, 33))
+    prior = about.log_uniform_size_prior(Stage.LAG, act, about.median_gap * np.geomspace(0.02, 200.0, 33))
     if prior is not None:
         time_unit = about.time_unit
         yield Form(
@@ -179,7 +179,7 @@ def _lag_form(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _delay_form(about: ReferenceFit) -> Iterator[Form]:
-    prior = about.log_uniform_prior(Stage.LAG, delayed_values, about.median_gap * np.geomspace(1e-3, 100.0, 41))
+    prior = about.log_uniform_size_prior(Stage.LAG, delayed_values, about.median_gap * np.geomspace(1e-3, 100.0, 41))
     if prior is not None:
         time_unit = about.time_unit
         yield Form(

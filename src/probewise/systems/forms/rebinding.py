@@ -11,10 +11,10 @@ from probewise._arrays import FloatArray
 from probewise.effects import PROPOSAL
 from probewise.errors import ParameterError
 from probewise.sensor import Stage
-from probewise.systems.forms import driving_columns, forms_of
+from probewise.systems.forms import bind_forms, driving_columns
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, Form
-from probewise.systems.forms.proposals import proposals
+from probewise.systems.forms.proposals import formula_forms
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import RunTable
@@ -23,7 +23,7 @@ _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_r
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class StoredFit:
     """What rebinding needs of a reference fit: its table, and its predicted readings and states, (n_points,).
 
     `held` are the columns that the model holds from row to row.
@@ -36,10 +36,10 @@ class Recorded:
 
 
 @dataclass(frozen=True, eq=False)
-class _RecordedFit(ReferenceFit):
+class _StoredReferenceFit(ReferenceFit):
     """A reference fit known by its recorded predictions: nothing is simulated; sizes (for priors) are arbitrary."""
 
-    known: Recorded | None = None
+    known: StoredFit | None = None
 
     @property
     def predicted(self) -> FloatArray:
@@ -59,24 +59,24 @@ class _RecordedFit(ReferenceFit):
         assert self.known is not None
         return column in self.known.held
 
-    def rms_change(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+    def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         return np.ones(len(settings))
 
     def typical_amplitude(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
         return guess
 
-    def range_of_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
+    def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
         return float(tried[0]), float(tried[-1])
 
 
-def extract_recorded(about: ReferenceFit) -> Recorded:
+def extract_stored_fit(about: ReferenceFit) -> StoredFit:
     """Return what rebinding the forms of a reference fit needs of it."""
     held = tuple(name for name in driving_columns(about) if about.is_held_between_rows(name))
-    return Recorded(about.table, about.predicted, about.states, held)
+    return StoredFit(about.table, about.predicted, about.states, held)
 
 
 def rebind_forms(
-    names: Iterable[str], simulator: Simulator, known: Recorded, *, more_runs: Iterable[str] = ()
+    names: Iterable[str], simulator: Simulator, known: StoredFit, *, more_runs: Iterable[str] = ()
 ) -> dict[str, Form]:
     """Rebind forms about a recording, by name; names of other effects are left out.
 
@@ -97,34 +97,34 @@ def rebind_forms(
         If a proposal cannot be rebound.
     """
     wanted = list(dict.fromkeys(names))
-    found = _forms_about(wanted, simulator, known)
+    found = _bind_wanted_forms(wanted, simulator, known)
     longer = _table_with_more_runs(known.table, list(more_runs))
     if longer is not known.table:
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
         states = {name: values[rows] for name, values in known.states.items()}
-        beyond = Recorded(longer, known.predicted[rows], states, known.held)
+        beyond = StoredFit(longer, known.predicted[rows], states, known.held)
         per_run = [name for name in wanted if has_value_per_run(name)]
-        found |= _forms_about(per_run, simulator, beyond)
+        found |= _bind_wanted_forms(per_run, simulator, beyond)
     lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
     if lost:
         raise ParameterError("effects", lost[0], "a term that this version can bind again")
     return {name: found[name] for name in wanted if name in found}
 
 
-def counts_from_far_origin(names: Iterable[str], simulator: Simulator, known: Recorded) -> bool:
+def counts_from_far_origin(names: Iterable[str], simulator: Simulator, known: StoredFit) -> bool:
     """Return whether any of these forms counts a time or a column of the recording from elsewhere than 0."""
-    return any(form.counted_from for form in _forms_about(list(names), simulator, known).values())
+    return any(form.counted_from for form in _bind_wanted_forms(list(names), simulator, known).values())
 
 
-def _forms_about(wanted: list[str], simulator: Simulator, known: Recorded) -> dict[str, Form]:
+def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit) -> dict[str, Form]:
     """Bind those forms and proposals about a recording that are wanted, and that this version has, by name."""
     if not wanted:
         return {}
     system = System(simulator, known.table.scan_names)
-    about = _RecordedFit(system, known.table, np.zeros(system.n_params), 1.0, known)
-    found = forms_of(about)
+    about = _StoredReferenceFit(system, known.table, np.zeros(system.n_params), 1.0, known)
+    found = bind_forms(about)
     if any(name.startswith(PROPOSAL) for name in wanted):
-        found |= {form.name: form for form in proposals(about)}
+        found |= {form.name: form for form in formula_forms(about)}
     return {name: found[name] for name in wanted if name in found}
 
 

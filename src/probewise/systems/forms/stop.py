@@ -75,7 +75,7 @@ class MeterStop(NoiseEffect):
         return f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip() + ", where the meter stops"
 
 
-def find_meter_stop(recording: Recording, reading: str = "the reading") -> tuple[MeterStop, BoolArray] | None:
+def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading") -> tuple[MeterStop, BoolArray] | None:
     """Find an extreme value that readings repeat exactly, and the mask of the rows at it, (n_points,).
 
     Noise makes successive readings differ, unless the meter saturates after the noise. None if no extreme value is

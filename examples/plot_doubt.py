@@ -58,7 +58,7 @@ for trust, (_, found) in runs.items():
 fig, axes = plt.subplots(2, 1, figsize=(9, 10), layout="constrained")
 for ax, (trust, (experiment, found)) in zip(axes, runs.items(), strict=True):
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
-    exploration.view(found.last, experiment, places, levels=(10.0, 60.0), ax=ax)
+    exploration.draw_robot_view(found.last, experiment, places, levels=(10.0, 60.0), ax=ax)
     ax.add_patch(plt.Circle(hidden.center_mm, hidden.radius_mm, fill=False, linestyle=":", linewidth=2, color="white"))
     ax.set_title(f"trust {trust:g} (dotted: the true circle)", loc="right")
 

@@ -45,5 +45,5 @@ places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
 # The view in the middle of the search, and at its end.
 for n in (len(found.steps) // 2, len(found.steps)):
     fig, ax = plt.subplots(figsize=(9, 5.4), layout="constrained")
-    exploration.view(found.steps[n - 1], experiment, places[:n], levels=(10.0, 60.0), ax=ax)
+    exploration.draw_robot_view(found.steps[n - 1], experiment, places[:n], levels=(10.0, 60.0), ax=ax)
     plots.draw_field_legend(ax)

@@ -58,7 +58,9 @@ outline_mm = outlines(circle.region(truth[None]))[0]
 for ax, name, found in zip(axes[0], ("trust 1", "trust 0.9"), (trusting, doubting), strict=True):
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
     title = f"{name}, after {len(places)} readings"
-    exploration.view(found.last, found.experiment, places, levels=(10.0, 60.0), truth_mm=outline_mm, title=title, ax=ax)
+    exploration.draw_robot_view(
+        found.last, found.experiment, places, levels=(10.0, 60.0), truth_mm=outline_mm, title=title, ax=ax
+    )
 plots.draw_field_legend(axes)
 
 # %%

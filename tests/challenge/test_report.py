@@ -27,7 +27,7 @@ def test_the_answer_counts_targets(results):
 
 
 def test_the_csv_leaves_out_what_is_not_there(results):
-    lines = list(csv.DictReader(io.StringIO(report.table_csv(score(results)))))
+    lines = list(csv.DictReader(io.StringIO(report.target_table_csv(score(results)))))
     by_name = {line["what"]: line for line in lines}
     assert by_name["right name first, lambda 8"]["found"] == "0.5"
     assert by_name["right name first, lambda 6"]["found"] == ""

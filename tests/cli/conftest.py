@@ -70,5 +70,5 @@ def quick_frames(monkeypatch):
     """Draw every step of a run as one black pixel."""
     dot = io.BytesIO()
     Image.new("RGB", (1, 1)).save(dot, "PNG")
-    for drawing in ("robot_view_png", "robot_views_png"):
+    for drawing in ("robot_view_png", "robot_views_by_model_png"):
         monkeypatch.setattr(exploration, drawing, lambda *_, **__: dot.getvalue())

@@ -67,13 +67,13 @@ def test_readings_may_be_chosen_several_at_a_time(explore):
 @pytest.mark.slow
 def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, monkeypatch, tmp_path):
     """The naive model left, as in the paper, whichever chooses; the run itself is the same as without."""
-    drawn, quick = [], exploration.robot_views_png
+    drawn, quick = [], exploration.robot_views_by_model_png
 
     def remember(views, *_, **__):
         drawn.append(views)
         return quick()
 
-    monkeypatch.setattr(exploration, "robot_views_png", remember)
+    monkeypatch.setattr(exploration, "robot_views_by_model_png", remember)
     status, lines = explore("--both-models", "--max-readings", 2)
     assert status == 0
     assert [[title for title, *_ in views] for views in drawn] == [["naive model", "SSF model"]] * 2

@@ -15,7 +15,7 @@ from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
 from probewise.report import doubting_robot
-from probewise.report.demo import HEADER, comparison_lines
+from probewise.report.demo import HEADER, search_comparison_lines
 from probewise.report.paper_view import fine_entropy_map, paper_view, window_mm
 from probewise.report.plots import PAGE_IN
 from probewise.report.robot_search import RobotSearch
@@ -115,8 +115,8 @@ def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(m
 
 def test_the_demos_comparison_is_two_tables_each_with_its_caption(monkeypatch):
     rows = [("naive", "30", "9", "20.1", "0.67", "0.83", "12.5 mm", "x 1 mm"), ("SSF", *"12345", "2 mm", "x 2 mm")]
-    monkeypatch.setattr("probewise.report.demo.comparison_rows", lambda searches: rows)
-    first, second = "\n".join(comparison_lines([])).rstrip().split("\n\n")
+    monkeypatch.setattr("probewise.report.demo.search_comparison_rows", lambda searches: rows)
+    first, second = "\n".join(search_comparison_lines([])).rstrip().split("\n\n")
     for text, header in ((first, HEADER[:-2]), (second, (HEADER[0], *HEADER[-2:]))):
         caption, names, *lines = text.splitlines()
         assert "(" in caption or "±" in caption

@@ -14,11 +14,11 @@ from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page
 from probewise.report.covariate import axis_label, category_name_by_value, covariate_values_by_place
-from probewise.report.covariate_view import is_along_line
+from probewise.report.covariate_view import is_scan_along_line
 from probewise.report.diagnosis_figures import rows_of_scan_changed_most
-from probewise.report.plots import gain_by_scan, scan_with_residuals
+from probewise.report.plots import heldout_gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
-from probewise.report.words import typeset
+from probewise.report.words import typeset_numbers
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 
@@ -101,7 +101,9 @@ def test_scans_that_an_effect_is_bound_to_are_named(saturated):
 
 
 def test_numbers_are_written_as_people_write_them():
-    assert typeset("(p = 2.2e-07) -0.3 mm in edge-90") == "(p\u00a0=\u00a02.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
+    assert (
+        typeset_numbers("(p = 2.2e-07) -0.3 mm in edge-90") == "(p\u00a0=\u00a02.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
+    )
 
 
 def test_labels_carry_units():
@@ -174,7 +176,7 @@ def test_values_without_a_scale_are_a_step_each():
 
 
 def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
-    ax = gain_by_scan([(f"scan_{k}", float(k)) for k in range(40)], 19.5, 1.9)
+    ax = heldout_gain_by_scan([(f"scan_{k}", float(k)) for k in range(40)], 19.5, 1.9)
     lengths = [bar.get_width() for bar in ax.containers[0]]
     np.testing.assert_allclose(lengths, [*range(39, 33, -1), *range(5, -1, -1)])
     assert ax.get_yticklabels()[0].get_text() == "scan 39"
@@ -190,7 +192,7 @@ def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
 
 def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_one_place_change_more():
     plan = read_plan(shipped("concealed"))
-    assert {name for rows, name in scans_of(plan) if not is_along_line(plan, rows)} == {"quadrants"}
+    assert {name for rows, name in scans_of(plan) if not is_scan_along_line(plan, rows)} == {"quadrants"}
     change = np.zeros(len(plan))
     for rows, name in scans_of(plan):
         change[rows] = {"quadrants": 9.0, "edge_90_out": 0.5}.get(name, 0.1)
@@ -198,7 +200,7 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
     assert plan.scan_names[plan.scan[chosen[0]]] == "edge_90_out"
     alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
     assert len(rows_of_scan_changed_most(alone, np.ones(4))) == 4
-    assert not is_along_line(plan, np.arange(1))
+    assert not is_scan_along_line(plan, np.arange(1))
 
 
 def scans_of(plan):

@@ -87,17 +87,19 @@ FIGURES = {
     "playing_field": lambda s: plots.playing_field(**field()),
     "reach_map": lambda s: plots.reach_map(field()["utility"], X, Y, axis_mm=(524.0, 580.0)),
     "spatial_sensitivity": lambda s: plots.spatial_sensitivity(blob()),
-    "ssf_by_order": lambda s: plots.ssf_by_order(
+    "ssf_by_n_gaussians": lambda s: plots.ssf_by_n_gaussians(
         dict.fromkeys((1, 2, 3), blob()), {1: -389.8, 2: -394.0, 3: -397.7}, {1: 0.02, 2: 0.5, 3: 0.6}
     ),
     "effect_probabilities_by_reading": lambda s: plots.effect_probabilities_by_reading(DOUBT),
     "posterior_widths": lambda s: plots.posterior_widths(WIDTHS),
     "information_gained": lambda s: plots.information_gained({k: np.arange(16.0) for k in WIDTHS}),
     "readings_by_orientation": lambda s: plots.readings_by_orientation(s.recording),
-    "predicted_against_recorded": lambda s: plots.predicted_against_recorded(
+    "predicted_and_recorded_by_scan": lambda s: plots.predicted_and_recorded_by_scan(
         s.recording, s.recording.readings, np.ones(len(s.recording))
     ),
-    "calibration_check": lambda s: plots.calibration_check(s.recording, s.recording.readings, s.recording.readings),
+    "standardised_residuals": lambda s: plots.standardised_residuals(
+        s.recording, s.recording.readings, s.recording.readings
+    ),
     "residuals_against": lambda s: plots.residuals_against(
         np.arange(40.0), np.sin(np.arange(40.0)), np.zeros(40), label="time (s)", unit="LEGO"
     ),
@@ -125,7 +127,7 @@ FIGURES = {
     "reliability_diagram": lambda s: plots.reliability_diagram(
         [Bin(0.15, estimated_share([True] * 3 + [False] * 17)), Bin(0.5, estimated_share([True] * 11 + [False] * 9))]
     ),
-    "predicted_and_recorded": lambda s: plots.predicted_and_recorded(
+    "recorded_against_predicted": lambda s: plots.recorded_against_predicted(
         np.arange(40.0), np.arange(40.0) + 0.3, np.ones(40), label="temp_c", unit="degC"
     ),
     "confusion_matrix": lambda s: plots.confusion_matrix(["a", "b"], ["a", "b"], np.array([[3, 1], [0, 4]])),
@@ -135,11 +137,11 @@ FIGURES = {
 def test_every_plot_function_is_here():
     others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "draw_field_legend", "grid_of_axes", "png", "stack_of_axes", "svg"}
     of_a_diagnosis = {  # laid out by `svg`, and drawn by the tests of its pages
-        "before_and_after",
+        "readings_before_and_after_repair",
         "residual_autocorrelation",
-        "gain_by_scan",
+        "heldout_gain_by_scan",
         "readings_modulo_step",
-        "lost_readings",
+        "lost_readings_against_predicted",
         "mean_residuals_along",
         "scan_with_residuals",
         "readings_in_order",

@@ -87,7 +87,7 @@ def test_scans_that_the_repair_changes_are_drawn_on_the_same_axes():
 def test_one_scan_is_drawn_about_where_the_two_models_differ():
     recording, before, after = two_models()
     rows = np.flatnonzero(recording.plan.scan == 0)
-    above, below = plots.before_and_after(recording, rows, before, after)[:, 0]
+    above, below = plots.readings_before_and_after_repair(recording, rows, before, after)[:, 0]
     low, high = below.get_xlim()
     assert -50 < low < -6 < 6 < high < 50
     assert sum(len(line.get_xdata()) for line in above.lines if line.get_label() == "recorded") == len(rows)
@@ -98,7 +98,7 @@ def test_one_scan_is_drawn_about_where_the_two_models_differ():
 
 def test_readings_that_lie_on_no_line_have_no_curve(recording):
     with pytest.raises(ParameterError, match="three places"):
-        plots.before_and_after(recording, np.arange(404, 408), recording.readings, recording.readings)
+        plots.readings_before_and_after_repair(recording, np.arange(404, 408), recording.readings, recording.readings)
 
 
 @pytest.mark.parametrize("lego_scale", [False, True])

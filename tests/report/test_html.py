@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, slideshow, table
-from probewise.report.words import count, number, number_unsigned_zero, probability
+from probewise.report.words import count_with_noun, number_text, number_unsigned_zero, probability_text
 
 
 def png(size, dpi=None):
@@ -81,11 +81,11 @@ def test_markup_is_not_escaped_twice():
 
 
 def test_numbers_are_written_as_people_read_them():
-    assert number(-1.25, 1) == "−1.2"
-    assert number(float("nan"), 1) == "–"
+    assert number_text(-1.25, 1) == "−1.2"
+    assert number_text(float("nan"), 1) == "–"
     assert number_unsigned_zero(-0.01, 1) == "0.0"
-    assert (count(1, "reading"), count(2, "reading")) == ("1 reading", "2 readings")
-    assert (probability(1e-9), probability(0.5), probability(1.0)) == ("< 0.001", "0.500", "> 0.999")
+    assert (count_with_noun(1, "reading"), count_with_noun(2, "reading")) == ("1 reading", "2 readings")
+    assert (probability_text(1e-9), probability_text(0.5), probability_text(1.0)) == ("< 0.001", "0.500", "> 0.999")
 
 
 def test_many_sections_are_listed_with_links_that_lead_to_them():

@@ -37,14 +37,14 @@ def test_every_usable_reading_on_a_line_is_drawn(recording):
 
 
 def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording):
-    axes = plots.predicted_against_recorded(recording, recording.readings, np.ones(len(recording)))
+    axes = plots.predicted_and_recorded_by_scan(recording, recording.readings, np.ones(len(recording)))
     assert sum(ax.get_visible() for ax in axes.flat) == 5
 
 
 def test_many_scans_are_thinned_to_eight_panels():
     plan = read_recording(shipped("concealed")).plan
     flat = Recording(plan, np.full(len(plan), 30.0))
-    axes = plots.predicted_against_recorded(flat, flat.readings, np.ones(len(flat)))
+    axes = plots.predicted_and_recorded_by_scan(flat, flat.readings, np.ones(len(flat)))
     assert sum(ax.get_visible() for ax in axes.flat) <= 8
 
 
@@ -72,7 +72,7 @@ def test_an_ssf_is_drawn_about_its_place_in_the_sensor_frame():
     ax = plots.spatial_sensitivity(blob())
     left, right = ax.get_xlim()
     assert left == -right
-    assert plots.ssf_by_order({1: blob(), 2: blob()}, {1: -5.0, 2: -7.0}, {1: 0.1, 2: 0.1}).shape == (1, 2)
+    assert plots.ssf_by_n_gaussians({1: blob(), 2: blob()}, {1: -5.0, 2: -7.0}, {1: 0.1, 2: 0.1}).shape == (1, 2)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from probewise.cli.diagnose import generators_of_diagnosis
 from probewise.diagnosis import diagnose
 from probewise.experiment import loop
 from probewise.recordings import read_recording, shipped
-from probewise.report.words import typeset
+from probewise.report.words import typeset_numbers
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -54,7 +54,7 @@ def test_the_readme_quotes_what_the_demo_said_when_its_pictures_were_made():
 def test_the_readme_quotes_what_the_command_says_of_the_shipped_recording():
     rng, *_ = generators_of_diagnosis(QUOTED["seed"])
     found = diagnose(read_recording(shipped("concealed")), rng=rng)
-    assert typeset(found.reason) == QUOTED["reason"]
+    assert typeset_numbers(found.reason) == QUOTED["reason"]
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])

@@ -26,11 +26,11 @@ def drawn():
             X, np.sin(X), [("as calibrated", X), ("repaired", np.sin(X))], label="X (mm)", unit="V"
         ),
         "clouds": plots.residuals_against_covariates([("time (s)", X)], [("as calibrated", noise)], unit="V"),
-        "gain": plots.gain_by_scan([("edge_0", 0.5), ("edge_90", -0.1)], 0.2, 0.05),
+        "gain": plots.heldout_gain_by_scan([("edge_0", 0.5), ("edge_90", -0.1)], 0.2, 0.05),
         "neighbours": plots.residual_autocorrelation(noise, scan, rho=0.3),
         "spread": plots.spread_by_level(X, noise, unit="V", model_sd=np.ones(200)),
         "tails": plots.tails(noise, 1.0),
-        "lost": plots.lost_readings(X, noise, X > 9.0, unit="V"),
+        "lost": plots.lost_readings_against_predicted(X, noise, X > 9.0, unit="V"),
         "lattice": plots.readings_modulo_step(np.round(noise, 1), 0.1, unit="V"),
     }
 
@@ -70,7 +70,7 @@ def test_no_legend_lies_over_data(figures, images):
 
 
 def test_the_same_drawing_gives_the_same_bytes():
-    first, second = (plots.svg(plots.gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
+    first, second = (plots.svg(plots.heldout_gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
     assert first == second
 
 

@@ -19,8 +19,8 @@ from probewise.report.sheets import (
     LEFT_MM,
     OVERLAP_MM,
     Sheet,
+    arm_home_jig_sheets,
     field_sheet,
-    jig_sheets,
     marks_sheet,
     plan_sheets,
     target_sheet,
@@ -213,7 +213,7 @@ def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is
     arm = dataclasses.replace(
         shipped, elbow=elbow, elbow_is_relative=elbow_is_relative, links_mm=(150.0, 120.0), shoulder_mm=(40.0, 60.0)
     )
-    side, above = jig_sheets(arm)
+    side, above = arm_home_jig_sheets(arm)
     pdf = sheets_pdf([side, above], paper="a4", title="t")
     wrist = 40 + 120 * np.cos(np.radians(30)), 60 + 150 - 120 * np.sin(np.radians(30))
     face = np.add(wrist, [arm.sensor_mm[0], -arm.sensor_mm[1]])
@@ -230,7 +230,7 @@ def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is
 
 
 def test_the_jigs_beams_are_as_wide_as_lego_and_its_pages_have_a_ruler():
-    side, above = jig_sheets(read_geometry(shipped_geometry_path()))
+    side, above = arm_home_jig_sheets(read_geometry(shipped_geometry_path()))
     pages = pages_of(sheets_pdf([side, above], paper="a4", title="t"))
     assert len(pages) == 1 + len(tiles_of(side, "a4")) + len(tiles_of(above, "a4"))
     beam = side.strokes_mm[0]

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.report.words import interval, unit_of, value_and_interval, with_error, without_unit
+from probewise.report.words import interval_text, unit_of, value_and_interval_texts, value_with_error, without_unit
 
 
 @pytest.mark.parametrize(
@@ -21,24 +21,24 @@ from probewise.report.words import interval, unit_of, value_and_interval, with_e
     ],
 )
 def test_a_value_is_written_to_the_second_figure_of_its_error(value, error, written):
-    assert with_error(value, error) == written
+    assert value_with_error(value, error) == written
 
 
 def test_a_unit_follows_the_error():
-    assert with_error(90.94, 3.82, "mm") == "90.9 ± 3.8 mm"
+    assert value_with_error(90.94, 3.82, "mm") == "90.9 ± 3.8 mm"
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-8, 1e6))
 def test_no_error_above_zero_is_written_as_zero(value, error):
-    written = with_error(value, error).partition(" ± ")[2]
+    written = value_with_error(value, error).partition(" ± ")[2]
     assert any(figure in written for figure in "123456789")
 
 
 def test_an_interval_is_written_to_the_third_figure_of_its_width():
-    assert interval(0.030724, 0.035694) == "0.03072 to 0.03569"
-    assert interval(-0.020431, 5.4e-06) == "−0.0204 to 0.0000"
-    assert value_and_interval(0.032489, 0.030724, 0.035694) == ("0.03249", "0.03072 to 0.03569")
-    assert value_and_interval(3.0, 3.0, 3.0) == ("3", "3")
+    assert interval_text(0.030724, 0.035694) == "0.03072 to 0.03569"
+    assert interval_text(-0.020431, 5.4e-06) == "−0.0204 to 0.0000"
+    assert value_and_interval_texts(0.032489, 0.030724, 0.035694) == ("0.03249", "0.03072 to 0.03569")
+    assert value_and_interval_texts(3.0, 3.0, 3.0) == ("3", "3")
 
 
 def test_a_parameters_unit_is_told_once():

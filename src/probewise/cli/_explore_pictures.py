@@ -66,7 +66,7 @@ class Pictures:
             )
         views = {inputs.model: (step, inputs.experiment), inputs.other_model: (shadow, inputs.other)}
         titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
-        return report.robot_views_png(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
+        return report.robot_views_by_model_png(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
 
     def write_results(
         self, stage: StagedFiles, result: Exploration, *, seed: int, known: Mapping[str, float] | None

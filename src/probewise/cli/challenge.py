@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     drawing = progress_shown(quiet=arguments.quiet)
     with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
-        stage.write("table.csv", report.table_csv(rows))
+        stage.write("table.csv", report.target_table_csv(rows))
         stage.write("report.html", report.page_html(results, rows, command=command, systems=arguments.systems))
     print_result(report.summary_sentence(rows, len(results)), quiet=arguments.quiet)
     print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)

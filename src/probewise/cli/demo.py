@@ -127,7 +127,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         answers = report.main_findings_by_key(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
     return (
-        *report.comparison_lines(searches),
+        *report.search_comparison_lines(searches),
         report.summary_sentence(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
@@ -191,7 +191,7 @@ def _search_from_empty_field(
     from probewise.experiment import arm_over, experiment_for, run, surface_of
     from probewise.report import exploration as report
     from probewise.report.plots import grid_of_axes, png
-    from probewise.report.words import count
+    from probewise.report.words import count_with_noun
     from probewise.scene import Field, outlines
     from probewise.world.shipped import truth as world_behind
 
@@ -206,13 +206,13 @@ def _search_from_empty_field(
     name = MODEL_NAMES[model]
     frames = [
         png(
-            report.view(
+            report.draw_robot_view(
                 step,
                 experiment,
                 places[: step.number],
                 levels=levels,
                 truth_mm=outline_mm,
-                title=f"{name} model, after {count(step.number, 'reading')}",
+                title=f"{name} model, after {count_with_noun(step.number, 'reading')}",
                 ax=grid_of_axes(1, 1, size_in=(6.6, 4.0))[0, 0],
             ),
             dpi=90,

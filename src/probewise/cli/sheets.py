@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     from probewise.cli._plans import read_or_shipped_plan
     from probewise.recordings.description import read_description
-    from probewise.report.sheets import field_sheet, jig_sheets, marks_sheet, plan_sheets, target_sheet
+    from probewise.report.sheets import arm_home_jig_sheets, field_sheet, marks_sheet, plan_sheets, target_sheet
 
     what = arguments.what
     if what not in (FIELD, TARGET) and arguments.target is not None:
@@ -70,7 +70,7 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     if what == MARKS:
         return (marks_sheet(geometry_of(arguments)),)
     if what == JIG:
-        return jig_sheets(geometry_of(arguments))
+        return arm_home_jig_sheets(geometry_of(arguments))
     if what in (FIELD, TARGET):
         field_mm = geometry_of(arguments).field_mm
         if arguments.target is None and what == TARGET:

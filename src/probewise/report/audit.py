@@ -10,8 +10,8 @@ from probewise.effects import spoken_name
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import AxesGrid, audit_matrix, png
-from probewise.report.terms import explain_new_terms, with_explanations
-from probewise.report.words import count, number, typeset
+from probewise.report.terms import explain_new_terms, sections_with_terms_explained
+from probewise.report.words import count_with_noun, number_text, typeset_numbers
 
 _CURED_BY = "The fewest extra readings that would help"
 
@@ -26,15 +26,15 @@ def summary_sentence(audit: PlanAudit) -> str:
     if not audit.cures:
         return said
     cured = len(audit.seen_as("fine", after=True)) - n_fine
-    return f"{said} {count(audit.extra_readings, 'more reading')} make {cured} more fine."
+    return f"{said} {count_with_noun(audit.extra_readings, 'more reading')} make {cured} more fine."
 
 
 def encoded_figures(audit: PlanAudit) -> dict[str, bytes]:
     """Draw the figure of an audit; return its PNG by file name."""
-    return {"audit.png": png(detectability_figure(audit))}
+    return {"audit.png": png(draw_detectability_and_aliases(audit))}
 
 
-def detectability_figure(audit: PlanAudit) -> AxesGrid:
+def draw_detectability_and_aliases(audit: PlanAudit) -> AxesGrid:
     """Draw the detectability of every effect, and which effects are aliased; return the two axes, (1, 2)."""
     names, detectability = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
     return audit_matrix(names, detectability, audit.cosines, alias=ALIAS)
@@ -65,7 +65,10 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
                 definition_list(
                     (
                         ("plan", source),
-                        ("readings", f"{len(audit.plan)} in {count(len(audit.plan.scan_names), audit.words.run)}"),
+                        (
+                            "readings",
+                            f"{len(audit.plan)} in {count_with_noun(len(audit.plan.scan_names), audit.words.run)}",
+                        ),
                         (audit.words.null.removeprefix("the "), audit.assumed),
                         ("controls of the instrument", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
                     )
@@ -78,7 +81,7 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
         f"Audit of {source}",
         answer=summary_sentence(audit),
         key_figure=fragment(shown, *explain_new_terms(f"{summary_sentence(audit)} {shown}", known)),
-        sections=with_explanations(sections, known),
+        sections=sections_with_terms_explained(sections, known),
     )
 
 
@@ -108,7 +111,7 @@ def _extra_readings_elements(audit: PlanAudit) -> tuple[Markup, ...]:
             (
                 (
                     str(k),
-                    typeset(cure.description),
+                    typeset_numbers(cure.description),
                     str(len(cure.plan)),
                     ", ".join(map(spoken_name, cure.cured)) or "–",
                 )
@@ -116,7 +119,7 @@ def _extra_readings_elements(audit: PlanAudit) -> tuple[Markup, ...]:
             ),
         ),
         paragraph(
-            f"{count(len(plan), 'reading')}, about {number(audit.extra_minutes, 0)} minutes; "
+            f"{count_with_noun(len(plan), 'reading')}, about {number_text(audit.extra_minutes, 0)} minutes; "
             f"the plan is in cure_plan.csv. Still aliased or invisible: {', '.join(left) or 'nothing'}."
         ),
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from probewise.diagnosis import EffectAudit
 from probewise.effects import spoken_name
 from probewise.report.html import Markup, table
-from probewise.report.words import number, unit_name
+from probewise.report.words import number_text, unit_name
 
 _SIZES = {
     "albedo": "change of albedo",
@@ -45,7 +45,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
             (
                 spoken_name(effect.name),
                 effect.detectability,
-                number(effect.share, 2),
+                number_text(effect.share, 2),
                 effect.reason or ", ".join(f"{spoken_name(n)} {c:.3f}" for n, c in effect.alike[:4]) or "–",
                 "; ".join(_detectable_size_in_words(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
                 *["–" if effect.rows is None else str(effect.rows)] * counted,

@@ -13,21 +13,21 @@ from probewise.recordings import Prediction, Recording
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
     AxesGrid,
-    calibration_check,
     png,
-    predicted_against_recorded,
+    predicted_and_recorded_by_scan,
     readings_by_orientation,
     spatial_sensitivity,
-    ssf_by_order,
+    ssf_by_n_gaussians,
+    standardised_residuals,
 )
 from probewise.report.words import (
-    count,
-    number,
+    count_with_noun,
+    number_text,
     number_unsigned_zero,
-    typeset,
+    typeset_numbers,
     unit_name,
-    value_and_interval,
-    with_error,
+    value_and_interval_texts,
+    value_with_error,
     without_unit,
 )
 
@@ -35,23 +35,23 @@ from probewise.report.words import (
 def summary_sentence(sensor: FittedSensor) -> str:
     """Summarise in one sentence: number of Gaussians, lead in ln Z, the SSF's centre and sds, and the noise."""
     n = sensor.n_gaussians
-    said = f"The evidence favours {count(n, 'Gaussian')}"
+    said = f"The evidence favours {count_with_noun(n, 'Gaussian')}"
     others = sorted((o for o in sensor.orders if o.n_gaussians != n), key=lambda o: -o.log_z)
     if others:
         chosen = next(o for o in sensor.orders if o.n_gaussians == n)
         lead = chosen.log_z - others[0].log_z
         error = math.hypot(chosen.log_z_error, others[0].log_z_error)
-        said += f", ahead of {others[0].n_gaussians} by {with_error(lead, error)} in ln Z"
-    center_x, center_y, widths = ssf_centre_and_sds(sensor)
+        said += f", ahead of {others[0].n_gaussians} by {value_with_error(lead, error)} in ln Z"
+    center_x, center_y, widths = ssf_centre_and_axis_sds_mm(sensor)
     return (
         f"{said}: centred at ({number_unsigned_zero(center_x, 1)}, {number_unsigned_zero(center_y, 1)}) mm "
         "on the sensor, "
-        f"{number(widths[0], 1)} by {number(widths[1], 1)} mm (sd), "
-        f"noise {number(float(sensor.noise_sd.mean()), 2)} {unit_name(sensor.instrumentation.unit)} per reading."
+        f"{number_text(widths[0], 1)} by {number_text(widths[1], 1)} mm (sd), "
+        f"noise {number_text(float(sensor.noise_sd.mean()), 2)} {unit_name(sensor.instrumentation.unit)} per reading."
     )
 
 
-def ssf_centre_and_sds(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
+def ssf_centre_and_axis_sds_mm(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
     """Return the centre of the mean SSF and its sds along the long and the short axis (mm)."""
     u, v = sensor.field.mean_mm
     short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0))
@@ -62,16 +62,16 @@ def encoded_figures(calibration: Calibration, recording: Recording, prediction: 
     """Draw the figures of a calibration; return their PNGs by file name."""
     return {
         "readings.png": png(readings_by_orientation(recording)),
-        "predicted.png": png(predicted_against_recorded(recording, prediction.mean, prediction.sd)),
-        "residuals.png": png(calibration_check(recording, prediction.mean, prediction.sd)),
+        "predicted.png": png(predicted_and_recorded_by_scan(recording, prediction.mean, prediction.sd)),
+        "residuals.png": png(standardised_residuals(recording, prediction.mean, prediction.sd)),
         "ssf.png": png(spatial_sensitivity(calibration.sensor.field)),
-        "ssf_by_order.png": png(draw_ssf_of_each_order(calibration)),
+        "ssf_by_order.png": png(draw_ssf_by_n_gaussians(calibration)),
     }
 
 
-def draw_ssf_of_each_order(calibration: Calibration) -> AxesGrid:
+def draw_ssf_by_n_gaussians(calibration: Calibration) -> AxesGrid:
     """Draw the mean SSF of each number of Gaussians, with its evidence; return the axes."""
-    return ssf_by_order(
+    return ssf_by_n_gaussians(
         calibration.fields,
         {o.n_gaussians: o.log_z for o in calibration.orders},
         {o.n_gaussians: o.log_z_error for o in calibration.orders},
@@ -111,8 +111,8 @@ def sections(
                     "Recorded readings, and what the model predicts.",
                 ),
                 paragraph(
-                    f"Chi-square per reading is {number(float(np.mean(z**2)), 3)} over "
-                    f"{count(int(ok.sum()), 'reading')} "
+                    f"Chi-square per reading is {number_text(float(np.mean(z**2)), 3)} over "
+                    f"{count_with_noun(int(ok.sum()), 'reading')} "
                     "(near 1 where the model and its noise are right; they were fitted, so a little below)."
                 ),
                 figure(
@@ -121,14 +121,16 @@ def sections(
                 ),
             ),
         ),
-        Section("Parameters", (ssf_table(sensor), parameter_table(sensor), *_note_paragraphs(sensor.notes))),
+        Section(
+            "Parameters", (ssf_centre_and_width_table(sensor), parameter_table(sensor), *_note_paragraphs(sensor.notes))
+        ),
         Section(
             "Prior",
             (
                 table(
                     ("parameter", "unit", "prior", "why"),
                     (
-                        (p.parameter, _printed_unit(p.unit), typeset(p.distribution), typeset(p.reason))
+                        (p.parameter, _printed_unit(p.unit), typeset_numbers(p.distribution), typeset_numbers(p.reason))
                         for p in sensor.priors
                     ),
                 ),
@@ -158,8 +160,8 @@ def evidence_table(sensor: FittedSensor) -> Markup:
         (
             (
                 str(o.n_gaussians),
-                with_error(o.log_z, o.log_z_error),
-                number(best - o.log_z, 2),
+                value_with_error(o.log_z, o.log_z_error),
+                number_text(best - o.log_z, 2),
                 f"{o.n_ssf_parameters} ({o.n_parameters})",
             )
             for o in sensor.orders
@@ -174,7 +176,7 @@ def parameter_table(sensor: FittedSensor) -> Markup:
     return table(
         ("parameter", "unit", "median", "95 % interval"),
         (
-            (n, _printed_unit(sensor.unit_of_parameter(n)), *value_and_interval(median[n], *ends[n]))
+            (n, _printed_unit(sensor.unit_of_parameter(n)), *value_and_interval_texts(median[n], *ends[n]))
             for n in sensor.names
         ),
         caption="Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of "
@@ -182,12 +184,12 @@ def parameter_table(sensor: FittedSensor) -> Markup:
     )
 
 
-def ssf_table(sensor: FittedSensor) -> Markup:
+def ssf_centre_and_width_table(sensor: FittedSensor) -> Markup:
     """Build the table of the SSF's centre, widths and angle: medians and 95 % intervals."""
     return table(
         ("SSF", "unit", "median", "95 % interval"),
         (
-            (without_unit(q.name), _printed_unit(q.unit), *value_and_interval(q.median, *q.interval95))
+            (without_unit(q.name), _printed_unit(q.unit), *value_and_interval_texts(q.median, *q.interval95))
             for q in sensor.ssf_quantities()
         ),
         caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "

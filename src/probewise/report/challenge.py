@@ -13,8 +13,8 @@ from probewise.challenge.systems.table import gains_on_held_out_runs
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
-from probewise.report.terms import explain_new_terms, with_explanations
-from probewise.report.words import count, typeset
+from probewise.report.terms import explain_new_terms, sections_with_terms_explained
+from probewise.report.words import count_with_noun, typeset_numbers
 
 Results = Sequence[Mapping[str, Any]]
 
@@ -25,8 +25,8 @@ def summary_sentence(rows: Sequence[Row], n_cases: int) -> str:
     """Summarise in one sentence how many targets are met, missed and undecided."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
-        f"{count(n_cases, 'case')} of concealed physics: {count(n['met'], 'target')} met, {n['missed']} missed, "
-        f"{n['open']} undecided by so few cases."
+        f"{count_with_noun(n_cases, 'case')} of concealed physics: {count_with_noun(n['met'], 'target')} met, "
+        f"{n['missed']} missed, {n['open']} undecided by so few cases."
     )
 
 
@@ -39,7 +39,7 @@ def target_table(rows: Sequence[Row]) -> Markup:
             (
                 _indented_row_name(row.name),
                 _value_text(row.found) if row.found.n else "–",
-                typeset(_interval_text(row.found)),
+                typeset_numbers(_interval_text(row.found)),
                 str(row.found.n),
                 _target_text(row),
                 "undecided" if row.decision == "open" else _DECISIONS[row.decision],
@@ -55,7 +55,7 @@ def _indented_row_name(name: str) -> str:
     return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
-def table_csv(rows: Sequence[Row]) -> str:
+def target_table_csv(rows: Sequence[Row]) -> str:
     """Return the table as the text of a CSV file; missing values are empty."""
     cells = []
     for row in rows:
@@ -95,7 +95,7 @@ def page_html(results: Results, rows: Sequence[Row], *, command: str, systems: b
         "How good a diagnosis is",
         answer=summary_sentence(rows, len(results)),
         key_figure=fragment(honest, *explain_new_terms(honest, known)),
-        sections=with_explanations(sections, known),
+        sections=sections_with_terms_explained(sections, known),
     )
 
 

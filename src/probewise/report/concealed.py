@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import doubt_against_trust, png
-from probewise.report.plots.concealed import row_name
-from probewise.report.words import count
+from probewise.report.plots.concealed import effect_and_size_in_words
+from probewise.report.words import count_with_noun
 from probewise.study import ConcealedRow
 
 
@@ -30,7 +30,7 @@ def page_html(rows: Sequence[ConcealedRow], *, command: str) -> str:
         "the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals promise.",
     )
     sections = [
-        Section("The table", (_comparison_table(rows), _table_legend())),
+        Section("The table", (_doubt_against_trust_table(rows), _table_legend())),
         Section("How it was made", (definition_list([("command", command)]),)),
     ]
     return page("A robot with a concealed fault", answer=summary_sentence(rows), key_figure=drawn, sections=sections)
@@ -39,10 +39,10 @@ def page_html(rows: Sequence[ConcealedRow], *, command: str) -> str:
 def _sure_and_wrong_text(rows: Sequence[ConcealedRow]) -> str:
     """Write how many of all runs ended sure and wrong, as in "3 of 40 runs"."""
     n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in rows)
-    return f"{n_wrong} of {count(sum(row.runs for row in rows), 'run')}"
+    return f"{n_wrong} of {count_with_noun(sum(row.runs for row in rows), 'run')}"
 
 
-def _comparison_table(rows: Sequence[ConcealedRow]) -> Markup:
+def _doubt_against_trust_table(rows: Sequence[ConcealedRow]) -> Markup:
     header = (
         "concealed",
         "runs",
@@ -61,7 +61,7 @@ def _comparison_table(rows: Sequence[ConcealedRow]) -> Markup:
         header,
         (
             (
-                row_name(doubts),
+                effect_and_size_in_words(doubts),
                 str(doubts.runs),
                 f"{doubts.readings:g} | {trusts.readings:g}",
                 *(

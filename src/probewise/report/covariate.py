@@ -23,18 +23,18 @@ WORDS = {
 }
 
 
-def covariate_words(name: str) -> str:
+def covariate_in_words(name: str) -> str:
     """Return a covariate's name in words, without its unit: "battery" for battery_mv."""
     stem, _, suffix = name.rpartition("_")
     own = stem if stem and suffix in SUFFIXES else name
     return WORDS.get(name, own.replace("column:", "column ").replace("_", " "))
 
 
-def family_words(family: str) -> str:
+def term_family_in_words(family: str) -> str:
     """Return the name in words of a family of free-form terms: covariate, "scan by scan" if within scans, and form."""
     name, _, how = family.partition(", ")
     stem = name.removesuffix(" within scans")
-    said = covariate_words(stem) + (", scan by scan" if stem != name else "")
+    said = covariate_in_words(stem) + (", scan by scan" if stem != name else "")
     return f"{said} ({how})" if how else said
 
 
@@ -45,18 +45,18 @@ def covariate_unit(name: str, unit: str) -> str:
     return known.get(name, SUFFIXES.get(suffix, "") if stem else "")
 
 
-def covariate_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
+def covariate_in_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
     """Return the name of a covariate in words and its unit, "" if none is known."""
     unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
-        return ("scan" if name == "scan" else covariate_words(name)), covariate_unit(name, unit)
+        return ("scan" if name == "scan" else covariate_in_words(name)), covariate_unit(name, unit)
     units = {"time": apparatus.system.simulator.time_unit, "level": unit, "previous": unit}
     return apparatus.words.covariate_in_words(name), units.get(name, "")
 
 
 def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
     """Return an axis label: the covariate, the scan if one is given, and the unit."""
-    said, unit = covariate_words_and_unit(diagnosis, name)
+    said, unit = covariate_in_words_and_unit(diagnosis, name)
     run = diagnosis.apparatus.words.run
     said += f", {run} {scan}" if scan is not None and name != run else ""
     return said + (f" ({unit_name(unit)})" if unit else "")

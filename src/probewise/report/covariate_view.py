@@ -14,8 +14,8 @@ from probewise.recordings import Plan
 from probewise.report.covariate import (
     axis_label,
     category_name_by_value,
+    covariate_in_words_and_unit,
     covariate_values_by_place,
-    covariate_words_and_unit,
 )
 from probewise.report.residual_means import ResidualMeans, mean_residuals
 from probewise.report.words import unit_name
@@ -89,7 +89,7 @@ class ResidualNoise:
         )
 
 
-def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
+def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
     """Choose the covariate of the first figure: the first candidate with a mean clearly outside the band of chance.
 
     If there is none, the candidate with the largest mean in sds; without candidates, the predicted reading.
@@ -104,7 +104,7 @@ def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateV
     for place in places:
         found += _views_of_place(diagnosis, place, values[place.figure_name])
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
-        found.append(_view_along_repair_change(diagnosis))
+        found.append(_view_against_repair_change(diagnosis))
     if not found:
         return CovariateView(np.array(diagnosis.repair.before.readings), axis_label(diagnosis, "level"))
     sizes = [chance.mean_residuals(diagnosis, view, after=False).largest_mean_in_sds for view in found]
@@ -145,13 +145,13 @@ def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[
 
     `at`, (n_points,), holds the covariate's values.
     """
-    by_covariate = view_of_place(diagnosis, place, at)
+    by_covariate = view_along_place_covariate(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
     return [view_along_scan(diagnosis, place.scan, place), by_covariate]
 
 
-def view_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
+def view_along_place_covariate(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
     """Build the view of a place along its covariate, whose values are `at`, (n_points,)."""
     unit = diagnosis.recording.plan.instrumentation.unit
     label = axis_label(diagnosis, place.covariate, place.scan)
@@ -175,14 +175,14 @@ def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None)
         return CovariateView(at, axis_label(diagnosis, "time" if plan.has_varying_time else "row", whole), place=place)
     x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
     along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
-    if not is_along_line(plan, rows):
+    if not is_scan_along_line(plan, rows):
         along, label = plan.time_s[rows], "time (s)"
     at = np.full(len(plan), np.nan)
     at[rows] = along
     return CovariateView(at, f"{label}, scan {scan}", place=place)
 
 
-def is_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
+def is_scan_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
     """Return whether the rows of one scan lie on a line, at three or more places; True for the rows of a table."""
     if isinstance(plan, RunTable):
         return True
@@ -213,7 +213,7 @@ def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
         if effect.name not in diagnosis.combination:
             continue
         if isinstance(plan, RunTable):
-            out += _covariates_to_fold(diagnosis, plan, effect.name, found)
+            out += _covariates_and_periods_to_fold(diagnosis, plan, effect.name, found)
             continue
         if found.get("alias_hz", 0.0) > 0:
             out.append((plan.time_s, 1 / found["alias_hz"], "time", "s"))
@@ -228,7 +228,7 @@ def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
     ]
 
 
-def _covariates_to_fold(
+def _covariates_and_periods_to_fold(
     diagnosis: Diagnosis, table: RunTable, effect: str, found: Mapping[str, float]
 ) -> list[tuple[FloatArray, float, str, str]]:
     """List the covariates to fold for an effect on a table: values (n_points,), period, name and unit.
@@ -236,12 +236,12 @@ def _covariates_to_fold(
     A wave in time folds the time; a column's periodic error folds that column.
     """
     if found.get("hz", 0.0) > 0:
-        return [(table.time_s, 1 / found["hz"], *covariate_words_and_unit(diagnosis, "time"))]
+        return [(table.time_s, 1 / found["hz"], *covariate_in_words_and_unit(diagnosis, "time"))]
     column = name_without_copy_suffix(effect).partition(":")[2]
     return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
 
 
-def _view_along_repair_change(diagnosis: Diagnosis) -> CovariateView:
+def _view_against_repair_change(diagnosis: Diagnosis) -> CovariateView:
     unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
     return CovariateView(
         diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})"

@@ -30,19 +30,19 @@ from probewise.report.paper_view import paper_view, window_mm
 from probewise.report.plots import (
     AxesGrid,
     arm_and_sensor,
-    before_and_after,
     grid_of_axes,
     hypothesis_probabilities,
     information_gained,
     png,
     posterior_widths,
     quadrant_patterns,
+    readings_before_and_after_repair,
     residuals_by_scan,
     sensor_orientations,
 )
 from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import join_side_by_side
-from probewise.report.words import count, number, typeset
+from probewise.report.words import count_with_noun, number_text, typeset_numbers
 
 FIRST = 3  # as in the paper's figure
 HEADER = (
@@ -72,14 +72,14 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     )
 
 
-def equal_readings_text(searches: Sequence[RobotSearch]) -> str:
+def sds_after_equal_readings_text(searches: Sequence[RobotSearch]) -> str:
     """Compare in a sentence both robots' widest posterior sds after as many readings as the SSF robot needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
     widest = naive.run.steps[naive.step_number_after(n) - 1].largest_sd_mm
     return (
-        f"After {count(n, 'reading')} each, the naive robot knows the circle to {number(widest, 1)} mm, the other "
-        f"to {number(ssf.run.last.largest_sd_mm, 1)} mm (widest posterior sd)."
+        f"After {count_with_noun(n, 'reading')} each, the naive robot knows the circle to {number_text(widest, 1)} mm, "
+        f"the other to {number_text(ssf.run.last.largest_sd_mm, 1)} mm (widest posterior sd)."
     )
 
 
@@ -95,38 +95,38 @@ def main_findings_by_key(
     return {
         "seed": seed,
         "search": summary_sentence(started_alike),
-        "equal_readings": equal_readings_text(started_alike),
+        "equal_readings": sds_after_equal_readings_text(started_alike),
         "verdict": diagnosis.verdict,
         "combination": "+".join(diagnosis.combination),
         "concealed": concealed,
         "diagnosis": diagnosis_report.summary_sentence(diagnosis),
-        "reason": typeset(diagnosis.reason),
+        "reason": typeset_numbers(diagnosis.reason),
         "doubt": doubting_robot.summary_sentence(doubt),
     }
 
 
-def comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
+def search_comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
     """Return the comparison's cells, in the order of `HEADER`, one row per search."""
     return [
         (
             s.model,
             str(len(s.run.steps)),
             str(s.readings_until_first_white),
-            number(s.run.last.bits, 1),
-            number(s.run.bits_per_reading, 2),
-            number(s.run.paper_bits_per_reading, 2),
-            f"{number(s.largest_error_mm, 1)} mm",
+            number_text(s.run.last.bits, 1),
+            number_text(s.run.bits_per_reading, 2),
+            number_text(s.run.paper_bits_per_reading, 2),
+            f"{number_text(s.largest_error_mm, 1)} mm",
             exploration_report.errors_text(s.run, s.truth),
         )
         for s in searches
     ]
 
 
-def comparison_table(searches: Sequence[RobotSearch], caption: str = "") -> Markup:
+def search_comparison_table(searches: Sequence[RobotSearch], caption: str = "") -> Markup:
     """Build the table that compares the robots' searches, a row each; the default caption explains bits and errors."""
     return table(
         HEADER,
-        comparison_rows(searches),
+        search_comparison_rows(searches),
         caption=caption
         or (
             "Bits: prior minus posterior differential entropy of the circle's parameters. The paper counts 25 bits for "
@@ -194,7 +194,7 @@ def encoded_diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     if best is not None:
         name, gain, rows = best
         title = f"{name}: {gain:+.2f} nats per reading when it was held out"
-        drawn["before_after.png"] = png(before_and_after(recording, rows, before, after, name=title))
+        drawn["before_after.png"] = png(readings_before_and_after_repair(recording, rows, before, after, name=title))
     return drawn
 
 
@@ -208,7 +208,8 @@ def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -
         for ax, search in zip(row, searches, strict=True):
             k = search.step_number_after(n)
             step = search.run.steps[k - 1]
-            title = f"{search.model} model, {count(k, 'reading')}: known to {number(step.largest_sd_mm, 1)} mm"
+            taken, known = count_with_noun(k, "reading"), number_text(step.largest_sd_mm, 1)
+            title = f"{search.model} model, {taken}: known to {known} mm"
             paper_view(
                 search.run, k, levels=search.levels, truth_mm=search.truth_mm, window_mm=window, title=title, ax=ax
             )
@@ -260,7 +261,7 @@ def page_html(
                 definition_list(
                     (
                         ("seed", str(seed)),
-                        ("time", f"{number(seconds, 0)} s"),
+                        ("time", f"{number_text(seconds, 0)} s"),
                         (
                             "recordings",
                             "the two that ship with the package, both simulated by a world that shares no code with "
@@ -273,10 +274,10 @@ def page_html(
         ),
     ]
     caption = (
-        f"{equal_readings_text(started_alike)} Left the naive model, right the SSF model. Blue: 50 circles drawn "
-        "from the posterior. Copper: entropy of the readings that these circles predict; brighter places promise more "
-        "information. Squares: readings by their brightness. Green: the next place. Dashed white: the hidden "
-        "circle."
+        f"{sds_after_equal_readings_text(started_alike)} Left the naive model, right the SSF model. "
+        "Blue: 50 circles drawn from the posterior. Copper: entropy of the readings that these circles predict; "
+        "brighter places promise more information. Squares: readings by their brightness. Green: the next place. "
+        "Dashed white: the hidden circle."
     )
     return page(
         "Modeling a sensor to improve its efficacy",
@@ -345,14 +346,14 @@ def _search_section(
                 "run after each reading, is "
                 "probewise explore --method paper.",
             ),
-            comparison_table(started_alike),
+            search_comparison_table(started_alike),
         ),
     )
     n_slides = max(len(s.run.steps) for s in searches)
     texts = [
         "; ".join(
-            f"{s.model} model, {count(k := s.step_number_after(n), 'reading')}: "
-            f"{number(s.run.steps[k - 1].largest_sd_mm, 1)} mm" + (" (ended)" if n > len(s.run.steps) else "")
+            f"{s.model} model, {count_with_noun(k := s.step_number_after(n), 'reading')}: "
+            f"{number_text(s.run.steps[k - 1].largest_sd_mm, 1)} mm" + (" (ended)" if n > len(s.run.steps) else "")
             for s in searches
         )
         for n in range(1, n_slides + 1)
@@ -376,7 +377,7 @@ def _search_section(
                 "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the "
                 "circle.",
             ),
-            comparison_table(searches, "From an empty field; columns as in the table above."),
+            search_comparison_table(searches, "From an empty field; columns as in the table above."),
         ),
     )
     return Section("The search", (introduction,), (panels, whole))
@@ -410,8 +411,9 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
         )
         held = (
             f"On scans that were held out of the fit, the repaired model gains "
-            f"{number(gain.heldout_log_density_per_reading, 3)} ± {number(gain.heldout_sd, 3)} nats per reading. (A "
-            "nat is a unit of log probability: one nat more makes a reading e = 2.7 times as probable.)"
+            f"{number_text(gain.heldout_log_density_per_reading, 3)} ± {number_text(gain.heldout_sd, 3)} "
+            "nats per reading. (A nat is a unit of log probability: "
+            "one nat more makes a reading e = 2.7 times as probable.)"
         )
         repair = [figure(drawn["before_after.png"], caption), paragraph(held), *repair]
     link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
@@ -419,9 +421,9 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
     return Section("A mismatch, found and repaired", said, (explanations, Section("The repair", (*repair, more))))
 
 
-def comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
+def search_comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
     """Write the comparison as lines of text: a table of each search's cost, another of its errors."""
-    rows = [HEADER, *comparison_rows(searches)]
+    rows = [HEADER, *search_comparison_rows(searches)]
     costs, errors = [row[:-2] for row in rows], [(row[0], *row[-2:]) for row in rows]
     return [
         "A whole search, from an empty field (bits: information gained; the paper's count: 25 bits over the readings)",

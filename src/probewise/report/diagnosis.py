@@ -23,7 +23,7 @@ from probewise.diagnosis import (
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
-from probewise.report.covariate import covariate_words_and_unit, family_words
+from probewise.report.covariate import covariate_in_words_and_unit, term_family_in_words
 from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
 from probewise.report.diagnosis_figures import encoded_figures, first_figure_content
 from probewise.report.effect_words import (
@@ -35,8 +35,8 @@ from probewise.report.effect_words import (
 )
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
-from probewise.report.terms import explain_new_terms, with_explanations
-from probewise.report.words import count, number, probability, typeset, unit_name
+from probewise.report.terms import explain_new_terms, sections_with_terms_explained
+from probewise.report.words import count_with_noun, number_text, probability_text, typeset_numbers, unit_name
 
 __all__ = ["encoded_figures", "page_html", "sections", "summary_sentence"]
 
@@ -71,7 +71,7 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
             "Before and after the repair" if diagnosis.repair.changes_predictions else "The model",
             _before_and_after_elements(diagnosis, drawn),
         ),
-        Section("Does the repaired model predict held-out readings?", _gain_elements(diagnosis, drawn)),
+        Section("Does the repaired model predict held-out readings?", _heldout_gain_elements(diagnosis, drawn)),
         Section("Aliased effects, and what would separate them", _alias_elements(diagnosis)),
         Section("Noise", _noise_elements(diagnosis, drawn)),
     ]
@@ -104,7 +104,7 @@ def page_html(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=summary_sentence(diagnosis),
         key_figure=fragment(first, *explain_new_terms(f"{diagnosis.verdict} {first}", known)),
-        sections=with_explanations([*sections(diagnosis, drawn), *design, run], known),
+        sections=sections_with_terms_explained([*sections(diagnosis, drawn), *design, run], known),
     )
 
 
@@ -148,7 +148,7 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         facts.append(
             (
                 "In the repaired model",
-                _sample_shares_in_words(diagnosis.repair.combination_shares, diagnosis.apparatus.words.model),
+                _combination_shares_in_words(diagnosis.repair.combination_shares, diagnosis.apparatus.words.model),
             )
         )
     return facts
@@ -172,7 +172,7 @@ def _formula_in_words(formula: Formula) -> str:
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
     held_out = f"{formula.heldout_log_density_per_reading:+.3f} nats per held-out reading"
     gained = f"log evidence {formula.log_evidence:+.1f} nats, {held_out}"
-    return typeset(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
+    return typeset_numbers(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
 
 
 def _reason_in_words(diagnosis: Diagnosis) -> str:
@@ -191,10 +191,10 @@ def _heldout_gain_in_words(nats: float, sd: float) -> str:
 
 def _signed_nats(nats: float, sd: float) -> str:
     written = value_with_sd(nats, sd)
-    return f"{typeset(written if written.startswith('-') else f'+{written}')} nats"
+    return f"{typeset_numbers(written if written.startswith('-') else f'+{written}')} nats"
 
 
-def _sample_shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str:
+def _combination_shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str:
     held = (
         f"{join_names(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
         for names, share in shares.items()
@@ -217,7 +217,7 @@ def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
         said = f"For the mean, yes: {often}. But chance would not put so many outlying readings together."
     else:
         said = f"{'Yes' if p_value > _CHANCE else 'Hardly'}: {often}."
-    return typeset(said)
+    return typeset_numbers(said)
 
 
 def _next_readings_in_words(diagnosis: Diagnosis) -> str:
@@ -228,17 +228,19 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if plan is None:
         return "No measurement that this apparatus can take would tell more."
     told = plan.expected_log_bayes_factor
-    asked = f"{count(len(plan.plan), 'reading')}, about {count(max(round(plan.minutes), 1), 'minute')}"
+    asked = (
+        f"{count_with_noun(len(plan.plan), 'reading')}, about {count_with_noun(max(round(plan.minutes), 1), 'minute')}"
+    )
     description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
     if told < _TELLS_SOMETHING:
         return (
             f"Nothing that is worth the time: the best plan of up to {MOST_READINGS} readings has an expected log "
-            f"Bayes factor of {number(told, 1)} nats. It is in {file}: {description} ({asked})."
+            f"Bayes factor of {number_text(told, 1)} nats. It is in {file}: {description} ({asked})."
         )
     said = f"{description}: {asked}, {file}."
     *others, last = map(_hypothesis_label_in_words, plan.between)
     rivals = f"{others[0]} from {last}" if len(others) == 1 else f"{', '.join(others)} and {last}"
-    return f"{said[:1].upper()}{said[1:]} Expected to separate {rivals} by {number(told, 1)} nats."
+    return f"{said[:1].upper()}{said[1:]} Expected to separate {rivals} by {number_text(told, 1)} nats."
 
 
 def _hypothesis_label_in_words(label: str) -> str:
@@ -253,21 +255,21 @@ def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     credible = [hypothesis_in_words(_effects_in_label(label)) for label in diagnosis.judged.credible]
     return (
         *(
-            paragraph(_as_sentence(f"{effect_in_words(e.name)} ({probability(e.probability)}): {e.sentence}"))
+            paragraph(_as_sentence(f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}"))
             for e in diagnosis.effects
             if e.probability > _LIKELY
         ),
         table(
             ("explanation", "probability"),
             (
-                (hypothesis_in_words(h.effects), probability(h.probability))
+                (hypothesis_in_words(h.effects), probability_text(h.probability))
                 for h in diagnosis.hypotheses[:8]
                 if h.probability > 1e-3
             ),
         ),
         *_credible_set_elements(credible),
-        *_unknown_effect_candidates(diagnosis),
-        *_unlisted_corrections(diagnosis),
+        *_unknown_effect_elements(diagnosis),
+        *_unlisted_correction_elements(diagnosis),
         *_laplace_and_nested_table(diagnosis),
         *_effect_elements(diagnosis),
     )
@@ -285,20 +287,20 @@ def _credible_set_elements(names: Sequence[str]) -> tuple[Markup, ...]:
     return (element("details", summary, paragraph(f"{'; '.join(names)}.")),)
 
 
-def _unknown_effect_candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _unknown_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Build the paragraph on the likely candidates for an unknown effect; empty if none is likely."""
     likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
-    said = ", ".join(f"{_unknown_candidate_in_words(name)} ({probability(p)})" for name, p in likely)
+    said = ", ".join(f"{_unknown_candidate_in_words(name)} ({probability_text(p)})" for name, p in likely)
     return (paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {said}."),)
 
 
 def _unknown_candidate_in_words(name: str) -> str:
-    return effect_in_words(name) if effect_has_words(name) else family_words(name)
+    return effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)
 
 
-def _unlisted_corrections(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _unlisted_correction_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Build a paragraph for each correction in posterior samples of the repaired model that no explanation has."""
     return tuple(
         paragraph(_as_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
@@ -317,8 +319,8 @@ def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[Markup, ...]:
                 (
                     hypothesis_in_words(w.effects),
                     str(w.n_gaussians or "–"),
-                    number(w.laplace, 2),
-                    typeset(value_with_sd(w.nested, w.error)),
+                    number_text(w.laplace, 2),
+                    typeset_numbers(value_with_sd(w.nested, w.error)),
                     ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
                 )
                 for w in diagnosis.report.weighings
@@ -359,7 +361,7 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
     )
 
 
-def _gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     shown = (
         (
@@ -375,7 +377,7 @@ def _gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Ma
     )
     held = f"{_signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)} per reading"
     rms = f"{gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} {unit} after the repair"
-    repaired = (("log evidence gained", f"{number(gain.log_evidence, 1)} nats"), ("rms of the residuals", rms))
+    repaired = (("log evidence gained", f"{number_text(gain.log_evidence, 1)} nats"), ("rms of the residuals", rms))
     return (
         *shown,
         definition_list(
@@ -386,7 +388,7 @@ def _gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Ma
                     if diagnosis.repair.changes_predictions
                     else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)
                 ),
-                ("test for further missing effects", typeset(p_in_words(gain.p_value_after))),
+                ("test for further missing effects", typeset_numbers(p_in_words(gain.p_value_after))),
             )
         ),
     )
@@ -404,11 +406,13 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
     rows = (
-        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value_and_interval(p))
+        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value_and_interval_texts(p))
         for p in noise.parameters
     )
     return (
-        paragraph(typeset(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")),
+        paragraph(
+            typeset_numbers(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")
+        ),
         *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
         figure(
             drawn["noise.svg"],
@@ -431,10 +435,10 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
     rows = [
         (
             _effect_words_and_name(effect.name) if k == 0 else "",
-            probability(effect.probability) if k == 0 else "",
-            number(effect.size_lambda, 1) if k == 0 else "",
+            probability_text(effect.probability) if k == 0 else "",
+            number_text(effect.size_lambda, 1) if k == 0 else "",
             p.name.removesuffix(f"_{p.unit}").replace("_", " "),
-            *(_value_and_interval(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
+            *(_value_and_interval_texts(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
         )
         for effect in effects
         for k, p in enumerate(effect.parameters)
@@ -448,11 +452,13 @@ def _effect_words_and_name(name: str) -> str:
     return f"{said} ({name})" if said != name else name
 
 
-def _value_and_interval(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
+def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Return two texts: a parameter with its sd (and unit, if asked), and its 95 % interval."""
     low, high = found.interval95
     own = _unit_text(found) if unit else ""
-    return typeset(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
+    return typeset_numbers(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset_numbers(
+        f"{low:.4g} to {high:.4g}"
+    )
 
 
 def _unit_text(found: ParameterFound) -> str:
@@ -478,8 +484,8 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
         (
             (
                 " and ".join(map(effect_in_words, a.effects)),
-                number(a.cosine, 3),
-                typeset(a.settle_by),
+                number_text(a.cosine, 3),
+                typeset_numbers(a.settle_by),
                 _readings_needed_text(a.readings),
             )
             for a in aliases
@@ -493,7 +499,7 @@ def _readings_needed_text(n: int) -> str:
 
 
 def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
-    def joined(found: Sequence[str]) -> str:
+    def joined_or_none(found: Sequence[str]) -> str:
         return ", ".join(found).replace("_", " ") or "none"
 
     aliased = [f"{e.name} (with {e.alike[0][0]})" for e in audit.seen_as("aliased")]
@@ -501,12 +507,12 @@ def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     return (
         definition_list(
             (
-                ("fine (detected, and told from every other)", joined([e.name for e in audit.seen_as("fine")])),
+                ("fine (detected, and told from every other)", joined_or_none([e.name for e in audit.seen_as("fine")])),
                 (
                     "aliased (detected, but another effect can imitate it)",
-                    joined(aliased),
+                    joined_or_none(aliased),
                 ),
-                ("invisible (not detected)", joined([e.name for e in audit.seen_as("invisible")])),
+                ("invisible (not detected)", joined_or_none([e.name for e in audit.seen_as("invisible")])),
             )
         ),
         element("details", element("summary", "every effect, with numbers"), audit_table(audit.effects)),
@@ -515,13 +521,13 @@ def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
 
 
 def _as_sentence(text: str) -> str:
-    return typeset(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
+    return typeset_numbers(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
 
 
 def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
     """Return a place's caption: where residuals are significant, the p-value, whether a mean leaves the band."""
     run = diagnosis.apparatus.words.run
-    covariate, unit = covariate_words_and_unit(diagnosis, place.covariate)
+    covariate, unit = covariate_in_words_and_unit(diagnosis, place.covariate)
     if place.covariate == run:
         what = f"{run} {place.scan}"
     elif place.start is None or place.end is None:
@@ -534,4 +540,4 @@ def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> 
         what += f", {run} {place.scan}"
     chance = "" if place.p_value < ALARM else ", possibly chance"
     hidden = "" if seen else " No mean leaves the band: residuals that change sign, or only scatter, average to zero."
-    return typeset(f"Significant residuals: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")
+    return typeset_numbers(f"Significant residuals: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")

@@ -14,16 +14,16 @@ from probewise.report.covariate import axis_label, covariate_values_by_place
 from probewise.report.covariate_view import (
     CovariateView,
     ResidualNoise,
-    choose_first_view,
-    is_along_line,
+    choose_first_figure_view,
+    is_scan_along_line,
+    view_along_place_covariate,
     view_along_scan,
-    view_of_place,
 )
 from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
-    gain_by_scan,
+    heldout_gain_by_scan,
     hypothesis_probabilities,
-    lost_readings,
+    lost_readings_against_predicted,
     mean_residuals_along,
     readings_in_order,
     readings_modulo_step,
@@ -59,7 +59,7 @@ def encoded_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
         drawn["gain.svg"] = svg(
-            gain_by_scan(
+            heldout_gain_by_scan(
                 gain.heldout_by_scan,
                 gain.heldout_log_density_per_reading,
                 gain.heldout_sd,
@@ -82,7 +82,7 @@ def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = No
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
         return max(diagnosis.combination, key=lambda name: sizes.get(name, 0.0))
-    return choose_first_view(diagnosis, ResidualNoise.of_diagnosis(diagnosis) if chance is None else chance)
+    return choose_first_figure_view(diagnosis, ResidualNoise.of_diagnosis(diagnosis) if chance is None else chance)
 
 
 def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
@@ -115,7 +115,7 @@ def _place_svg(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: Fl
     A whole scan or run is drawn along X, Y, time or rows, which shows residuals that change sign, and below that beside
     the others.
     """
-    by_covariate = view_of_place(diagnosis, place, at)
+    by_covariate = view_along_place_covariate(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         axes = stack_of_axes([2.6])
     else:
@@ -162,7 +162,7 @@ def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
     models = models if diagnosis.repair.changes_predictions else models[:1]
     return svg(
         scan_with_residuals(
-            shown.at[rows], readings, models, joined=is_along_line(plan, rows), label=shown.label, unit=unit
+            shown.at[rows], readings, models, joined=is_scan_along_line(plan, rows), label=shown.label, unit=unit
         )
     )
 
@@ -175,7 +175,7 @@ def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntA
     `change` is the change of each predicted reading, (n_points,).
     """
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
-    lines = [rows for rows in scans if is_along_line(plan, rows)]
+    lines = [rows for rows in scans if is_scan_along_line(plan, rows)]
     return max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
 
 
@@ -211,7 +211,9 @@ def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) 
         lost &= np.abs(residuals) > _LOST * float(chance.sd.mean())
         residuals[lost] = np.nan
         if name == "dropouts":
-            return lambda ax: lost_readings(diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax)
+            return lambda ax: lost_readings_against_predicted(
+                diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax
+            )
     if name == "quantisation" and "step" in found:
         return lambda ax: readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
     if name in ("correlated_noise", "random_walk"):

@@ -12,7 +12,7 @@ from probewise.report.html import Section, figure, paragraph, table
 from probewise.report.paper_view import window_mm
 from probewise.report.plots import PAGE_IN, draw_field_legend, effect_probabilities_by_reading, grid_of_axes, png
 from probewise.report.robot_search import RobotSearch
-from probewise.report.words import count, number
+from probewise.report.words import count_with_noun, number_text
 
 SATURATION = 40.0
 """Reading at which the concealed effect of the demo, saturation, sets in; the model expects 60 over white."""
@@ -21,8 +21,8 @@ SATURATION = 40.0
 def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     """Say in one sentence how both robots ended, the trusting one first."""
     trusting, doubting = (
-        f"{count(len(s.run.steps), 'reading')}, off by {number(s.largest_error_mm, 1)} mm "
-        f"(posterior sd up to {number(s.run.last.largest_sd_mm, 1)} mm)"
+        f"{count_with_noun(len(s.run.steps), 'reading')}, off by {number_text(s.largest_error_mm, 1)} mm "
+        f"(posterior sd up to {number_text(s.run.last.largest_sd_mm, 1)} mm)"
         for s in searches
     )
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
@@ -36,8 +36,8 @@ def encoded_figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
     axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.4 + 3.3 * (high - low) / (right - left)))
     for ax, search in zip(axes[0], searches, strict=True):
         places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in search.run.readings]
-        title = f"{search.model} robot, after {count(len(places), 'reading')}"
-        exploration_report.view(
+        title = f"{search.model} robot, after {count_with_noun(len(places), 'reading')}"
+        exploration_report.draw_robot_view(
             search.run.last,
             search.run.experiment,
             places,
@@ -58,9 +58,10 @@ def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Sect
     missing = left_out_after_step(doubting.last, doubting.experiment.trust)
     introduction = paragraph(
         f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
-        f"{number(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. The other "
-        f"expects with probability {1 - doubting.experiment.trust:.1g} that an effect is missing; it compares the "
-        f"plain model with each effect that could act, and chooses its readings and its end under all of them."
+        f"{number_text(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. "
+        f"The other expects with probability {1 - doubting.experiment.trust:.1g} that an effect is missing; "
+        "it compares the plain model with each effect that could act, and chooses its readings and its end under all "
+        "of them."
     )
     rows = table(
         ("robot", "readings", "largest error", "widest posterior sd", "stopped because"),
@@ -68,8 +69,8 @@ def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Sect
             (
                 s.model,
                 str(len(s.run.steps)),
-                f"{number(s.largest_error_mm, 1)} mm",
-                f"{number(s.run.last.largest_sd_mm, 1)} mm",
+                f"{number_text(s.largest_error_mm, 1)} mm",
+                f"{number_text(s.run.last.largest_sd_mm, 1)} mm",
                 s.run.stop_reason,
             )
             for s in searches

@@ -29,7 +29,16 @@ from probewise.report.plots import (
     png,
     posterior_widths,
 )
-from probewise.report.words import count, interval, number, probability, unit_name, unit_of, with_error, without_unit
+from probewise.report.words import (
+    count_with_noun,
+    interval_text,
+    number_text,
+    probability_text,
+    unit_name,
+    unit_of,
+    value_with_error,
+    without_unit,
+)
 from probewise.scene import AnyOf, outlines, with_angles_near
 
 MODEL_NAMES = {"ssf": "SSF"}
@@ -37,7 +46,7 @@ _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
 _MOST_SHOWN = 6
 
 
-def view(
+def draw_robot_view(
     step: Step,
     experiment: Experiment,
     readings: Sequence[tuple[float, float, float]],
@@ -78,9 +87,13 @@ def view(
         truth_mm=truth_mm,
         cards_mm=[card.corners_mm for card in experiment.cards],
         utility_label=step.map.label,
-        title=title or f"after {count(step.number, 'reading')}, {number(step.bits, 1)} bits known",
+        title=title or f"after {count_with_noun(step.number, 'reading')}, {number_text(step.bits, 1)} bits known",
         ax=ax,
     )
+
+
+view = draw_robot_view
+"""The old name of `draw_robot_view`."""
 
 
 def robot_view_png(
@@ -91,13 +104,13 @@ def robot_view_png(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the robot's view after one step, with its legend, as a PNG; parameters as in `view`."""
-    ax = view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
+    """Draw the robot's view after one step, with its legend, as a PNG; parameters as in `draw_robot_view`."""
+    ax = draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
     draw_field_legend(ax)
     return png(ax, dpi=90, tight=False)
 
 
-def robot_views_png(
+def robot_views_by_model_png(
     views: Sequence[tuple[str, Step, Experiment]],
     readings: Sequence[tuple[float, float, float]],
     *,
@@ -106,12 +119,12 @@ def robot_views_png(
 ) -> bytes:
     """Draw the posteriors of several sensor models from the same readings, one below the other, as a PNG.
 
-    Each view is a title, a step and the experiment it belongs to; the rest is as in `view`.
+    Each view is a title, a step and the experiment it belongs to; the rest is as in `draw_robot_view`.
     """
     axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
-        known = f"{title}, {count(step.number, 'reading')}, {number(step.bits, 1)} bits"
-        view(step, experiment, readings, levels=levels, truth_mm=truth_mm, title=known, ax=ax)
+        known = f"{title}, {count_with_noun(step.number, 'reading')}, {number_text(step.bits, 1)} bits"
+        draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, title=known, ax=ax)
     draw_field_legend(axes)
     return png(axes, dpi=75, tight=False)
 
@@ -146,7 +159,7 @@ def _fault_section(steps: Sequence[Step], trust: float) -> Section:
             ),
             table(
                 ("left out", "probability"),
-                (("nothing" if n == CLEAN else spoken_name(n), probability(p)) for n, p in named[:_MOST_SHOWN]),
+                (("nothing" if n == CLEAN else spoken_name(n), probability_text(p)) for n, p in named[:_MOST_SHOWN]),
             ),
         ),
     )
@@ -156,7 +169,8 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, with the posterior sd; those without a truth are left out."""
     step, truth = run.last, _truth_near_estimate(run, truth)
     return ", ".join(
-        f"{without_unit(_without_shape(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
+        f"{without_unit(_without_shape_prefix(step, name))} "
+        f"{value_with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
@@ -179,14 +193,16 @@ def _truth_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[s
 def summary_sentence(run: Exploration) -> str:
     """Summarise in one sentence: the number of readings, the shape found, and its parameters."""
     found = found_shape(run)
-    several = f" (probability {probability(found.probability)})" if run.last.shapes else ""
-    known = ", ".join(f"{without_unit(p.name)} {with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters)
+    several = f" (probability {probability_text(found.probability)})" if run.last.shapes else ""
+    known = ", ".join(
+        f"{without_unit(p.name)} {value_with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters
+    )
     if not run.reached:
-        taken = count(len(run.steps), "reading")
+        taken = count_with_noun(len(run.steps), "reading")
         return (
             f"Not found to the target precision in {taken}; so far {_with_article(found.name)}{several} with {known}."
         )
-    return f"Found in {count(len(run.steps), 'reading')}: {_with_article(found.name)}{several} with {known}."
+    return f"Found in {count_with_noun(len(run.steps), 'reading')}: {_with_article(found.name)}{several} with {known}."
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
@@ -201,9 +217,9 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
             (
                 without_unit(p.name),
                 unit_of(p.name),
-                *with_error(p.mean, p.sd).partition(" ± ")[::2],
+                *value_with_error(p.mean, p.sd).partition(" ± ")[::2],
                 *(() if p.arm_sd is None else (f"{p.arm_sd:.2g}",)),
-                interval(*p.interval95),
+                interval_text(*p.interval95),
                 *((f"{short[p.name]:.6g}" if p.name in short else "–",) if truth else ()),
             )
             for p in found.parameters
@@ -220,10 +236,11 @@ def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
         (
             (
                 str(s.number),
-                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.orientation_and_height_text}",
+                f"{number_text(s.reading.pose.x_mm, 0)}, {number_text(s.reading.pose.y_mm, 0)}"
+                f"{s.orientation_and_height_text}",
                 f"{s.reading.value:g}",
-                number(s.largest_sd_mm, 1),
-                number(s.bits, 1),
+                number_text(s.largest_sd_mm, 1),
+                number_text(s.bits, 1),
             )
             for s in run.steps
         ),
@@ -259,16 +276,19 @@ def page_html(
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
-    spent = f"{count(len(run.steps), 'reading')}, {number(run.seconds, 0)} s of arm time"
-    gained = f"{number(run.last.bits, 1)} bits, {number(run.bits_per_reading, 2)} per reading"
-    off = probability(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
+    spent = f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time"
+    gained = f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading"
+    off = probability_text(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
     facts = [
         ("sensor model", MODEL_NAMES.get(model, model)),
         ("inference", run.experiment.inference_method.label),
         ("stopped because", run.stop_reason),
         ("cost", spent),
         ("information", gained),
-        ("the paper's count", f"{number(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"),
+        (
+            "the paper's count",
+            f"{number_text(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)",
+        ),
         (f"probability that a length is off by over {OFF_MM:g} mm", off),
         ("fit of the best hypothesis", _fit_in_words(run.last.p_value)),
         ("seed", str(seed)),
@@ -276,11 +296,11 @@ def page_html(
     if truth:
         facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run, truth)))
     sensor = [
-        (without_unit(name), unit_of(name), *with_error(mean, sd).partition(" ± ")[::2])
+        (without_unit(name), unit_of(name), *value_with_error(mean, sd).partition(" ± ")[::2])
         for name, (mean, sd) in run.last.sensor.items()
     ]
     learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)
-    shapes = (table(("shape", "probability"), ((n, probability(p)) for n, p in run.last.shapes.items())),)
+    shapes = (table(("shape", "probability"), ((n, probability_text(p)) for n, p in run.last.shapes.items())),)
     sections = [
         Section(
             "The shape and what it cost",
@@ -338,7 +358,7 @@ def _fit_in_words(p_value: float) -> str:
     return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
 
 
-def _without_shape(step: Step, name: str) -> str:
+def _without_shape_prefix(step: Step, name: str) -> str:
     """Drop the shape's name in front of a parameter name."""
     return name.removeprefix(f"{step.likely_shape}.")
 

@@ -10,8 +10,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import predicted_and_recorded, residuals_against_covariates, svg
-from probewise.report.words import number, typeset, unit_name
+from probewise.report.plots import recorded_against_predicted, residuals_against_covariates, svg
+from probewise.report.words import number_text, typeset_numbers, unit_name
 from probewise.systems import RunTable
 
 _MOST_COLUMNS = 6
@@ -32,14 +32,14 @@ def encoded_figures(fit: SystemFit) -> dict[str, bytes]:
     """
     recording, own = fit.recording, fit.fitted.simulator
     unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
-    drawn = svg(predicted_and_recorded(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
+    drawn = svg(recorded_against_predicted(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
     clouds = residuals_against_covariates(
-        _labelled_columns(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
+        _labelled_covariates(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
     )
     return {"predicted.svg": drawn, "residuals.svg": svg(clouds)}
 
 
-def _labelled_columns(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
+def _labelled_covariates(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
     own = fit.fitted.simulator
     time = f"{plan.time} ({own.time_unit})" if plan.has_varying_time else "row of the table"
     out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]
@@ -52,17 +52,21 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     """Return the page's HTML; `drawn` is from `encoded_figures`."""
     own, evidence = fit.fitted, fit.evidence
     median, interval = np.median(own.samples, axis=0), own.interval()
-    error = f" ± {number(evidence.error, 2)}" if evidence.error else ""
+    error = f" ± {number_text(evidence.error, 2)}" if evidence.error else ""
     how = f"; {evidence.reason}" if evidence.reason else ""
     rows = [
-        (name, typeset(f"{median[k]:.5g}"), typeset(f"{interval[name][0]:.5g} to {interval[name][1]:.5g}"))
+        (
+            name,
+            typeset_numbers(f"{median[k]:.5g}"),
+            typeset_numbers(f"{interval[name][0]:.5g} to {interval[name][1]:.5g}"),
+        )
         for k, name in enumerate(own.names)
     ]
     run = (
         ("readings", f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}"),
         ("simulator", own.simulator.source or "given in Python"),
         ("noise sd of a reading", f"{np.median(own.noise_sd):.4g} {unit_name(own.simulator.unit)}"),
-        ("log evidence", f"{number(evidence.log_z, 2)}{error} nats by {evidence.method}{how}"),
+        ("log evidence", f"{number_text(evidence.log_z, 2)}{error} nats by {evidence.method}{how}"),
         ("seed", str(seed)),
     )
     return page(

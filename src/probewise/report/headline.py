@@ -8,9 +8,9 @@ import numpy as np
 
 from probewise.diagnosis import ALARM, Diagnosis
 from probewise.effects import UNNAMED
-from probewise.report.covariate import covariate_words_and_unit
+from probewise.report.covariate import covariate_in_words_and_unit
 from probewise.report.effect_words import effect_in_words, hypothesis_in_words, join_names
-from probewise.report.words import count
+from probewise.report.words import count_with_noun
 
 MOST_WORDS = 20
 _SURE = 0.5
@@ -27,7 +27,7 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
     """List versions of the verdict, the most complete first; the last is always short enough."""
     n = int(diagnosis.recording.usable.sum())
     if diagnosis.judged.too_little:
-        return [_too_little_sentence(diagnosis, n)]
+        return [_too_few_readings_sentence(diagnosis, n)]
     match diagnosis.verdict:
         case "clean" if diagnosis.p_value < ALARM:
             return ["These readings look unusual, but nothing that was tried explains them better than the model."]
@@ -45,11 +45,11 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
             return [" ".join([one, *more]) for one in said] + said
 
 
-def _too_little_sentence(diagnosis: Diagnosis, n: int) -> str:
+def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:
     seen = diagnosis.recording.readings[diagnosis.recording.usable]
     if n > 1 and float(np.ptp(seen)) == 0.0:
         return f"All {n} readings are equal: there is no signal to diagnose."
-    return f"{count(n, 'reading').capitalize()} {'is' if n == 1 else 'are'} too few for a diagnosis."
+    return f"{count_with_noun(n, 'reading').capitalize()} {'is' if n == 1 else 'are'} too few for a diagnosis."
 
 
 def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
@@ -67,7 +67,7 @@ def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
 def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
-    covariate, _ = covariate_words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
+    covariate, _ = covariate_in_words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
     known = [effect_in_words(e.name) for e in diagnosis.effects if e.probability >= _SURE]
     short = "Something is missing that no known effect explains"
     plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short

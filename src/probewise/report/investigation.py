@@ -12,8 +12,8 @@ from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, probabilities_by_round
-from probewise.report.terms import explain_new_terms, with_explanations
-from probewise.report.words import count, probability, typeset
+from probewise.report.terms import explain_new_terms, sections_with_terms_explained
+from probewise.report.words import count_with_noun, probability_text, typeset_numbers
 
 _MOST_TOLD = 4
 _LEAST_TOLD = 0.005
@@ -34,7 +34,9 @@ def probabilities_figure_html(found: Investigation) -> Markup:
 def summary_sentence(found: Investigation) -> str:
     """Return the last verdict in words, the number of readings beyond the first plan, and whether they settled it."""
     extra = found.extra_readings
-    taken = f"{count(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
+    taken = (
+        f"{count_with_noun(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
+    )
     came = "settled it" if found.last.settled else "did not settle it"
     return f"{headline(found.last.diagnosis)} {taken} {came}."
 
@@ -67,7 +69,10 @@ def page_html(
     run = definition_list(
         (
             ("arm", source),
-            ("readings", f"{sum(len(each.recording) for each in found.rounds)} in {count(len(found.rounds), 'round')}"),
+            (
+                "readings",
+                f"{sum(len(each.recording) for each in found.rounds)} in {count_with_noun(len(found.rounds), 'round')}",
+            ),
             ("seed", str(seed)),
             *(
                 (("the world concealed", ", ".join(map(spoken_name, concealed)) or "nothing"),)
@@ -79,16 +84,17 @@ def page_html(
     known: set[str] = set()
     story = Section("How it came to that", (), tuple(_round_section(each) for each in found.rounds))
     details = Section("The diagnosis of all readings", (), tuple(of_a_diagnosis.sections(last.diagnosis, drawn)))
+    verdict, rounds = last.diagnosis.verdict.replace("_", " "), count_with_noun(len(found.rounds), "round")
     return page(
-        f"Investigation: {last.diagnosis.verdict.replace('_', ' ')} after {count(len(found.rounds), 'round')}",
+        f"Investigation: {verdict} after {rounds}",
         answer=summary_sentence(found),
         key_figure=fragment(bars, *explain_new_terms(bars, known)),
-        sections=with_explanations([story, details, Section("This run", (run,))], known),
+        sections=sections_with_terms_explained([story, details, Section("This run", (run,))], known),
     )
 
 
 def _round_title(each: Round) -> str:
-    n = count(len(each.recording), "reading")
+    n = count_with_noun(len(each.recording), "reading")
     return f"round {each.number}: {n}" if each.number == 1 else f"round {each.number}: {len(each.recording)} more"
 
 
@@ -116,9 +122,13 @@ def _round_section(each: Round) -> Section:
     else:
         then = f"Next readings: {asked.description}{between} (about {asked.minutes:.0f} minutes)."
     said: tuple[Markup, ...] = (
-        paragraph(typeset(f"{count(len(each.recording), 'reading').capitalize()} were taken, {why}.")),
-        paragraph(typeset(f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}.")),
-        table(("explanation", "probability"), ((name, probability(p)) for name, p in likely)),
-        paragraph(typeset(then)),
+        paragraph(
+            typeset_numbers(f"{count_with_noun(len(each.recording), 'reading').capitalize()} were taken, {why}.")
+        ),
+        paragraph(
+            typeset_numbers(f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}.")
+        ),
+        table(("explanation", "probability"), ((name, probability_text(p)) for name, p in likely)),
+        paragraph(typeset_numbers(then)),
     )
     return Section(_round_title(each)[:1].upper() + _round_title(each)[1:], said)

@@ -26,12 +26,12 @@ from probewise.report.plots import (
     hypothesis_probabilities,
     png,
     posterior_widths,
-    predicted_against_recorded,
-    predicted_and_recorded,
+    predicted_and_recorded_by_scan,
     readings_by_orientation,
+    recorded_against_predicted,
     spatial_sensitivity,
 )
-from probewise.report.words import count, unit_name, unit_of, with_error, without_unit
+from probewise.report.words import count_with_noun, unit_name, unit_of, value_with_error, without_unit
 from probewise.sensor import SSFField
 from probewise.systems import SystemPrediction
 from probewise.systems.table import RunRecording
@@ -63,15 +63,14 @@ def _ssf_field_html(value: SSFField) -> str:
 
 @render_html.register
 def _recording_html(value: Recording) -> str:
-    said = (
-        f"{count(len(value), 'reading')}, {int(value.usable.sum())} usable, {count(len(value.plan.scan_names), 'scan')}"
-    )
+    taken, scans = count_with_noun(len(value), "reading"), count_with_noun(len(value.plan.scan_names), "scan")
+    said = f"{taken}, {int(value.usable.sum())} usable, {scans}"
     return _div(figure(png(readings_by_orientation(value), dpi=DPI), said))
 
 
 @render_html.register
 def _run_recording_html(value: RunRecording) -> str:
-    return _div(paragraph(f"{value.summary()}; {count(len(value.plan.scan_names), 'run')}"))
+    return _div(paragraph(f"{value.summary()}; {count_with_noun(len(value.plan.scan_names), 'run')}"))
 
 
 @render_html.register
@@ -84,7 +83,7 @@ def _fitted_sensor_html(value: FittedSensor) -> str:
 
 @render_html.register
 def _calibration_html(value: Calibration) -> str:
-    drawn = calibration_report.draw_ssf_of_each_order(value)
+    drawn = calibration_report.draw_ssf_by_n_gaussians(value)
     return _div(
         paragraph(calibration_report.summary_sentence(value.sensor)),
         figure(png(drawn, dpi=DPI), "Mean SSF by number of Gaussians"),
@@ -107,11 +106,11 @@ def _nested_result_html(value: NestedResult) -> str:
 def _weighted_html(value: Weighted) -> str:
     names = value.names[:MOST_PARAMETERS]
     believed = zip(names, value.mean(), value.sd(), strict=False)
-    known = ", ".join(f"{without_unit(n)} {with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed)
+    known = ", ".join(f"{without_unit(n)} {value_with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed)
     drawn = corner_plot(value, parameters=names)
     return _div(
         figure(png(drawn, dpi=DPI), "Posterior: each parameter by itself, and each pair"),
-        paragraph(f"{known}; {count(len(value.theta), 'sample')}, effective sample size {value.n_eff:.0f}."),
+        paragraph(f"{known}; {count_with_noun(len(value.theta), 'sample')}, effective sample size {value.n_eff:.0f}."),
     )
 
 
@@ -142,14 +141,14 @@ def _exploration_html(value: Exploration) -> str:
 @render_html.register
 def _prediction_html(value: Prediction) -> str:
     recording = Recording(value.plan, value.readings)
-    drawn = predicted_against_recorded(recording, value.mean, value.sd)
+    drawn = predicted_and_recorded_by_scan(recording, value.mean, value.sd)
     said = value.summary().replace("\n", "; ")
     return _div(paragraph(said), figure(png(drawn, dpi=DPI), "Predicted readings, each with its 95 % band"))
 
 
 @render_html.register
 def _plan_audit_html(value: PlanAudit) -> str:
-    drawn = png(audit_report.detectability_figure(value), dpi=DPI)
+    drawn = png(audit_report.draw_detectability_and_aliases(value), dpi=DPI)
     text = _pre(value.summary())
     return _div(
         paragraph(audit_report.summary_sentence(value)), figure(drawn, "Detectability of effects, and aliases"), text
@@ -177,7 +176,7 @@ def _system_fit_html(value: SystemFit) -> str:
     own = value.fitted.simulator
     readings = np.where(value.recording.usable, value.recording.readings, np.nan)
     unit = unit_name(own.unit)
-    drawn = predicted_and_recorded(readings, value.predicted, value.sd, label=own.reading, unit=unit)
+    drawn = recorded_against_predicted(readings, value.predicted, value.sd, label=own.reading, unit=unit)
     return _div(
         paragraph(fit_report.summary_sentence(value)),
         figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."),
@@ -191,7 +190,7 @@ def _system_prediction_html(value: SystemPrediction) -> str:
     if not np.isfinite(value.readings).any():
         return _div(said)
     unit = unit_name(value.table.instrumentation.unit)
-    drawn = predicted_and_recorded(value.readings, value.mean, value.sd, label="reading", unit=unit)
+    drawn = recorded_against_predicted(value.readings, value.mean, value.sd, label="reading", unit=unit)
     return _div(figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."), said)
 
 

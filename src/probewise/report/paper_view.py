@@ -11,7 +11,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.experiment import Exploration
 from probewise.inquiry import Grid, UtilityMap, entropy_map
 from probewise.report.plots import playing_field
-from probewise.report.words import count
+from probewise.report.words import count_with_noun
 from probewise.scene import outlines
 
 _FINER = 2  # times as many places per side as the robot's grid, which is coarser than an edge is wide
@@ -77,7 +77,7 @@ def paper_view(
         next_mm=None if pose is None else (pose.x_mm, pose.y_mm),
         truth_mm=truth_mm,
         utility_label=drawn.label,
-        title=title or f"after {count(number, 'reading')}",
+        title=title or f"after {count_with_noun(number, 'reading')}",
         lego_scale=True,
         ax=ax,
     )

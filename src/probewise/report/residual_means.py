@@ -97,14 +97,16 @@ def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> 
     if values.size == 0:
         return []
     if window is None:
-        return _groups_of_part(values, np.arange(values.size), _LEAST_ROWS)
+        return _groups_of_given_rows(values, np.arange(values.size), _LEAST_ROWS)
     inside = (values >= window[0]) & (values <= window[1])
     least = int(np.clip(inside.sum(), 1, _LEAST_ROWS))
     parts = (values < window[0], inside, values > window[1])
-    return [group for part in parts if part.any() for group in _groups_of_part(values, np.flatnonzero(part), least)]
+    return [
+        group for part in parts if part.any() for group in _groups_of_given_rows(values, np.flatnonzero(part), least)
+    ]
 
 
-def _groups_of_part(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
+def _groups_of_given_rows(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
     """Group some of the rows, by equal steps of the covariate; in equal numbers where most rows share a few values."""
     mine = values[rows]
     share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)

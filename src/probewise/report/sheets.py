@@ -172,7 +172,7 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
             places = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
             turns = tuple(dict.fromkeys(np.radians(orientation_deg(plan)[rows]).tolist()))
         else:
-            places = np.concatenate([places, _extreme_points_of_pattern(pattern)])
+            places = np.concatenate([places, _points_sheet_must_show(pattern)])
         low = np.floor((places.min(axis=0) - AROUND_MM) / _ROUND_MM) * _ROUND_MM
         high = np.ceil((places.max(axis=0) + AROUND_MM) / _ROUND_MM) * _ROUND_MM
         lines = (where_white_in_words(pattern),)
@@ -214,7 +214,7 @@ def marks_sheet(geometry: Geometry) -> Sheet:
     return Sheet("marks", Uniform(1.0), (0.0, 0.0), geometry.field_mm, lines, crosses_mm=marks, frame=frame)
 
 
-def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
+def arm_home_jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     """Make the sheets that show an arm at its home angles: its links from the side, its base from above."""
     base, shoulder, elbow = (joint.home_rad for joint in geometry.joints)
     lower = shoulder + elbow if geometry.elbow_is_relative else elbow
@@ -225,7 +225,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     crosses = np.array([*joints, face])
     beams = [_beam_outline(a, b) for a, b in itertools.pairwise(joints)]
     drawn = np.concatenate([crosses, *beams, [[0.0, 0.0]]])
-    low, high = _corners_around(drawn, _JIG_MM)
+    low, high = _sheet_corners_around(drawn, _JIG_MM)
     if drawn[:, 1].min() >= 0:
         low = low[0], 0.0  # cut there, the sheet stands on the table
     middles = [(a + b) / 2 for a, b in itertools.pairwise(joints)]
@@ -261,7 +261,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     axis, out = np.array(geometry.axis_mm), float(face[0])
     along = np.array([math.cos(base), math.sin(base)])
     rest = axis + out * along
-    low, high = _corners_around(np.array([axis, rest]), _JIG_BASE_MM)
+    low, high = _sheet_corners_around(np.array([axis, rest]), _JIG_BASE_MM)
     x_low, y_low, x_high, y_high = *low, *high
     width, height = geometry.field_mm
     edges = [np.array([[max(x_low, 0.0), y], [min(x_high, width), y]]) for y in (0.0, height) if y_low < y < y_high]
@@ -297,7 +297,7 @@ def _beam_outline(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
     return np.concatenate([*ends, ends[0][:1]])
 
 
-def _corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _sheet_corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the lower left and upper right corner of a sheet that shows points, (n, 2), with a margin."""
     low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
@@ -314,7 +314,7 @@ def _n_pages_along(length_mm: float, room_mm: float) -> int:
     return 1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
 
 
-def _extreme_points_of_pattern(pattern: Pattern) -> FloatArray:
+def _points_sheet_must_show(pattern: Pattern) -> FloatArray:
     """Return places of a pattern that its sheet must show when there is no plan, (n, 2)."""
     match pattern:
         case Disc((x, y), radius):

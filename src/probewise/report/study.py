@@ -11,7 +11,7 @@ from probewise.experiment import least_readings
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, posterior_widths_of_runs, readings_needed
-from probewise.report.words import count, number, with_error
+from probewise.report.words import count_with_noun, number_text, value_with_error
 from probewise.study import LEAST_FOR_MEDIAN, REFERENCE, Estimate, Row, Study, Summary, experiment_of
 
 _COLUMNS: tuple[tuple[str, str], ...] = (
@@ -33,10 +33,10 @@ _INTERVALS = (
 def summary_sentence(study: Study) -> str:
     """Summarise the study's first row: mean and median readings, and the share of runs that reached the precision."""
     row, found = next(iter(study.table().items()))
-    share = "All" if found.reached.value == 1 else f"{number(100 * found.reached.value, 1)} % of the"
+    share = "All" if found.reached.value == 1 else f"{number_text(100 * found.reached.value, 1)} % of the"
     return (
-        f"{row.name[0].upper()}{row.name[1:]}: {with_error(found.mean.value, _half_width(found.mean))} readings on "
-        f"average, median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
+        f"{row.name[0].upper()}{row.name[1:]}: {value_with_error(found.mean.value, _half_width(found.mean))} readings "
+        f"on average, median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
     )
 
 
@@ -79,7 +79,13 @@ def lower_bound_table(study: Study) -> Markup | None:
             search = _bits_over_capacity(least.search_bits, least.search_capacity_bits)
             refinement = _bits_over_capacity(least.refinement_bits, least.capacity_bits)
             lines.append(
-                (row.name, search, _estimate_words(found.to_white), refinement, _estimate_words(found.after_white))
+                (
+                    row.name,
+                    search,
+                    _estimate_with_error_text(found.to_white),
+                    refinement,
+                    _estimate_with_error_text(found.after_white),
+                )
             )
     header = (
         "row",
@@ -152,11 +158,12 @@ def _readings_row(row: Row, found: Summary) -> tuple[str, ...]:
     return (
         row.name,
         str(found.n_runs),
-        f"{number(100 * reached.value, 1)} % ({number(100 * reached.low, 1)} to {number(100 * reached.high, 1)})",
-        _estimate_words(found.mean),
+        f"{number_text(100 * reached.value, 1)} % "
+        f"({number_text(100 * reached.low, 1)} to {number_text(100 * reached.high, 1)})",
+        _estimate_with_error_text(found.mean),
         _value_with_interval(found.median),
-        _estimate_words(found.to_white),
-        _estimate_words(found.after_white),
+        _estimate_with_error_text(found.to_white),
+        _estimate_with_error_text(found.after_white),
     )
 
 
@@ -169,27 +176,27 @@ def _value_with_interval(estimate: Estimate) -> str:
 def _information_row(row: Row, found: Summary) -> tuple[str, ...]:
     return (
         row.name,
-        _estimate_words(found.bits_each),
-        number(found.error_mm, 1),
-        f"{count(found.wrong, 'run')} ({number(found.wrong_expected, 1)}, {found.wrong_limit})",
-        _percent_words(found.held),
-        _estimate_words(found.arm_s),
-        number(found.cpu_s, 2),
+        _estimate_with_error_text(found.bits_each),
+        number_text(found.error_mm, 1),
+        f"{count_with_noun(found.wrong, 'run')} ({number_text(found.wrong_expected, 1)}, {found.wrong_limit})",
+        _percent_with_error_text(found.held),
+        _estimate_with_error_text(found.arm_s),
+        number_text(found.cpu_s, 2),
     )
 
 
 def _bits_over_capacity(bits: float, capacity_bits: float) -> str:
-    return f"{number(bits / capacity_bits, 1)} = {number(bits, 1)} / {number(capacity_bits, 2)}"
+    return f"{number_text(bits / capacity_bits, 1)} = {number_text(bits, 1)} / {number_text(capacity_bits, 2)}"
 
 
-def _estimate_words(estimate: Estimate) -> str:
+def _estimate_with_error_text(estimate: Estimate) -> str:
     half = _half_width(estimate)
-    return with_error(estimate.value, half) if half > 0 else number(estimate.value, 1)
+    return value_with_error(estimate.value, half) if half > 0 else number_text(estimate.value, 1)
 
 
-def _percent_words(estimate: Estimate) -> str:
+def _percent_with_error_text(estimate: Estimate) -> str:
     scaled = Estimate(100 * estimate.value, 100 * estimate.low, 100 * estimate.high)
-    return f"{_estimate_words(scaled)} %" if math.isfinite(estimate.value) else "–"
+    return f"{_estimate_with_error_text(scaled)} %" if math.isfinite(estimate.value) else "–"
 
 
 def _half_width(estimate: Estimate) -> float:

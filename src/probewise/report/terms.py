@@ -53,6 +53,6 @@ def explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
     return (paragraph(*parts, class_="terms"),) if parts else ()
 
 
-def with_explanations(sections: Sequence[Section], known: set[str]) -> list[Section]:
+def sections_with_terms_explained(sections: Sequence[Section], known: set[str]) -> list[Section]:
     """Return the sections, each with a paragraph on the terms that it is the first to use; add them to `known`."""
     return [replace(s, body=(*s.body, *explain_new_terms(" ".join((s.heading, *s.body)), known))) for s in sections]

@@ -9,12 +9,12 @@ _UNITS = {"mm": "mm", "rad": "rad", "deg": "°", "s": "s", "counts": "counts", "
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def number(value: float, digits: int) -> str:
+def number_text(value: float, digits: int) -> str:
     """Write a number with fixed decimals and a true minus sign; a dash for NaN."""
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
 
 
-def with_error(value: float, error: float, unit: str = "") -> str:
+def value_with_error(value: float, error: float, unit: str = "") -> str:
     """Write a value with its error, both to the error's second significant digit, so that no error shows as zero.
 
     A dash if the value is not finite; the value alone if the error is not above zero.
@@ -24,13 +24,13 @@ def with_error(value: float, error: float, unit: str = "") -> str:
     if not (math.isfinite(error) and error > 0):
         written = f"{value:.6g}"
     elif -6 < (digits := 1 - math.floor(math.log10(error))) <= 8:
-        written = f"{number_unsigned_zero(value, max(digits, 0))} ± {number(error, max(digits, 0))}"
+        written = f"{number_unsigned_zero(value, max(digits, 0))} ± {number_text(error, max(digits, 0))}"
     else:
         written = f"{value:.3g} ± {error:.1g}"
-    return typeset(f"{written} {unit}".rstrip()).replace("-", "−")
+    return typeset_numbers(f"{written} {unit}".rstrip()).replace("-", "−")
 
 
-def interval(low: float, high: float) -> str:
+def interval_text(low: float, high: float) -> str:
     """Write the ends of an interval, both to the third significant digit of its width."""
     width = high - low
     if not (math.isfinite(width) and width > 0):
@@ -39,9 +39,9 @@ def interval(low: float, high: float) -> str:
     return f"{number_unsigned_zero(low, digits)} to {number_unsigned_zero(high, digits)}"
 
 
-def value_and_interval(value: float, low: float, high: float) -> tuple[str, str]:
+def value_and_interval_texts(value: float, low: float, high: float) -> tuple[str, str]:
     """Return texts of a value and of its interval, to the third significant digit of the interval's width."""
-    ends = interval(low, high)
+    ends = interval_text(low, high)
     decimals = len(ends.partition(" ")[0].partition(".")[2])
     return (number_unsigned_zero(value, decimals) if high > low else f"{value:.6g}"), ends
 
@@ -59,11 +59,11 @@ def without_unit(name: str) -> str:
 
 
 def number_unsigned_zero(value: float, digits: int) -> str:
-    """Write a number with fixed decimals as `number` does, but without a minus sign if it rounds to zero."""
-    return number(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
+    """Write a number with fixed decimals as `number_text` does, but without a minus sign if it rounds to zero."""
+    return number_text(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
 
 
-def typeset(text: str) -> str:
+def typeset_numbers(text: str) -> str:
     """Typeset the numbers in a text: 2 × 10⁻⁷ for 2e-07, true minus signs, no line break within "p = 0.2"."""
 
     def power_of_ten(found: re.Match[str]) -> str:
@@ -73,7 +73,7 @@ def typeset(text: str) -> str:
     return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power_of_ten, together))
 
 
-def count(n: int, noun: str) -> str:
+def count_with_noun(n: int, noun: str) -> str:
     """Write a count with its noun, in the plural if needed."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
@@ -83,7 +83,7 @@ def unit_name(unit: str) -> str:
     return "LEGO units" if unit == "LEGO" else unit
 
 
-def probability(p: float) -> str:
+def probability_text(p: float) -> str:
     """Write a probability with three decimals; as a bound, "< 0.001" or "> 0.999", near 0 and 1."""
     if p < 0.001:
         return "< 0.001"

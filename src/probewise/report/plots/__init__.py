@@ -16,29 +16,29 @@ from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_a
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
 from probewise.report.plots.concealed import doubt_against_trust
 from probewise.report.plots.doubt import effect_probabilities_by_reading
-from probewise.report.plots.fit import predicted_and_recorded
+from probewise.report.plots.fit import recorded_against_predicted
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.noise import (
-    lost_readings,
+    lost_readings_against_predicted,
     readings_modulo_step,
     residual_autocorrelation,
     residual_histogram,
     spread_by_level,
 )
 from probewise.report.plots.patterns import quadrant_patterns, sensor_orientations
-from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
+from probewise.report.plots.prediction import predicted_and_recorded_by_scan, residuals_against, standardised_residuals
 from probewise.report.plots.progress import information_gained, posterior_widths
 from probewise.report.plots.readings import readings_by_orientation
 from probewise.report.plots.residuals import (
-    gain_by_scan,
+    heldout_gain_by_scan,
     mean_residuals_along,
     readings_in_order,
     residuals_against_covariates,
     scan_with_residuals,
 )
-from probewise.report.plots.scans import before_and_after, residuals_by_scan
+from probewise.report.plots.scans import readings_before_and_after_repair, residuals_by_scan
 from probewise.report.plots.scene import draw_field_legend, playing_field
-from probewise.report.plots.ssf import spatial_sensitivity, ssf_by_order
+from probewise.report.plots.ssf import spatial_sensitivity, ssf_by_n_gaussians
 from probewise.report.plots.study import posterior_widths_of_runs, readings_needed
 from probewise.report.plots.verdict import hypothesis_probabilities, probabilities_by_round
 
@@ -48,33 +48,32 @@ __all__ = [
     "AxesGrid",
     "arm_and_sensor",
     "audit_matrix",
-    "before_and_after",
-    "calibration_check",
     "confusion_matrix",
     "corner_plot",
     "doubt_against_trust",
     "draw_field_legend",
     "effect_probabilities_by_reading",
-    "gain_by_scan",
     "grid_of_axes",
+    "heldout_gain_by_scan",
     "hypothesis_probabilities",
     "information_gained",
     "insertion_plot",
-    "lost_readings",
+    "lost_readings_against_predicted",
     "mean_residuals_along",
     "playing_field",
     "png",
     "posterior_widths",
     "posterior_widths_of_runs",
-    "predicted_against_recorded",
-    "predicted_and_recorded",
+    "predicted_and_recorded_by_scan",
     "probabilities_by_round",
     "quadrant_patterns",
     "reach_map",
+    "readings_before_and_after_repair",
     "readings_by_orientation",
     "readings_in_order",
     "readings_modulo_step",
     "readings_needed",
+    "recorded_against_predicted",
     "reliability_diagram",
     "residual_autocorrelation",
     "residual_histogram",
@@ -86,8 +85,9 @@ __all__ = [
     "sensor_orientations",
     "spatial_sensitivity",
     "spread_by_level",
-    "ssf_by_order",
+    "ssf_by_n_gaussians",
     "stack_of_axes",
+    "standardised_residuals",
     "svg",
     "trace_plot",
 ]
@@ -121,3 +121,24 @@ correlation_of_neighbours = residual_autocorrelation
 
 lattice_of_readings = readings_modulo_step
 """The old name of `readings_modulo_step`."""
+
+ssf_by_order = ssf_by_n_gaussians
+"""The old name of `ssf_by_n_gaussians`."""
+
+calibration_check = standardised_residuals
+"""The old name of `standardised_residuals`."""
+
+gain_by_scan = heldout_gain_by_scan
+"""The old name of `heldout_gain_by_scan`."""
+
+before_and_after = readings_before_and_after_repair
+"""The old name of `readings_before_and_after_repair`."""
+
+predicted_against_recorded = predicted_and_recorded_by_scan
+"""The old name of `predicted_and_recorded_by_scan`."""
+
+predicted_and_recorded = recorded_against_predicted
+"""The old name of `recorded_against_predicted`."""
+
+lost_readings = lost_readings_against_predicted
+"""The old name of `lost_readings_against_predicted`."""

@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, SMALL_PT, axes_or_new, label_axes
 from probewise.report.plots.scene import add_colour_bar, paint_out_of_reach
-from probewise.report.words import number
+from probewise.report.words import number_text
 
 _LINES_DEG = 15.0  # step between contours of equal orientation
 
@@ -89,4 +89,4 @@ def _contour_levels_deg(degrees: FloatArray) -> FloatArray:
 
 def _angle_text(degrees: float) -> str:
     """Write an angle, taken to between -180 and 180 degrees, without decimals and with a true minus sign."""
-    return number((degrees + 180.0) % 360.0 - 180.0, 0)
+    return number_text((degrees + 180.0) % 360.0 - 180.0, 0)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from probewise._kinds import require_kind
 from probewise.errors import ShapeError
 from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
-from probewise.report.words import typeset
+from probewise.report.words import typeset_numbers
 
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
 __all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "axes_or_new", "grid_of_axes"]
@@ -181,15 +181,15 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
         borderaxespad=0.1,
         columnspacing=1.2,
     )
-    return max(map(len, _lines_of_legend_columns(labels, n_columns)))
+    return max(map(len, _legend_lines_by_column(labels, n_columns)))
 
 
 def _legend_width_letters(labels: Sequence[str], n_columns: int) -> int:
     """Estimate a legend's width in letters."""
-    return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _lines_of_legend_columns(labels, n_columns))
+    return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _legend_lines_by_column(labels, n_columns))
 
 
-def _lines_of_legend_columns(labels: Sequence[str], n_columns: int) -> list[list[str]]:
+def _legend_lines_by_column(labels: Sequence[str], n_columns: int) -> list[list[str]]:
     """Return the lines of text in each column of a legend, which matplotlib fills from the left."""
     columns = np.array_split(np.array(labels, dtype=np.object_), n_columns)
     return ["\n".join(column).split("\n") for column in columns]
@@ -205,7 +205,9 @@ def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
             axis.set_major_formatter(in_full)
         else:
             digits = 3 - math.floor(math.log10(max(high - low, 1e-300)))
-            axis.set_major_formatter(FuncFormatter(lambda v, _, digits=digits: typeset(f"{round(v, digits) + 0.0:g}")))
+            axis.set_major_formatter(
+                FuncFormatter(lambda v, _, digits=digits: typeset_numbers(f"{round(v, digits) + 0.0:g}"))
+            )
 
 
 def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:

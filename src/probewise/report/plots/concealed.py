@@ -27,7 +27,7 @@ _PANELS = (
 )
 
 
-def row_name(row: ConcealedRow) -> str:
+def effect_and_size_in_words(row: ConcealedRow) -> str:
     """Name a row: the concealed effect in words, and its size."""
     name = effect_in_words(row.concealed) if effect_has_words(row.concealed) else row.concealed.replace("_", " ")
     return name if row.size is None else f"{name}, {row.size:g}"
@@ -47,7 +47,7 @@ def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None =
     -------
     Axes, (1, 3).
     """
-    names = list(dict.fromkeys(row_name(row) for row in rows))
+    names = list(dict.fromkeys(effect_and_size_in_words(row) for row in rows))
     own = axes is None
     axes = axes_or_grid(axes, 1, 3, size_in=(PAGE_IN, 1.7 + 0.32 * len(names)), sharey=True)
     arms: Mapping[str, tuple[list[ConcealedRow], str, str, float]] = {
@@ -56,7 +56,7 @@ def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None =
     }
     for ax, (field, title, x) in zip(axes[0], _PANELS, strict=True):
         for label, (those, colour, marker, shift) in arms.items():
-            y = np.array([names.index(row_name(row)) for row in those]) + shift
+            y = np.array([names.index(effect_and_size_in_words(row)) for row in those]) + shift
             values = [getattr(row, field) for row in those]
             style = {"fmt": marker, "color": colour, "markersize": 4.5, "label": label}
             if all(isinstance(value, Estimate) for value in values):

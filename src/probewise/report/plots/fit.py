@@ -9,7 +9,7 @@ from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, BLUE, label_axes, legend_above, stack_of_axes
 
 
-def predicted_and_recorded(
+def recorded_against_predicted(
     readings: FloatArray, predicted: FloatArray, sd: FloatArray, *, label: str, unit: str, ax: Axes | None = None
 ) -> Axes:
     """Draw each reading against its prediction, with one sd of a new reading.

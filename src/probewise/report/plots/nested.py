@@ -32,7 +32,7 @@ from probewise.report.plots.canvas import (
     label_axes,
     new_figure,
 )
-from probewise.report.words import unit_of, value_and_interval, with_error, without_unit
+from probewise.report.words import unit_of, value_and_interval_texts, value_with_error, without_unit
 
 Posterior: TypeAlias = NestedResult | Weighted
 
@@ -302,7 +302,7 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
 
 
 def _evidence_text(result: Posterior) -> str:
-    return f"ln Z = {with_error(result.log_z, result.log_z_error)}"
+    return f"ln Z = {value_with_error(result.log_z, result.log_z_error)}"
 
 
 def _checked_parameter_columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
@@ -380,7 +380,7 @@ def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, 
     if titled:
         median = float(result.quantiles([0.5])[0, column])
         low, high = (float(end) for end in cuts[0])
-        ax.set_title("\n".join(value_and_interval(median, low, high)), fontsize=SMALL_PT)
+        ax.set_title("\n".join(value_and_interval_texts(median, low, high)), fontsize=SMALL_PT)
 
 
 def _draw_pair(

@@ -129,7 +129,7 @@ def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = No
     return ax
 
 
-def lost_readings(
+def lost_readings_against_predicted(
     predicted: FloatArray, readings: FloatArray, lost: BoolArray, *, unit: str, ax: Axes | None = None
 ) -> Axes:
     """Draw recorded against predicted readings, (n_points,) each; those where the mask `lost` is True are marked."""

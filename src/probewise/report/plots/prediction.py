@@ -29,7 +29,7 @@ from probewise.report.words import unit_name
 MAX_PANELS = 8
 
 
-def predicted_against_recorded(
+def predicted_and_recorded_by_scan(
     recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: AxesGrid | None = None
 ) -> AxesGrid:
     """Draw recorded and predicted readings with the 95 % band of new readings (paper, figure 7).
@@ -107,13 +107,13 @@ def _draw_single_readings(ax: Axes, recording: Recording, rows: IntArray, mean: 
     ax.margins(x=0.15)
 
 
-def calibration_check(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
+def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
     """Draw standardised residuals in order of time; 95 % should lie between the dashed lines.
 
     Parameters
     ----------
     recording, mean, sd
-        As for `predicted_against_recorded`.
+        As for `predicted_and_recorded_by_scan`.
     ax
         Axes to draw on; a new figure without.
     """

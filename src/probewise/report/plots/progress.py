@@ -10,7 +10,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, CYCLE, SMALL_PT, axes_or_new, label_axes, legend_above
-from probewise.report.words import count
+from probewise.report.words import count_with_noun
 
 
 def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
@@ -28,7 +28,9 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
     ax = axes_or_new(ax, size_in=(6.4, 3.6))
     for (name, sd), colour in zip(widths_mm.items(), CYCLE, strict=False):
         number = np.arange(1, len(sd) + 1)
-        ax.plot(number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {count(len(sd), 'reading')}")
+        ax.plot(
+            number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {count_with_noun(len(sd), 'reading')}"
+        )
     legend_above(ax)
     return set_up_width_axes(ax, target_mm)
 

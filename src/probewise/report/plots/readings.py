@@ -93,7 +93,7 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
     ----------
     recording
         Rows over half-planes are drawn by signed distance from the edge, others by position along the scan. Single rows
-        (the quadrants) are drawn by `predicted_against_recorded` only.
+        (the quadrants) are drawn by `predicted_and_recorded_by_scan` only.
     ax
         Axes to draw on; a new figure without.
     """

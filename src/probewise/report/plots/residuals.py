@@ -27,7 +27,7 @@ from probewise.report.plots.canvas import (
     stack_of_axes,
 )
 from probewise.report.residual_means import ResidualMeans, running_mean_curve
-from probewise.report.words import number, number_unsigned_zero, unit_name
+from probewise.report.words import number_text, number_unsigned_zero, unit_name
 
 BEFORE, AFTER = "as calibrated", "repaired"
 _CROWDED = 500  # number of dots from which they are paler
@@ -188,7 +188,7 @@ def residuals_against_covariates(
     return axes
 
 
-def gain_by_scan(
+def heldout_gain_by_scan(
     scans: Sequence[tuple[str, float]], mean: float, sd: float, *, part: str = "scan", ax: Axes | None = None
 ) -> Axes:
     """Draw the gain on each held-out scan in nats per reading, and the mean over all with its standard error.
@@ -212,7 +212,7 @@ def gain_by_scan(
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[BLUE if gain >= 0 else VERMILLION for gain in gains])
     ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, zorder=0)
-    said = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number(sd, 3)} nats per reading"
+    said = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number_text(sd, 3)} nats per reading"
     ax.axvline(mean, color=GREY, linewidth=1.4, label=said)
     ax.axvline(0, color=BLACK, linewidth=0.7)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])

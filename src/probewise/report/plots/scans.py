@@ -65,7 +65,7 @@ def residuals_by_scan(
     return axes
 
 
-def before_and_after(
+def readings_before_and_after_repair(
     recording: Recording, rows: IntArray, before: FloatArray, after: FloatArray, *, name: str = ""
 ) -> AxesGrid:
     """Draw readings with the curves of two models, and below them the residuals, around where the models differ.

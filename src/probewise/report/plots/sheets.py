@@ -190,11 +190,11 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
         LEFT_MM + 3.0, tile.page_mm[1] - 6.0, f"{sheet.name}{place}: {sheet.lines[0]}", fontsize=_USUAL, va="center"
     )
     ax.text(tile.page_mm[0] - 10.0, 6.0, number, fontsize=_SMALL, ha="right", va="center")
-    _label_strips(ax, tiles, tile, first)
+    _label_glue_strips(ax, tiles, tile, first)
     return ax.figure  # type: ignore[return-value]
 
 
-def _label_strips(ax: Axes, tiles: Sequence[Tile], tile: Tile, first: int) -> None:
+def _label_glue_strips(ax: Axes, tiles: Sequence[Tile], tile: Tile, first: int) -> None:
     """Print on each strip the page to be glued on it: margins are cut off, strips are not."""
     number = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
     (left, bottom), (right, top) = tile.on_page_mm(np.array([tile.low_mm, tile.high_mm])).tolist()

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
 from probewise.report.plots.canvas import AxesGrid, axes_or_grid, axes_or_new, label_axes
 from probewise.report.plots.scene import add_colour_bar
-from probewise.report.words import with_error
+from probewise.report.words import value_with_error
 from probewise.sensor import SSFField
 
 
@@ -68,7 +68,7 @@ def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_
     return float(unit * np.ceil(far / unit))
 
 
-def ssf_by_order(
+def ssf_by_n_gaussians(
     fields: Mapping[int, SSFField],
     log_z: Mapping[int, float],
     log_z_error: Mapping[int, float],
@@ -96,7 +96,9 @@ def ssf_by_order(
     for ax, n in zip(axes.flat, orders, strict=False):
         name = "1 Gaussian" if n == 1 else f"{n} Gaussians"
         mark = ", most probable" if n == best and len(orders) > 1 else ""
-        spatial_sensitivity(fields[n], ax=ax, title=f"{name}{mark}\nln Z = {with_error(log_z[n], log_z_error[n])}")
+        spatial_sensitivity(
+            fields[n], ax=ax, title=f"{name}{mark}\nln Z = {value_with_error(log_z[n], log_z_error[n])}"
+        )
     for ax in list(axes.flat)[len(orders) :]:
         ax.set_visible(False)
     widest = max(ax.get_xlim()[1] for ax in list(axes.flat)[: len(orders)])

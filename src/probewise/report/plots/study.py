@@ -20,7 +20,7 @@ from probewise.report.plots.canvas import (
     legend_below,
 )
 from probewise.report.plots.progress import set_up_width_axes
-from probewise.report.words import count
+from probewise.report.words import count_with_noun
 from probewise.study import Summary
 
 _BAND = (0.16, 0.84)
@@ -63,7 +63,7 @@ def posterior_widths_of_runs(
         )
         ax.plot(_reading_numbers(table), np.median(table, axis=0), color=BLUE, linewidth=1.8, label="median")
         set_up_width_axes(ax, target_mm)
-        ax.set_title(f"{name} ({count(len(table), 'run')})", fontsize="medium", loc="left")
+        ax.set_title(f"{name} ({count_with_noun(len(table), 'run')})", fontsize="medium", loc="left")
         ax.label_outer()
     for ax in list(axes.flat)[len(runs) :]:
         ax.set_visible(False)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.report.plots import png
-from probewise.report.plots.apparatus import arm_lengths
+from probewise.report.plots.apparatus import draw_arm_lengths
 
 STATIC = Path(__file__).parent / "_static"
 TAKEN = {
@@ -44,7 +44,7 @@ def main() -> None:
 
 def draw_arm() -> None:
     """Draw the arm of the shipped geometry with its lengths."""
-    (STATIC / "arm.png").write_bytes(png(arm_lengths(read_geometry(shipped_geometry_path()))))
+    (STATIC / "arm.png").write_bytes(png(draw_arm_lengths(read_geometry(shipped_geometry_path()))))
 
 
 if __name__ == "__main__":

@@ -105,7 +105,7 @@ def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(m
     monkeypatch.setattr("probewise.diagnosis.diagnose", diagnose)
     recording = shipped("concealed")
     with pytest.raises(ParameterError, match="rehearsal"):
-        demo._diagnose_concealed(2013)
+        demo._diagnose_shipped_recording(2013)
     with pytest.raises(ParameterError, match="rehearsal"):
         probewise.diagnose(read_recording(recording), rng=np.random.default_rng(2013), progress=False)
     assert main(["diagnose", str(recording), "--out", str(tmp_path / "out"), "--quiet"]) == 2

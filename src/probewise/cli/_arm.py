@@ -41,7 +41,7 @@ def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that 
     add_path(parser, "--geometry", "ARM.toml", f"the arm as built: lengths, gears, ports, limits (default: {default})")
 
 
-def geometry_of(arguments: argparse.Namespace) -> Geometry:
+def read_or_shipped_geometry(arguments: argparse.Namespace) -> Geometry:
     """Read the geometry given, or the shipped one."""
     from probewise.arm import read_geometry, shipped_geometry_path
 

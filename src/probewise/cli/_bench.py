@@ -171,7 +171,7 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
         case Uniform():
             return pattern
         case HalfPlane():
-            return replace(pattern, offset_mm=pattern.offset_mm + _along_normal(pattern.normal_rad, by_mm))
+            return replace(pattern, offset_mm=pattern.offset_mm + _shift_along_normal_mm(pattern.normal_rad, by_mm))
         case Quadrant():
             return replace(pattern, corner_mm=(pattern.corner_mm[0] + x_mm, pattern.corner_mm[1] + y_mm))
         case Disc():
@@ -179,7 +179,7 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
         case Polygon():
             return replace(pattern, vertices_mm=tuple((x + x_mm, y + y_mm) for x, y in pattern.vertices_mm))
         case Stripes():
-            return replace(pattern, phase_mm=pattern.phase_mm + _along_normal(pattern.normal_rad, by_mm))
+            return replace(pattern, phase_mm=pattern.phase_mm + _shift_along_normal_mm(pattern.normal_rad, by_mm))
         case Image():
             return replace(pattern, origin_mm=(pattern.origin_mm[0] + x_mm, pattern.origin_mm[1] + y_mm))
         case Ramp():
@@ -188,5 +188,5 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
             return pattern
 
 
-def _along_normal(normal_rad: float, by_mm: tuple[float, float]) -> float:
+def _shift_along_normal_mm(normal_rad: float, by_mm: tuple[float, float]) -> float:
     return by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad)

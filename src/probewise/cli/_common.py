@@ -69,7 +69,7 @@ def add_seed_and_quiet(parser: argparse.ArgumentParser) -> None:
     """Add --seed and --quiet."""
     parser.add_argument(
         "--seed",
-        type=seed_number,
+        type=parse_seed,
         default=DEFAULT_SEED,
         metavar="N",
         help=f"seed of all randomness, printed with the result (default {DEFAULT_SEED})",
@@ -82,9 +82,9 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary; errors still show")
 
 
-def add_count(parser: argparse._ActionsContainer, name: str, about: str, *, default: int | None = None) -> None:
+def add_count_option(parser: argparse._ActionsContainer, name: str, about: str, *, default: int | None = None) -> None:
     """Add an option that takes a whole number greater than 0."""
-    parser.add_argument(name, type=positive_int, default=default, metavar="N", help=about)
+    parser.add_argument(name, type=parse_positive_int, default=default, metavar="N", help=about)
 
 
 def add_path(
@@ -118,12 +118,12 @@ def _parse_whole_number(text: str, *, least: int, allowed: str) -> int:
     return value
 
 
-def positive_int(text: str) -> int:
+def parse_positive_int(text: str) -> int:
     """Parse an integer above zero, for argparse."""
     return _parse_whole_number(text, least=1, allowed="greater than 0")
 
 
-def seed_number(text: str) -> int:
+def parse_seed(text: str) -> int:
     """Parse an integer of 0 or more, for argparse."""
     return _parse_whole_number(text, least=0, allowed="of 0 or more")
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
 
-from probewise.cli._common import message_to_resume, positive_int
+from probewise.cli._common import message_to_resume, parse_positive_int
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError
 from probewise.progress import Progress
@@ -17,7 +17,7 @@ from probewise.progress import Progress
 def add_executor(parser: argparse.ArgumentParser) -> None:
     """Add --workers and --scheduler."""
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=positive_int, default=1, metavar="N", help="processes here (default 1)")
+    where.add_argument("--workers", type=parse_positive_int, default=1, metavar="N", help="processes here (default 1)")
     where.add_argument(
         "--scheduler", metavar="HOST:PORT", help="a dask scheduler whose workers do it (extra `cluster`)"
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from probewise import experiment as posing
 from probewise.cli._arm import open_emulated_arm_and_bench, open_nxt_arm, open_own_instrument
-from probewise.cli._explore_inputs import Inputs
+from probewise.cli._explore_inputs import ExploreInputs
 from probewise.cli._geometry import parse_truth
 from probewise.errors import ParameterError
 
@@ -32,7 +32,7 @@ class ArmAndTruth:
     about: Mapping[str, Any] = field(default_factory=dict)
 
 
-def open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> ArmAndTruth:
+def open_arm_and_truth(arguments: argparse.Namespace, inputs: ExploreInputs, taken: tuple[Reading, ...]) -> ArmAndTruth:
     """Open the chosen arm, to continue after the readings `taken`.
 
     Raises ParameterError, FileError or ArmError if a truth was given with a real arm, or the arm cannot be opened.

@@ -13,7 +13,7 @@ import numpy as np
 
 from probewise import experiment as posing
 from probewise.calibration import FittedSensor, read_sensor
-from probewise.cli._arm import ArmName, geometry_of, parse_arm
+from probewise.cli._arm import ArmName, parse_arm, read_or_shipped_geometry
 from probewise.cli._geometry import parse_cards, parse_field
 from probewise.errors import ParameterError
 from probewise.recordings import read_recording
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Inputs:
+class ExploreInputs:
     """Checked inputs of a run.
 
     `other` is the experiment under the sensor model `other_model`, which --both-models shows too; otherwise None.
@@ -46,13 +46,13 @@ class Inputs:
     streams: RandomStreams
 
     @property
-    def levels(self) -> tuple[float, float]:
+    def black_and_white_readings(self) -> tuple[float, float]:
         """Posterior mean readings over black and over white."""
         means = self.sensor.mean()
         return means["I_min"], means["I_max"]
 
 
-def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
+def read_checked_inputs(arguments: argparse.Namespace) -> ExploreInputs:
     """Read the files that the options name, check the options, and build the experiment.
 
     Raises ParameterError or FileError if an option contradicts another, or a file cannot be read.
@@ -60,7 +60,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
     chosen = parse_arm(arguments.arm)
     if chosen.kind == "file" and arguments.geometry is not None:
         raise ParameterError("--geometry", str(arguments.geometry), "none with FILE.py, which defines its own reach")
-    geometry = geometry_of(arguments) if chosen.is_lego or arguments.geometry is not None else None
+    geometry = read_or_shipped_geometry(arguments) if chosen.is_lego or arguments.geometry is not None else None
     field = _checked_field(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
@@ -100,7 +100,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
     other, other_model = None, _model_to_compare_with(arguments.model)
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)
-    return Inputs(
+    return ExploreInputs(
         arm=chosen,
         geometry=geometry,
         sensor=sensor,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probewise import experiment as posing
-from probewise.cli._explore_inputs import Inputs
+from probewise.cli._explore_inputs import ExploreInputs
 from probewise.cli._output import StagedFiles
 from probewise.cli._stopping import raise_if_stopped
 from probewise.recordings import write_bytes_atomically, write_text_atomically
@@ -29,7 +29,7 @@ class Pictures:
     """The pictures of a run: draws each step as it arrives, and keeps steps and pictures for the report."""
 
     out: Path
-    inputs: Inputs
+    inputs: ExploreInputs
     live: bool
     truth_mm: FloatArray | None
     steps: list[Step] = field(default_factory=list)
@@ -62,11 +62,13 @@ class Pictures:
         readings = [(pose.x_mm, pose.y_mm, value) for pose, value in poses]
         if shadow is None or inputs.other is None:
             return report.robot_view_png(
-                step, inputs.experiment, readings, levels=inputs.levels, truth_mm=self.truth_mm
+                step, inputs.experiment, readings, levels=inputs.black_and_white_readings, truth_mm=self.truth_mm
             )
         views = {inputs.model: (step, inputs.experiment), inputs.other_model: (shadow, inputs.other)}
         titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
-        return report.robot_views_by_model_png(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
+        return report.robot_views_by_model_png(
+            titled, readings, levels=inputs.black_and_white_readings, truth_mm=self.truth_mm
+        )
 
     def write_results(
         self, stage: StagedFiles, result: Exploration, *, seed: int, known: Mapping[str, float] | None

@@ -45,7 +45,7 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recor
     journal = read_journal(path)
     if not journal.entries:
         raise FileError(path, "no reading", "a journal with at least one measurement")
-    recording = journal.recording(instrumentation=_instrumentation_as_declared(path, sensor, journal.settings))
+    recording = journal.recording(instrumentation=_instrumentation_declared_by_run(path, sensor, journal.settings))
     return replace(recording, notes=(*recording.notes, *journal.notes)), _hypothesised_shape(path, journal.settings)
 
 
@@ -70,7 +70,7 @@ def find_journal_sensor_file(path: Path) -> Path:
     raise FileError(path, f"its sensor {named} (as seen from {path.parent}) {found}", give)
 
 
-def _instrumentation_as_declared(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:
+def _instrumentation_declared_by_run(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:
     """Return the sensor's instrumentation, with the rounding and range that the run declared."""
     try:
         step = settings["options"]["step"]
@@ -78,7 +78,7 @@ def _instrumentation_as_declared(path: Path, sensor: FittedSensor, settings: Map
         declared = [None if value is None else float(value) for value in (step, low, high)]
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(
-            path, f"unusable options: {_error_text(error)}", "options as explore writes them", row=1
+            path, f"unusable options: {_missing_key_or_error_text(error)}", "options as explore writes them", row=1
         ) from error
     step, low, high = declared
     if not all(value is None or math.isfinite(value) for value in declared) or (step is not None and step <= 0):
@@ -99,7 +99,7 @@ def _hypothesised_shape(path: Path, settings: Mapping[str, Any]) -> Shape:
         written, size = settings["shape"], settings["field"]
         field = Field(float(size["width_mm"]), float(size["height_mm"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(path, f"unusable settings: {_error_text(error)}", allowed, row=1) from error
+        raise FileError(path, f"unusable settings: {_missing_key_or_error_text(error)}", allowed, row=1) from error
     for n in range(1, len(SHAPES) + 1):
         for names in itertools.permutations(SHAPES, n):
             shape: Shape = shape_named(names, field)
@@ -108,5 +108,5 @@ def _hypothesised_shape(path: Path, settings: Mapping[str, Any]) -> Shape:
     raise FileError(path, f"shape {written}", allowed, row=1, column="shape")
 
 
-def _error_text(error: Exception) -> str:
+def _missing_key_or_error_text(error: Exception) -> str:
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)

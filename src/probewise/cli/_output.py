@@ -98,7 +98,7 @@ def checked_output_file(path: Path, *inputs: Path) -> Path:
     return path
 
 
-def with_descriptions(tables: Sequence[Path]) -> list[Path]:
+def tables_and_descriptions(tables: Sequence[Path]) -> list[Path]:
     """Return each file of a table followed by its description, the JSON beside it."""
     named = [table for table in tables if table.name]  # not "." and "/"
     return [path for table in named for path in (table, table.with_suffix(".json"))]

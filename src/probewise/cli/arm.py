@@ -14,13 +14,13 @@ from probewise.cli._arm import (
     SCENE,
     add_geometry,
     enable_confirmed_lowering,
-    geometry_of,
     open_brick,
     open_nxt_arm,
     parse_arm,
     parse_place,
     prompter,
     prompter_for_answer,
+    read_or_shipped_geometry,
     warn_if_clearance_doubtful,
 )
 from probewise.cli._common import (
@@ -28,16 +28,16 @@ from probewise.cli._common import (
     CommandError,
     OneLineParser,
     Verb,
-    add_count,
+    add_count_option,
     add_path,
     add_quiet,
     message_to_resume,
     parse_path,
-    positive_int,
+    parse_positive_int,
+    parse_seed,
     positive_number_parser,
     print_result,
     print_warning,
-    seed_number,
 )
 from probewise.cli._output import checked_output_file
 from probewise.cli._plans import (
@@ -139,7 +139,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     heights.add_argument(
         "places", nargs="*", metavar="X,Y", help="places in mm, two or more (default: the field's middle and the marks)"
     )
-    add_count(heights, "--readings", "number of readings at each height (default 16)", default=16)
+    add_count_option(heights, "--readings", "number of readings at each height (default 16)", default=16)
 
     _add_task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
 
@@ -148,7 +148,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     scan.add_argument("start", metavar="X,Y", help="first place of the line, mm")
     scan.add_argument("end", metavar="X,Y", help="last place of the line, mm")
-    scan.add_argument("--readings", type=positive_int, default=21, metavar="N", help="number of readings (default 21)")
+    scan.add_argument(
+        "--readings", type=parse_positive_int, default=21, metavar="N", help="number of readings (default 21)"
+    )
 
     record = _add_task(
         tasks,
@@ -175,7 +177,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for task, scene in ((scan, True), (record, False)):
         simulated = task.add_argument_group("with simulated and emulator")
         add_path(simulated, "--sensor", "S.json", "its sensor (default: that of the shipped recordings)")
-        simulated.add_argument("--seed", type=seed_number, metavar="N", help=f"seed of noise (default {DEFAULT_SEED})")
+        simulated.add_argument("--seed", type=parse_seed, metavar="N", help=f"seed of noise (default {DEFAULT_SEED})")
         if scene:
             simulated.add_argument("--scene", metavar="X,Y,R", help="target on the field, as for emulate-nxt")
     record.set_defaults(scene=None)
@@ -210,7 +212,7 @@ def _add_arm(parser: argparse.ArgumentParser, arms: str | None = None) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run one task; return the exit status."""
-    TASKS[arguments.task](arguments, geometry_of(arguments))
+    TASKS[arguments.task](arguments, read_or_shipped_geometry(arguments))
     return 0
 
 
@@ -220,7 +222,7 @@ def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry
     from probewise.arm.geometry import JOINTS
     from probewise.recordings import write_bytes_atomically
     from probewise.report.plots import png, reach_map
-    from probewise.report.plots.apparatus import arm_lengths
+    from probewise.report.plots.apparatus import draw_arm_lengths
 
     out = None if arguments.out is None else checked_output_file(arguments.out)
     drawing = None if arguments.drawing is None else checked_output_file(arguments.drawing)
@@ -254,7 +256,7 @@ def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry
         write_bytes_atomically(out, png(reach_map(standing, x_mm, y_mm, axis_mm=geometry.axis_mm)))
         print_result(f"drawn        {out}", quiet=arguments.quiet)
     if drawing is not None:
-        write_bytes_atomically(drawing, png(arm_lengths(geometry)))
+        write_bytes_atomically(drawing, png(draw_arm_lengths(geometry)))
         print_result(f"drawn        {drawing}", quiet=arguments.quiet)
     if port is not None:
         _report_brick_state(port, geometry)
@@ -461,7 +463,7 @@ def _height_error_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: 
     return f"({x_mm:g}, {y_mm:g}) mm: it hangs {abs(off_mm):.1f} ± {sd_mm:.1f} mm {side} than its counters say"
 
 
-def _read_sensor(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _print_light_and_battery(arguments: argparse.Namespace, geometry: Geometry) -> None:
     with _open_lego_arm(arguments, geometry) as arm:
         value, battery_mv = arm.read_here(), arm.battery_mv()
         if not arguments.dry_run:
@@ -704,7 +706,7 @@ TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
     "fit-geometry": _fit_geometry,
     "home": _bring_home,
     "heights": _compare_heights_by_light,
-    "read": _read_sensor,
+    "read": _print_light_and_battery,
     "scan": _scan_line,
     "record": _record_plan,
 }

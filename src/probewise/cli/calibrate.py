@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 from probewise.cli._common import (
     Verb,
-    add_count,
+    add_count_option,
     add_out_directory,
     add_seed_and_quiet,
     parse_path,
-    positive_int,
+    parse_positive_int,
     print_result,
 )
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import checked_output_directory, staged_output, with_descriptions
+from probewise.cli._output import checked_output_directory, staged_output, tables_and_descriptions
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
@@ -29,13 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_out_directory(parser)
     parser.add_argument(
         "--orders",
-        type=positive_int,
+        type=parse_positive_int,
         nargs="+",
         default=list(ORDERS),
         metavar="N",
         help=f"numbers of Gaussians to compare (default {' '.join(map(str, ORDERS))})",
     )
-    add_count(
+    add_count_option(
         parser,
         "--live",
         f"live points where a number of Gaussians is searched in full (default {N_LIVE})",
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
         prediction = predict(result.sensor, recording, progress=progress)
         progress("drawing the figures")
         drawn = report.encoded_figures(result, recording, prediction)
-        with staged_output(out, inputs=with_descriptions([arguments.recording])) as stage:
+        with staged_output(out, inputs=tables_and_descriptions([arguments.recording])) as stage:
             write_sensor(result.sensor, stage / "sensor.json")
             stage.write_figures(drawn)
             stage.write("report.html", report.page_html(result, recording, prediction, drawn, seed=arguments.seed))

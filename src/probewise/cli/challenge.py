@@ -9,7 +9,7 @@ from functools import partial
 from probewise.cli._common import (
     CommandError,
     Verb,
-    add_count,
+    add_count_option,
     add_out_directory,
     add_seed_and_quiet,
     print_result,
@@ -22,7 +22,7 @@ from probewise.cli._stopping import reporting_what_is_kept
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
     add_out_directory(parser)
-    add_count(
+    add_count_option(
         parser,
         "--cases",
         "number of recordings, always the first of the seed; 60 give one case of each kind, 6000 the whole table "
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="recordings of twelve kinds of system, each with its owner's file, instead of a light sensor's",
     )
-    add_count(
+    add_count_option(
         parser,
         "--rounds",
         "take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: none)",

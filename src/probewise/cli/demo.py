@@ -67,14 +67,14 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     started = time.monotonic()
     seed = arguments.seed
     out = checked_output_directory(arguments.out)
-    truth = hidden_circle(seed)
+    truth = random_hidden_circle_mm(seed)
     with worker_pool(2) as pool:
         progress("calibrating and diagnosing", 0, 8)
-        diagnosing = pool.submit(_diagnose_concealed, seed)
-        calibration = _calibrate_shipped(seed, arguments.full, pool)
+        diagnosing = pool.submit(_diagnose_shipped_recording, seed)
+        calibration = _calibrate_shipped_recording(seed, arguments.full, pool)
         sensor = calibration.sensor
-        doubting = [pool.submit(search_with_a_fault, sensor, trust, truth, seed) for trust in TRUSTS.values()]
-        starting = [pool.submit(search_from_circle, sensor, model, truth, seed) for model in MODELS]
+        doubting = [pool.submit(search_with_saturating_sensor, sensor, trust, truth, seed) for trust in TRUSTS.values()]
+        starting = [pool.submit(search_from_reading_on_circle, sensor, model, truth, seed) for model in MODELS]
         searching = [pool.submit(_search_from_empty_field, sensor, model, truth, seed) for model in MODELS]
         parts: tuple[Future[Any], ...] = (diagnosing, *doubting, *starting, *searching)
         for done, future in enumerate(parts, start=1):
@@ -86,9 +86,11 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     recording = read_recording(shipped("paper"))
     prediction = predict(sensor, recording.plan, recording.readings)
     names = MODEL_NAMES.values()
-    searches = with_true_circle(sensor, zip(names, runs, strict=True), truth)
-    started_alike = with_true_circle(sensor, zip(names, alike, strict=True), truth)
-    doubted = with_true_circle(sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth)
+    searches = searches_with_true_circle(sensor, zip(names, runs, strict=True), truth)
+    started_alike = searches_with_true_circle(sensor, zip(names, alike, strict=True), truth)
+    doubted = searches_with_true_circle(
+        sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth
+    )
     drawn = report.encoded_figures(
         calibration,
         recording,
@@ -136,7 +138,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     )
 
 
-def with_true_circle(
+def searches_with_true_circle(
     sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
 ) -> list[RobotSearch]:
     """Return a `RobotSearch` for each run: with its robot's name, the true circle, and the sensor's levels."""
@@ -145,29 +147,29 @@ def with_true_circle(
     from probewise.report.robot_search import RobotSearch
     from probewise.scene import outlines
 
-    means, circle = sensor.mean(), circle_on_field()
+    means, circle = sensor.mean(), hypothesised_circle()
     known = dict(zip(circle.prior.names, truth, strict=True))
     outline_mm = outlines(circle.region(np.array([truth])))[0]
     levels = (means["I_min"], means["I_max"])
     return [RobotSearch(name, run, known, outline_mm, levels) for name, run in runs]
 
 
-def circle_on_field() -> Circle:
+def hypothesised_circle() -> Circle:
     """Return the hypothesised shape: a circle entirely on the field, radius 50 to 150 mm."""
     from probewise.scene import Circle
 
     return Circle(radius_mm=(50.0, 150.0), inside=True)
 
 
-def hidden_circle(seed: int) -> tuple[float, ...]:
+def random_hidden_circle_mm(seed: int) -> tuple[float, ...]:
     """Draw the hidden circle from the prior: x, y, radius in mm."""
     import numpy as np
 
-    drawn = circle_on_field().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
+    drawn = hypothesised_circle().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
     return tuple(float(v) for v in drawn)
 
 
-def _calibrate_shipped(seed: int, full: bool, pool: Executor) -> Calibration:
+def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calibration:
     import numpy as np
 
     from probewise.calibration import calibrate
@@ -196,11 +198,11 @@ def _search_from_empty_field(
     from probewise.world.shipped import truth as world_behind
 
     field, means = Field(), sensor.mean()
-    experiment = experiment_for(sensor, circle_on_field(), field, model=model, n_live=N_LIVE_ROBOT)
+    experiment = experiment_for(sensor, hypothesised_circle(), field, model=model, n_live=N_LIVE_ROBOT)
     surface = surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         found = run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
-    outline_mm = outlines(circle_on_field().region(np.array([truth])))[0]
+    outline_mm = outlines(hypothesised_circle().region(np.array([truth])))[0]
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
     levels = (means["I_min"], means["I_max"])
     name = MODEL_NAMES[model]
@@ -222,7 +224,9 @@ def _search_from_empty_field(
     return found, frames
 
 
-def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
+def search_from_reading_on_circle(
+    sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int
+) -> Exploration:
     """Search for the circle by the paper's rule; the first reading, on the circle, is the same for all models."""
     import numpy as np
 
@@ -233,14 +237,14 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
 
     field = Field()
     experiment = experiment_for(
-        sensor, circle_on_field(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy()
+        sensor, hypothesised_circle(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy()
     )
-    first, surface = pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
+    first, surface = random_pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         return run_from_place(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
 
 
-def pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
+def random_pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
     """Draw the pose of the first reading, uniformly within the circle; it is the same for all robots compared."""
     import numpy as np
 
@@ -252,7 +256,9 @@ def pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
     return Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
 
 
-def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, ...], seed: int) -> Exploration:
+def search_with_saturating_sensor(
+    sensor: FittedSensor, trust: float, truth: tuple[float, ...], seed: int
+) -> Exploration:
     """Search for the circle, from a first reading on it, with a sensor that saturates; its model leaves that out.
 
     `trust` is the robot's prior probability that the model leaves nothing out.
@@ -268,16 +274,16 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
     from probewise.world.shipped import truth as world_behind
 
     field = Field()
-    experiment = experiment_for(sensor, circle_on_field(), field, n_live=N_LIVE_ROBOT, trust=trust)
+    experiment = experiment_for(sensor, hypothesised_circle(), field, n_live=N_LIVE_ROBOT, trust=trust)
     world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
-    first, surface = pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
+    first, surface = random_pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world, surface, field, seed=seed) as arm:
         return run_from_place(
             first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT
         )
 
 
-def _diagnose_concealed(seed: int) -> Diagnosis:
+def _diagnose_shipped_recording(seed: int) -> Diagnosis:
     """Diagnose the second recording, with the same result as `probewise diagnose`."""
     from probewise.cli.diagnose import generators_of_diagnosis
     from probewise.diagnosis import diagnose

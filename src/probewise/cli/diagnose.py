@@ -15,7 +15,7 @@ from probewise.cli._output import (
     checked_output_directory,
     holds_readings,
     staged_output,
-    with_descriptions,
+    tables_and_descriptions,
 )
 from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
@@ -144,7 +144,7 @@ def files_not_to_replace(read: Sequence[Path], out: Path) -> list[Path]:
     from probewise.diagnosis import NEXT_PLAN
 
     filled_in = out / NEXT_PLAN
-    return with_descriptions([*read, *([filled_in] if holds_readings(filled_in, "reading") else [])])
+    return tables_and_descriptions([*read, *([filled_in] if holds_readings(filled_in, "reading") else [])])
 
 
 def write_results(

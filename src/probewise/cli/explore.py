@@ -19,23 +19,23 @@ from probewise.cli._arm import (
 )
 from probewise.cli._common import (
     Verb,
-    add_count,
+    add_count_option,
     add_out_directory,
     add_path,
     add_seed_and_quiet,
     message_to_resume,
     parse_path,
-    positive_int,
+    parse_positive_int,
     print_result,
 )
-from probewise.cli._output import checked_output_directory, staged_output, with_descriptions
+from probewise.cli._output import checked_output_directory, staged_output, tables_and_descriptions
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError
 from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
 
 if TYPE_CHECKING:
     from probewise.cli._explore_arm import ArmAndTruth
-    from probewise.cli._explore_inputs import Inputs
+    from probewise.cli._explore_inputs import ExploreInputs
     from probewise.experiment import Exploration, Journal, Step
 
 
@@ -100,7 +100,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"where the readings come from: {ARMS} (default simulated)",
     )
     add_geometry(parser, "the file that ships; the simulated arm has its reach, and a sensor that does not turn")
-    add_count(parser, "--max-readings", f"largest number of readings (default {MAX_READINGS})", default=MAX_READINGS)
+    add_count_option(
+        parser, "--max-readings", f"largest number of readings (default {MAX_READINGS})", default=MAX_READINGS
+    )
     parser.add_argument(
         "--live", action="store_true", help="show the robot's view in a browser while it works (DIR/live.html)"
     )
@@ -136,7 +138,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a card that lies on the field, its centre and size in mm, its albedo from 0 (as the field) to 1 (as the "
         "shape); may be given again",
     )
-    parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
+    parser.add_argument("--batch", type=parse_positive_int, default=1, metavar="N", help="choose N readings at a time")
     more = parser.add_argument_group("more than a place", "further choices, for an arm that supports them")
     more.add_argument(
         "--orientations", type=_parse_numbers, metavar="DEG,...", help="orientations to choose from, such as 0,45,90"
@@ -168,7 +170,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = checked_output_directory(arguments.out)
     inputs = read_checked_inputs(arguments)
     journal = out / "journal.jsonl"
-    before = _journal_so_far(journal, resume=arguments.resume)
+    before = _journal_to_resume(journal, resume=arguments.resume)
     site = open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
     print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
@@ -202,7 +204,7 @@ def run(arguments: argparse.Namespace) -> int:
                 max_readings=arguments.max_readings,
                 journal=before or journal,
                 about={
-                    **posing.sensor_entry(inputs.sensor, _relative_path(out, arguments.sensor)),
+                    **posing.sensor_entry(inputs.sensor, _path_relative_to_folder(out, arguments.sensor)),
                     **site.about,
                     "arm": arguments.arm.partition(":")[0],
                 },
@@ -219,7 +221,7 @@ def run(arguments: argparse.Namespace) -> int:
             pictures.draw_and_write(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
     drawing = progress_shown(quiet=arguments.quiet)
-    read = [arguments.sensor, *([] if arguments.levels is None else with_descriptions([arguments.levels]))]
+    read = [arguments.sensor, *([] if arguments.levels is None else tables_and_descriptions([arguments.levels]))]
     with (
         reporting_what_is_kept(kept_message, results=True),
         drawing as progress,
@@ -235,7 +237,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journal: Path) -> Iterator[str]:
+def _closing_lines(result: Exploration, inputs: ExploreInputs, site: ArmAndTruth, journal: Path) -> Iterator[str]:
     """Yield the closing lines: the shape found, what its sds leave out, probable sensor faults, and errors if known."""
     from probewise import experiment as posing
     from probewise.report import exploration as report
@@ -253,7 +255,7 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journ
         yield f"error        {report.errors_text(result, site.known)}"
 
 
-def _relative_path(folder: Path, path: Path) -> str:
+def _path_relative_to_folder(folder: Path, path: Path) -> str:
     """Return a file's path relative to a folder, which stays right if both are moved together."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
@@ -274,10 +276,10 @@ def _parse_numbers(text: str) -> tuple[float, ...]:
 
 def _parse_counts(text: str) -> tuple[int, ...]:
     """Parse "N,M,...", integers above zero, each once, for argparse."""
-    return tuple(dict.fromkeys(positive_int(cell) for cell in text.split(",")))
+    return tuple(dict.fromkeys(parse_positive_int(cell) for cell in text.split(",")))
 
 
-def _journal_so_far(journal: Path, *, resume: bool) -> Journal | None:
+def _journal_to_resume(journal: Path, *, resume: bool) -> Journal | None:
     from probewise.experiment import read_journal
 
     if resume and not journal.exists():

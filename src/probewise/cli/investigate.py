@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import ARMS, ArmName, add_geometry, geometry_of, parse_arm, parse_place, prompter
+from probewise.cli._arm import ARMS, ArmName, add_geometry, parse_arm, parse_place, prompter, read_or_shipped_geometry
 from probewise.cli._common import (
     CommandError,
     Verb,
-    add_count,
+    add_count_option,
     add_out_directory,
     add_path,
     add_seed_and_quiet,
@@ -65,7 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="effect concealed in the simulated world, such as backlash:0.5 or nothing; several joined by + (default: "
         "one effect drawn from the seed, named at the end)",
     )
-    add_count(parser, "--readings", "largest number of readings beyond the first plan (default 400)", default=400)
+    add_count_option(
+        parser, "--readings", "largest number of readings beyond the first plan (default 400)", default=400
+    )
     parser.add_argument(
         "--minutes",
         type=positive_number_parser("minutes"),
@@ -73,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="largest number of minutes beyond the first plan (default: no limit)",
     )
-    add_count(parser, "--rounds", "largest number of rounds, including the first (default 6)", default=6)
+    add_count_option(parser, "--rounds", "largest number of rounds, including the first (default 6)", default=6)
     parser.add_argument(
         "--no-hands",
         action="store_true",
@@ -185,7 +187,11 @@ def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
         raise ParameterError(
             "--no-hands", True, f"a plan over one pattern; {arguments.plan} has several, which a person must exchange"
         )
-    return plan_for_own_instrument(plan) if chosen.kind == "file" else plan_for_lego_arm(plan, geometry_of(arguments))
+    return (
+        plan_for_own_instrument(plan)
+        if chosen.kind == "file"
+        else plan_for_lego_arm(plan, read_or_shipped_geometry(arguments))
+    )
 
 
 @contextlib.contextmanager
@@ -196,7 +202,7 @@ def _opened_plan_runner(
     from probewise.arm import RequestToPerson, carry_out
     from probewise.cli._bench import open_arm_and_bench
 
-    geometry = geometry_of(arguments)
+    geometry = read_or_shipped_geometry(arguments)
     width, height = (0.0, 0.0) if chosen.kind == "file" else geometry.field_mm
     origin = (width / 2, height / 2)
     if arguments.origin_mm is not None:

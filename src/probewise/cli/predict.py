@@ -6,7 +6,7 @@ import argparse
 
 from probewise.cli._common import Verb, add_path, add_seed_and_quiet, parse_path, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import checked_output_file, with_descriptions
+from probewise.cli._output import checked_output_file, tables_and_descriptions
 from probewise.cli._simulator import add_simulator
 
 
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.calibration import predict, read_sensor
     from probewise.recordings import read_plan_and_readings, write_prediction
 
-    out = checked_output_file(arguments.out, arguments.sensor, *with_descriptions([arguments.plan]))
+    out = checked_output_file(arguments.out, arguments.sensor, *tables_and_descriptions([arguments.plan]))
     with progress_shown(quiet=arguments.quiet) as progress:
         sensor = read_sensor(arguments.sensor)
         plan, readings = read_plan_and_readings(arguments.plan, progress=progress)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import add_geometry, geometry_of
+from probewise.cli._arm import add_geometry, read_or_shipped_geometry
 from probewise.cli._common import CommandError, Verb, add_quiet, parse_path, print_result
 from probewise.cli._output import checked_output_file
 from probewise.errors import ParameterError
@@ -68,11 +68,11 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     if what not in (FIELD, TARGET) and arguments.target is not None:
         raise ParameterError("--target", arguments.target, f"none with {what}: it is for {FIELD} and {TARGET}")
     if what == MARKS:
-        return (marks_sheet(geometry_of(arguments)),)
+        return (marks_sheet(read_or_shipped_geometry(arguments)),)
     if what == JIG:
-        return arm_home_jig_sheets(geometry_of(arguments))
+        return arm_home_jig_sheets(read_or_shipped_geometry(arguments))
     if what in (FIELD, TARGET):
-        field_mm = geometry_of(arguments).field_mm
+        field_mm = read_or_shipped_geometry(arguments).field_mm
         if arguments.target is None and what == TARGET:
             raise CommandError("--target is missing: give a shape, such as --target circle:524,260,80")
         outline = None if arguments.target is None else _target_outline_mm(arguments.target, field_mm)

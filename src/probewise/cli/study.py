@@ -7,7 +7,15 @@ import shlex
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, print_result, seed_number
+from probewise.cli._common import (
+    Verb,
+    add_count_option,
+    add_out_directory,
+    add_quiet,
+    parse_positive_int,
+    parse_seed,
+    print_result,
+)
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
 from probewise.cli._output import checked_output_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
@@ -25,8 +33,8 @@ _SIZES = ("small", "plain", "gross")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
     add_out_directory(parser)
-    add_count(parser, "--circles", "circles per row, always the first ones (default 200)", default=200)
-    add_count(parser, "--quoted", "circles of the first row (default as --circles)")
+    add_count_option(parser, "--circles", "circles per row, always the first ones (default 200)", default=200)
+    add_count_option(parser, "--quoted", "circles of the first row (default as --circles)")
     parser.add_argument(
         "--concealed",
         action="store_true",
@@ -34,10 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "without doubt about the sensor (writes report.html and concealed.csv; replaces all other rows)",
     )
     parser.add_argument(
-        "--seed", type=seed_number, metavar="S", help="with --concealed: circles, noise and robot of another seed"
+        "--seed", type=parse_seed, metavar="S", help="with --concealed: circles, noise and robot of another seed"
     )
     parser.add_argument("--size", choices=_SIZES, help="with --concealed: only this one of the three sizes")
-    add_count(parser, "--clean", "with --concealed: circles of the row without a concealed effect")
+    add_count_option(parser, "--clean", "with --concealed: circles of the row without a concealed effect")
     parser.add_argument(
         "--beside-paper",
         action="store_true",
@@ -50,13 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     one.add_argument("--utility", metavar="NAME", help="acquisition function: finishing, information, entropy, ...")
     one.add_argument("--noise", type=float, metavar="SD", help="sd of the noise, LEGO units (reference: 1)")
     one.add_argument("--width", type=float, metavar="F", help="assumed width of the SSF over the true one")
-    one.add_argument("--batch", type=positive_int, metavar="N", help="number of readings chosen at a time")
+    one.add_argument("--batch", type=parse_positive_int, metavar="N", help="number of readings chosen at a time")
     one.add_argument("--learn-sensor", action="store_true", default=None, help="learn the sensor along with the shape")
     one.add_argument("--method", metavar="NAME", help="how the robot infers and chooses: particles or paper")
     one.add_argument(
         "--nested-stop", metavar="NAME", help="when the paper's nested sampling ends: change (of ln Z) or remaining"
     )
-    add_count(
+    add_count_option(
         parser, "--max-readings", "a run that is not done after N readings counts as a miss (default 100)", default=100
     )
     add_executor(parser)
@@ -75,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     for name in ("seed", "size", "clean"):
         if getattr(arguments, name) is not None:
             raise ParameterError(f"--{name}", getattr(arguments, name), "only with --concealed")
-    rows = _study_rows(arguments)
+    rows = _configuration_rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)
     numbers[rows[0]] = arguments.quoted or arguments.circles
     if max(numbers.values()) < 2:
@@ -124,13 +132,13 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     rows = concealed_rows(found)
     with staged_output(out) as stage:
         stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
-        stage.write("report.html", report.page_html(rows, command=_concealed_command(arguments)))
+        stage.write("report.html", report.page_html(rows, command=_concealed_command_line(arguments)))
     print_result(report.summary_sentence(rows), quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 
-def _study_rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
+def _configuration_rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
     from probewise.study import Row, paper_rows, standard_rows
 
     given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
@@ -159,7 +167,7 @@ def _command_line(arguments: argparse.Namespace) -> str:
     return shlex.join([*words, "--max-readings", str(arguments.max_readings)])
 
 
-def _concealed_command(arguments: argparse.Namespace) -> str:
+def _concealed_command_line(arguments: argparse.Namespace) -> str:
     words = ["probewise", "study", "--concealed", "--circles", str(arguments.circles)]
     for name in ("clean", "seed", "size"):
         value = getattr(arguments, name)

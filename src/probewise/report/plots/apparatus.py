@@ -70,7 +70,7 @@ def arm_and_sensor(
     return axes
 
 
-def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
+def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring it.
 
     Parameters

@@ -64,7 +64,9 @@ def test_world_and_chain_agree_on_what_another_height_does(height_mm):
 
 def test_every_height_is_a_design_and_the_lowest_signal_is_strongest(small):
     experiment = asked(small)
-    assert [design.settings for design in experiment.designs.combinations] == [(("height_mm", h),) for h in HEIGHTS]
+    assert [design.settings for design in experiment.designs.setting_combinations] == [
+        (("height_mm", h),) for h in HEIGHTS
+    ]
     arm = arm_over(replace(WORLD, noise_sd=1.0), DISC, FIELD, seed=1)
     with arm:
         first = next(explore(arm, experiment, rng=np.random.default_rng(1)))

@@ -55,7 +55,7 @@ def test_each_step_holds_what_its_reading_taught(found):
         assert info.number == number
         assert info.samples.shape == (20, 3)
         assert len(np.unique(info.samples, axis=0)) == 20
-        assert 0 <= info.map.highest <= math.log2(50)
+        assert 0 <= info.map.highest_utility <= math.log2(50)
         assert np.isfinite([info.bits, info.log_z, info.p_value, info.posterior.log_z_error]).all()
     poses = [info.next_pose for info in result.steps]
     assert poses[-1] is None
@@ -101,7 +101,7 @@ def test_the_readings_become_a_recording(found):
 def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
     naive = run(small.arm(sensor=small.sensor(0.0)), small.experiment(blur_mm=0.0), rng=rng(), max_readings=60)
     assert naive.reached
-    assert all(info.map.highest <= 1.0 + 1e-5 for info in naive.steps)  # single precision
+    assert all(info.map.highest_utility <= 1.0 + 1e-5 for info in naive.steps)  # single precision
     assert len(naive.steps) > len(found[0].steps)
 
 
@@ -454,7 +454,7 @@ def test_the_naive_sensor_of_the_package_runs_in_the_loop(small):
         small.arm(sensor=small.sensor(0.0)), small.experiment(shape=circle, model=model), rng=rng(), max_readings=3
     )
     assert isinstance(result, Exploration)
-    assert all(info.map.highest <= 1.0 + 1e-5 for info in result.steps)
+    assert all(info.map.highest_utility <= 1.0 + 1e-5 for info in result.steps)
     assert Pose(result.readings[0].pose.x_mm, result.readings[0].pose.y_mm) == result.readings[0].pose
 
 
@@ -572,7 +572,7 @@ def test_the_only_place_within_reach_is_read_while_it_tells_something(small):
     assert result.stop_reason.startswith("all 4 readings that it may take are taken")
     bits = [info.bits for info in result.steps]
     assert bits[0] > 0.05
-    assert result.steps[0].map.highest > result.steps[2].map.highest > 0
+    assert result.steps[0].map.highest_utility > result.steps[2].map.highest_utility > 0
 
 
 def test_a_run_stops_when_the_only_place_within_reach_has_told_all(small):

@@ -80,7 +80,7 @@ def test_half_of_the_circles_make_the_best_place_worth_one_bit():
     result = entropy_map(
         PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool), noise_sd=1.0
     )
-    assert result.highest == pytest.approx(1.0, abs=1e-12)
+    assert result.highest_utility == pytest.approx(1.0, abs=1e-12)
     best = grid.places_mm[result.best_mask]
     inside = (np.hypot(*(best - [300, 200]).T) <= 50) | (np.hypot(*(best - [700, 200]).T) <= 50)
     assert inside.all()

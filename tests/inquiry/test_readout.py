@@ -13,8 +13,8 @@ from probewise.inquiry import Readout, entropy_bits
 def test_the_cells_of_a_rounding_sensor_are_its_readings():
     levels = np.array([30.2, 47.0])
     readout = Readout(0.8, 1.0, 1.0, 100.0)
-    chance = readout.probability(levels)
-    edges = readout.edges(levels)
+    chance = readout.cell_probability(levels)
+    edges = readout.cell_edges(levels)
     np.testing.assert_allclose(edges, np.arange(edges[0], edges[-1] + 0.5))
     np.testing.assert_allclose(chance.sum(axis=1), 1.0)
     reading = np.concatenate([[edges[0] - 0.5], edges + 0.5])
@@ -24,14 +24,14 @@ def test_the_cells_of_a_rounding_sensor_are_its_readings():
 
 def test_the_ends_of_the_scale_take_all_beyond():
     readout = Readout(2.0, 1.0, 1.0, 100.0)
-    chance = readout.probability(np.array([0.0, 99.5]))
+    chance = readout.cell_probability(np.array([0.0, 99.5]))
     assert chance[0, 0] == pytest.approx(norm.cdf(1.5 / 2.0))
     assert chance[1, -1] == pytest.approx(norm.sf(0.0))
 
 
 def test_fine_cells_give_the_gaussians_entropy():
     """The entropy of cells of width w is the differential entropy less log2 w; Sheppard: 0.015 bits more."""
-    bits = entropy_bits(Readout(2.0, 1.0).probability(np.array([20.0])))[0]
+    bits = entropy_bits(Readout(2.0, 1.0).cell_probability(np.array([20.0])))[0]
     assert bits == pytest.approx(0.5 * math.log2(2 * math.pi * math.e * 2.0**2), abs=0.02)
 
 
@@ -57,10 +57,10 @@ def test_a_readout_out_of_range_is_refused(change):
 def test_cells_taken_together_hold_what_they_held_apart():
     levels = np.linspace(1000.0, 60000.0, 50)
     readout = Readout(100.0, 1.0, 0.0, 65535.0)
-    edges = readout.edges(levels, most=300)
+    edges = readout.cell_edges(levels, most=300)
     assert len(edges) <= 301
     assert (edges % 1.0 == 0.5).all()  # no reading lies on one
-    together = readout.probability(levels, most=300)
+    together = readout.cell_probability(levels, most=300)
     expected = norm.cdf(edges[:, None], levels, 100.0).T
     np.testing.assert_allclose(np.cumsum(together, axis=1)[:, :-1], expected, atol=1e-12)
     np.testing.assert_allclose(together.sum(axis=1), 1.0)

@@ -7,7 +7,7 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal, norm
 
 from probewise.inquiry.scanlines import to_int32, to_single_precision
-from probewise.inquiry.unit_gaussian import N_OPENINGS, REACH, mass_within_bend, mass_within_corner
+from probewise.inquiry.unit_gaussian import N_OPENINGS, REACH, mass_within_corner, mass_within_curved_edge
 
 HALF_STEP = 1 / 64  # sd, and the steepest slope of a distribution function is 0.4 per sd
 TO_NEAREST = 0.4 * HALF_STEP
@@ -34,13 +34,13 @@ def test_a_corner_far_off_leaves_one_edge():
 
 def test_the_sharpest_bend_is_the_last_of_the_table():
     """In single precision 1e9 / (1 + 1e9) is one, which would be a row behind the last."""
-    sharp = mass_within_bend(to_single_precision(np.zeros(2)), to_single_precision(np.array([1e3, 1e9])))
+    sharp = mass_within_curved_edge(to_single_precision(np.zeros(2)), to_single_precision(np.array([1e3, 1e9])))
     assert sharp[0] == sharp[1] < 0.15
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.1, 0.7, 3.0])
 def test_a_bent_edge_shows_what_lies_within_a_parabola(bend):
     distance = np.linspace(-2.5, 3.5, 13)
-    found = mass_within_bend(to_single_precision(distance), to_single_precision(np.full(13, bend)))
+    found = mass_within_curved_edge(to_single_precision(distance), to_single_precision(np.full(13, bend)))
     expected = [quad(lambda t, d=d: norm.pdf(t) * ndtr(d - bend * t * t / 2), -8, 8)[0] for d in distance]
     assert found == pytest.approx(np.array(expected), abs=TO_NEAREST + 0.5 * (1 + bend) ** 2 / 64 * 0.2)

@@ -112,7 +112,7 @@ def test_a_map_of_one_of_two_measures_says_which(made):
     assert utility_map(far, Finishing()).label == "expected information (bits)"
     shown = utility_map(near, Finishing(least=1e-6))
     assert shown.label == "probability that a reading there ends the run"
-    assert 0 < shown.highest <= 1
+    assert 0 < shown.highest_utility <= 1
     np.testing.assert_array_equal(shown.values[near.rows], Finishing(least=1e-6)(near))
 
 

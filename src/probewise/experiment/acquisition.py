@@ -74,7 +74,7 @@ def predict_and_rate_readings(
     Posterior, designs and predictive distributions; and the utility of each design.
     """
     designs = experiment.designs
-    rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.combinations))
+    rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.setting_combinations))
     if at is None:
         cost_s = designs.n_repeats.astype(np.float64)
     else:
@@ -85,7 +85,7 @@ def predict_and_rate_readings(
             read_s = float(travel_s[field.reachable].min())
         cost_s = designs.cost_s(travel_s, read_s)
     plan = designs.plan(PATTERN, time_s=0.0 if at is None else at.time_s)
-    standing = np.tile(field.orientation_rad, len(designs.combinations))
+    standing = np.tile(field.orientation_rad, len(designs.setting_combinations))
     plan = dataclasses.replace(
         plan, orientation_rad=plan.orientation_rad + standing, instrumentation=experiment.instrumentation
     )

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.arm.instrument import Reading
 from probewise.inquiry import Readout, UtilityInput, entropy_bits
-from probewise.inquiry.given_reading import GivenReading
+from probewise.inquiry.given_reading import WeightsGivenReading
 from probewise.scene import outlines
 from probewise.scene.albedo import Region
 from probewise.scene.regions import EllipseRegion, PolygonRegion
@@ -91,11 +91,11 @@ def _bits_by_gaussians(
 
 def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout) -> FloatArray:
     """Return bits about the name, (n_designs,): entropy of the reading's cell minus its mean entropy given the name."""
-    given = GivenReading(answers, weight, readout, fine=_CELL)
+    given = WeightsGivenReading(answers, weight, readout, fine=_CELL)
     told = entropy_bits(given.weight_by_cell)
     for own in each:
         part = float(weight[own].sum())
-        told -= part * entropy_bits(given.sum_by_cell(own / part))
+        told -= part * entropy_bits(given.weighted_sum_by_cell(own / part))
     return np.asarray(told)
 
 

@@ -76,7 +76,7 @@ def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Ge
     if utilities.is_flat:
         raise ParameterError(
             "utility",
-            f"{utilities.highest:g} everywhere",
+            f"{utilities.highest_utility:g} everywhere",
             "one that differs between places: as it is, no reading within reach is expected to tell anything; "
             "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
         )

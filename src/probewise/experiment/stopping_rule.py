@@ -134,7 +134,7 @@ def stop_reason(
             else "the only reading within reach promises nothing more"
         )
         return (
-            f"{promise}, {utilities.highest:.2g}: none would tell the hypotheses apart that are left; "
+            f"{promise}, {utilities.highest_utility:.2g}: none would tell the hypotheses apart that are left; "
             f"the widest length is known to {widest:.1f} mm{included}"
         )
     if max_readings is not None and n_readings >= max_readings:

@@ -28,7 +28,7 @@ from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.stopping_rule import OFF_SDS
 from probewise.inquiry import UtilityInput, UtilityMap, entropy_bits
-from probewise.inquiry.given_reading import GivenReading
+from probewise.inquiry.given_reading import WeightsGivenReading
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
 from probewise.scene.regions import EllipseRegion, PolygonRegion
@@ -200,9 +200,9 @@ def _plan_of_candidates(utility_input: UtilityInput, rows: IntArray, last: Readi
 
 def _expected_bits(weight: FloatArray, answers: FloatArray, utility_input: UtilityInput) -> FloatArray:
     """Return the expected information in bits from predictions (n, n_designs) of hypotheses (n,): (n_designs,)."""
-    given = GivenReading(answers, weight, utility_input.readout)
+    given = WeightsGivenReading(answers, weight, utility_input.readout)
     middle = np.array([0.5 * float(answers.min() + answers.max())])
-    of_noise = float(entropy_bits(utility_input.readout.probability(middle, fine=1.0))[0])
+    of_noise = float(entropy_bits(utility_input.readout.cell_probability(middle, fine=1.0))[0])
     return np.maximum(entropy_bits(given.weight_by_cell) - of_noise, 0.0)
 
 
@@ -216,7 +216,7 @@ def _probability_of_meeting_rule(
 ) -> FloatArray:
     """Return the probability that a reading at each design meets the stopping rule, (n_designs,)."""
     away = lengths - weight @ lengths
-    given = GivenReading(answers, weight, utility_input.readout)
+    given = WeightsGivenReading(answers, weight, utility_input.readout)
     out = np.empty(answers.shape[1])
     for design, mass in enumerate(given.weight_by_cell):
         joint = given.weight_by_hypothesis_and_cell(design)

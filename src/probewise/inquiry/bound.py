@@ -95,7 +95,7 @@ def capacity_bits(low: float, high: float, readout: Readout) -> float:
     if not low < high:
         raise ParameterError("(low, high)", (low, high), "low < high")
     levels = evenly_spaced_levels(low, high, readout.noise_sd / _PER_SD)
-    chance = readout.probability(levels)
+    chance = readout.cell_probability(levels)
     given = -entropy_bits(chance)
     share: FloatArray = np.full(len(levels), 1.0 / len(levels))
     lower = 0.0

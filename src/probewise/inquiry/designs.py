@@ -60,10 +60,10 @@ class Designs:
                 raise ParameterError(f"settings {name}", values, "one finite value or more")
 
     def __len__(self) -> int:
-        return self.grid.n_places * len(self.combinations)
+        return self.grid.n_places * len(self.setting_combinations)
 
     @cached_property
-    def combinations(self) -> tuple[Design, ...]:
+    def setting_combinations(self) -> tuple[Design, ...]:
         """The combinations of settings as designs at the field's corner; repeats of one setting are adjacent."""
         names = [name for name, _ in self.settings]
         return tuple(
@@ -73,16 +73,21 @@ class Designs:
             for n in self.repeats
         )
 
+    @property
+    def combinations(self) -> tuple[Design, ...]:
+        """The old name of `setting_combinations`."""
+        return self.setting_combinations
+
     def __getitem__(self, row: int) -> Design:
         """Return one design by its row."""
         which, place = divmod(row, self.grid.n_places)
         x_mm, y_mm = self.grid.places_mm[place]
-        return replace(self.combinations[which], x_mm=float(x_mm), y_mm=float(y_mm))
+        return replace(self.setting_combinations[which], x_mm=float(x_mm), y_mm=float(y_mm))
 
     @cached_property
     def n_repeats(self) -> IntArray:
         """Number of readings of each design, (n_designs,)."""
-        return np.repeat([combination.repeats for combination in self.combinations], self.grid.n_places)
+        return np.repeat([combination.repeats for combination in self.setting_combinations], self.grid.n_places)
 
     def plan(self, pattern_name: str, *, time_s: float = 0.0) -> Plan:
         """Return a plan with one row per design, (n_designs,) rows, each a scan of its own (see `Grid.plan`)."""
@@ -93,17 +98,19 @@ class Designs:
         """The plan of all designs except time and pattern name, cached because it has thousands of scan names."""
         n_places, n_designs = self.grid.n_places, len(self)
         once = self.grid.plan("")
-        rows = np.tile(np.arange(n_places), len(self.combinations))
+        rows = np.tile(np.arange(n_places), len(self.setting_combinations))
 
         def column(values: list[float]) -> FloatArray:
             return np.repeat(np.asarray(values, dtype=np.float64), n_places)
 
         return replace(
             once.take(rows),
-            orientation_rad=column([c.orientation_rad for c in self.combinations]),
+            orientation_rad=column([c.orientation_rad for c in self.setting_combinations]),
             scan=np.arange(n_designs),
             scan_names=tuple(str(k) for k in range(n_designs)),
-            covariates={name: column([dict(c.settings)[name] for c in self.combinations]) for name, _ in self.settings},
+            covariates={
+                name: column([dict(c.settings)[name] for c in self.setting_combinations]) for name, _ in self.settings
+            },
         )
 
     def cost_s(self, travel_s: FloatArray, read_s: float) -> FloatArray:
@@ -116,4 +123,4 @@ class Designs:
         read_s
             Seconds of each repeated reading.
         """
-        return np.tile(travel_s, len(self.combinations)) + read_s * (self.n_repeats - 1)
+        return np.tile(travel_s, len(self.setting_combinations)) + read_s * (self.n_repeats - 1)

@@ -62,7 +62,7 @@ class DiscTable:
         """Tabulate a model, or return None if that is not possible.
 
         A table holds a known mixture, or the naive sensor, over a single circle, with no effects but those of
-        `is_known_uniform_effect`; it must see no farther than 80 mm.
+        `is_known_footprint_effect`; it must see no farther than 80 mm.
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
@@ -76,11 +76,11 @@ class DiscTable:
         if isinstance(model, NaiveSensor):
             dark, bright = _readings_outside_and_inside(model, high)
             return cls(dark, bright, 0.0, bends, read_only_floats(np.empty((0, 0, 0))))
-        if not isinstance(model.ssf, FixedMixture) or not all(map(is_known_uniform_effect, model.effects)):
+        if not isinstance(model.ssf, FixedMixture) or not all(map(is_known_footprint_effect, model.effects)):
             return None
         dark, bright = _readings_outside_and_inside(model, high)
         directions = _unit_vectors_of_pseudo_angles(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
-        margin = _disc_margin_mm(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
+        margin = _distance_to_constant_reading_mm(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
         if margin >= _PROBE_MM:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
@@ -223,7 +223,7 @@ class DiscTable:
         return float((self.levels.shape[0] - 1) / (self.bend_per_mm[1] - self.bend_per_mm[0]))
 
 
-def is_known_uniform_effect(effect: AnyEffect) -> bool:
+def is_known_footprint_effect(effect: AnyEffect) -> bool:
     """Return whether an effect is known and changes the footprint equally everywhere, so that a table can hold it."""
     return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
 
@@ -324,7 +324,7 @@ def _readings_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[
     return float(dark), float(bright)
 
 
-def _disc_margin_mm(
+def _distance_to_constant_reading_mm(
     model: SensorModel, low_mm: float, high_mm: float, directions: FloatArray, dark: float, bright: float
 ) -> float:
     """Return the distance from a disc's edge beyond which the reading is constant, for small and large discs alike."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.scanlines import Interval, to_single_precision
-from probewise.inquiry.unit_gaussian import mass_within_bend
+from probewise.inquiry.unit_gaussian import mass_within_curved_edge
 from probewise.scene import EllipseRegion
 from probewise.sensor import FixedMixture
 
@@ -25,11 +25,11 @@ class Ellipses:
     then xx, xy, yy. `growth_per_sd` is the largest increase of each ellipse's scale per sd of the footprint,
     `growth_by_offsets` the increase by the Gaussians' offsets from the centre. `axes` (n_gaussians, 2, n_ellipses) are
     the semi-axes, major and minor. `to_axes_frame` (n_gaussians, 2, 3, n_ellipses) maps a place to their frames: for
-    each axis the factor of x, the factor of y, and a constant. `rows_mm` (2, n_ellipses) are the lowest and the
+    each axis the factor of x, the factor of y, and a constant. `y_range_mm` (2, n_ellipses) are the lowest and the
     highest point, `share` (n_gaussians,) the weights of the Gaussians.
     """
 
-    rows_mm: FloatArray
+    y_range_mm: FloatArray
     share: FloatArray
     lab: FloatArray
     growth_per_sd: FloatArray
@@ -97,7 +97,7 @@ class CrossedEllipses:
     base: FloatArray
     axes: FloatArray
 
-    def interval_within(self, reach: float) -> Interval:
+    def interval_deeper_than(self, reach: float) -> Interval:
         """Return the interval of x deeper than `reach` sds inside the edge; if negative, up to that far outside.
 
         An ellipse scaled by 1 + d / (its shortest semi-axis) contains all points within d of it; and likewise inwards.
@@ -129,7 +129,7 @@ class CrossedEllipses:
             steep = _vector_length(steep_p, steep_q)
             distance = ((a * cosine - p) * steep_p + (b * sine - q) * steep_q) / steep
             around = a * b * steep
-            out = out + share * mass_within_bend(distance, 1.0 / (around * around * steep))
+            out = out + share * mass_within_curved_edge(distance, 1.0 / (around * around * steep))
         return out
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.inquiry.forecast import resampled_rows_and_weights
-from probewise.inquiry.given_reading import GivenReading
+from probewise.inquiry.given_reading import WeightsGivenReading
 from probewise.inquiry.utility import InformationGain, Utility
 from probewise.inquiry.utility_input import Goal, UtilityInput
 
@@ -81,9 +81,9 @@ def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: Int
     answers = utility_input.forecast.predict(
         utility_input.theta[rows], utility_input.plan.take(utility_input.rows[designs])
     )
-    given = GivenReading(answers, share, utility_input.readout)
+    given = WeightsGivenReading(answers, share, utility_input.readout)
     ends = np.ones(given.weight_by_cell.shape, dtype=np.bool_)
     for length in away.T:
-        mean = given.sum_by_cell(length) / given.weight_by_cell
-        ends &= given.sum_by_cell(length**2) / given.weight_by_cell - mean**2 < goal.sd**2
+        mean = given.weighted_sum_by_cell(length) / given.weight_by_cell
+        ends &= given.weighted_sum_by_cell(length**2) / given.weight_by_cell - mean**2 < goal.sd**2
     return np.asarray((given.weight_by_cell * ends).sum(axis=1) / given.weight_by_cell.sum(axis=1))

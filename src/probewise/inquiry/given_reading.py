@@ -14,7 +14,7 @@ _PER_SD = 2.0  # levels of the predicted reading per noise sd
 _LEAST = 1e-12
 
 
-class GivenReading:
+class WeightsGivenReading:
     """Weights of hypotheses times the probability of each cell of a reading, and sums over hypotheses.
 
     Hypotheses with nearly equal predictions are summed first, so that the noise is applied to some hundred levels
@@ -38,14 +38,14 @@ class GivenReading:
         )
         self._index = nearest_level_index(answers, levels)
         self._weight = weight
-        self._chance = readout.probability(levels, fine=fine, most=MOST_LEVELS)
+        self._chance = readout.cell_probability(levels, fine=fine, most=MOST_LEVELS)
 
     @cached_property
     def weight_by_cell(self) -> FloatArray:
         """Total weight in each cell, (n_designs, n_cells); never 0."""
-        return np.maximum(self.sum_by_cell(np.ones(len(self._weight))), _LEAST)
+        return np.maximum(self.weighted_sum_by_cell(np.ones(len(self._weight))), _LEAST)
 
-    def sum_by_cell(self, values: FloatArray) -> FloatArray:
+    def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:
         """Sum weight times value, each with the probability of the cell: values (n,) -> (n_designs, n_cells)."""
         return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
 

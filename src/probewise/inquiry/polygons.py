@@ -24,10 +24,10 @@ class EdgesInFootprintSds:
 
     Distance inside edge k = across x + up y + offset, arrays (n_gaussians, n_edges, n_polygons). `opening`
     (n_gaussians, 2^n_edges, n_polygons), at 2^k + 2^m, numbers the corner of edges k and m; see `mass_within_corner`.
-    `share` is the weight of each Gaussian. `rows_mm` (2, n_polygons) are the lowest and the highest corner.
+    `share` is the weight of each Gaussian. `y_range_mm` (2, n_polygons) are the lowest and the highest corner.
     """
 
-    rows_mm: FloatArray
+    y_range_mm: FloatArray
     share: FloatArray
     across: FloatArray
     up: FloatArray
@@ -83,7 +83,7 @@ class CrossedPolygons:
     opening: IntArray
     which: IntArray
 
-    def interval_within(self, reach: float) -> Interval:
+    def interval_deeper_than(self, reach: float) -> Interval:
         """Return the interval of x deeper than `reach` sds inside every edge; if negative, up to that far outside.
 
         For several Gaussians, the outermost counts outside the polygon, and the innermost inside.

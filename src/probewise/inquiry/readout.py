@@ -54,7 +54,7 @@ class Readout:
 
     require = require_in_range  # its old name
 
-    def edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
+    def cell_edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
         """Return the edges of the cells for readings of these levels, (n_cells - 1,); the end cells are open.
 
         Cells of unrounded readings are `fine` noise sds wide; above `most` cells, neighbours are merged.
@@ -67,18 +67,20 @@ class Readout:
         first, last = math.floor(least / width + 0.5), math.ceil(greatest / width - 0.5)
         return np.asarray((np.arange(first, max(last, first + 1)) + 0.5) * width, dtype=np.float64)
 
-    def probability(
+    def cell_probability(
         self, levels: FloatArray, *, repeats: int = 1, fine: float = _FINE, most: int | None = None
     ) -> FloatArray:
-        """Return the probability of each cell given each level, (n_levels,) -> (n_levels, n_cells); see `edges`.
+        """Return the probability of each cell given each level, (n_levels,) -> (n_levels, n_cells); see `cell_edges`.
 
         For repeats it is that of their mean, with cells scaled to its smaller noise.
         """
         sd = self.noise_sd / math.sqrt(repeats)
         each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)
-        below = ndtr((each.edges(levels, fine=fine, most=most) - levels[:, None]) / sd)
+        below = ndtr((each.cell_edges(levels, fine=fine, most=most) - levels[:, None]) / sd)
         ends = np.zeros((len(levels), 1)), np.ones((len(levels), 1))
         return np.diff(np.concatenate([ends[0], below, ends[1]], axis=1), axis=1)
+
+    edges, probability = cell_edges, cell_probability  # their old names
 
 
 def entropy_bits(probability: FloatArray) -> FloatArray:

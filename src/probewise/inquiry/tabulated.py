@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.carded import CardedForecast, cards_of
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.discs import DiscTable, is_known_uniform_effect
+from probewise.inquiry.discs import DiscTable, is_known_footprint_effect
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
     DirectForecast,
@@ -115,7 +115,7 @@ class TabulatedForecast:
         if not isinstance(model.ssf, FixedMixture) or not isinstance(model.levels, FixedLevels):
             return None
         made = cls(model, model.ssf, model.levels, model.scene.shape)
-        return made if made._is_faithful(max(highest, 1.0)) else None
+        return made if made._agrees_with_model(max(highest, 1.0)) else None
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points), by the tables.
@@ -128,10 +128,10 @@ class TabulatedForecast:
         out = np.empty((len(theta), len(plan)))
         for number, way in enumerate(ways.T.tolist()):
             rows = np.flatnonzero(which.ravel() == number)
-            shapes = self._shapes_under_sensor(theta, *way)
+            shapes = self._tabulated_shapes_at(theta, *way)
             if shapes is None or ways.shape[1] > _MOST_WAYS:
                 return predict_where_visible(self.model, theta, plan)
-            dark, bright = self._dark_and_bright_at(way[1])
+            dark, bright = self._dark_and_bright_at_height(way[1])
             out[:, rows] = dark + (bright - dark) * shapes.footprint_share(plan.x_mm[rows], plan.y_mm[rows])
         return out
 
@@ -149,16 +149,16 @@ class TabulatedForecast:
         ways = list(zip(turns[:, 0].tolist(), heights[:, 0].tolist(), strict=True))
         shapes_at = {}
         for turn, height in dict.fromkeys(ways):
-            shapes = self._shapes_under_sensor(theta, turn, height)
+            shapes = self._tabulated_shapes_at(theta, turn, height)
             if shapes is None:
                 return asked()
-            shapes_at[turn, height] = _ShapesAt(shapes, *self._dark_and_bright_at(height))
+            shapes_at[turn, height] = _ShapesUnderSensor(shapes, *self._dark_and_bright_at_height(height))
         low = min(min(each.dark, each.bright) for each in shapes_at.values())
         high = max(max(each.dark, each.bright) for each in shapes_at.values())
         levels = evenly_spaced_levels(low, high, noise_sd / _PER_SD, most=MOST_LEVELS)
         return _TabulatedPredictive(shapes_at, ways, designs.grid, rows, levels)
 
-    def _shapes_under_sensor(self, theta: FloatArray, turn_rad: float, height: float) -> TabulatedShapes | None:
+    def _tabulated_shapes_at(self, theta: FloatArray, turn_rad: float, height: float) -> TabulatedShapes | None:
         """Return the shapes under the sensor at an orientation, and at `height` times that of its calibration."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         stands = height * np.array([[cosine, -sine], [sine, cosine]])
@@ -167,33 +167,33 @@ class TabulatedForecast:
         )
         return TabulatedShapes.of(self.shape.region(theta), seen)
 
-    def _dark_and_bright_at(self, height: float) -> tuple[float, float]:
+    def _dark_and_bright_at_height(self, height: float) -> tuple[float, float]:
         """Return the readings outside and deep inside a shape at `height` times that of the calibration.
 
         Light falls with the square of the height.
         """
         return self.levels.i_min, self.levels.i_min + (self.levels.i_max - self.levels.i_min) / height**2
 
-    def _is_faithful(self, highest: float) -> bool:
+    def _agrees_with_model(self, highest: float) -> bool:
         """Return whether tables and model agree, at places about the edges of some shapes from the prior."""
         prior, rng = self.shape.prior, np.random.default_rng(0)
         theta = prior.from_unit_cube(rng.random((_N_CHECKED, len(prior.names))))
-        shapes = self._shapes_under_sensor(theta, 0.0, highest)
-        dark, bright = self._dark_and_bright_at(highest)
+        shapes = self._tabulated_shapes_at(theta, 0.0, highest)
+        dark, bright = self._dark_and_bright_at_height(highest)
         if shapes is None or dark == bright:
             return False
         reach = _REACH * highest * float(np.sqrt(np.linalg.eigvalsh(self.mixture.covs_mm2).max()))
         quick, asked = [], []
         for row, outline in enumerate(outlines(self.shape.region(theta))):
             place = outline[rng.integers(len(outline), size=_PLACES)] + rng.uniform(-reach, reach, (_PLACES, 2))
-            plan = _plan_at(place, highest)
+            plan = _plan_at_height(place, highest)
             quick.append(shapes.footprint_share(plan.x_mm, plan.y_mm)[row])
             asked.append(self.model.predict(theta[[row]], plan)[0])
         off = np.array(quick) - (np.array(asked) - dark) / (bright - dark)
         return bool(np.sqrt((off**2).mean()) < _MOST_OFF)
 
 
-class _ShapesAt(NamedTuple):
+class _ShapesUnderSensor(NamedTuple):
     """All shapes under a sensor of one orientation and height, and its readings outside and deep inside them."""
 
     shapes: TabulatedShapes
@@ -205,7 +205,7 @@ class _ShapesAt(NamedTuple):
 class _TabulatedPredictive:
     """Shapes over a grid of places, for each orientation and height of the sensor."""
 
-    shapes_at: dict[tuple[float, float], _ShapesAt]
+    shapes_at: dict[tuple[float, float], _ShapesUnderSensor]
     turns_and_heights: list[tuple[float, float]]
     grid: Grid
     rows: IntArray
@@ -239,7 +239,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
 
 def _tabulated_chain(model: Chain) -> TabulatedChain | None:
     """Return a chain with effects over the table of the chain without those that no table holds; None if impossible."""
-    table = DiscTable.of(replace(model, effects=tuple(filter(is_known_uniform_effect, model.effects))))
+    table = DiscTable.of(replace(model, effects=tuple(filter(is_known_footprint_effect, model.effects))))
     return None if table is None else TabulatedChain.of(model, table)
 
 
@@ -257,7 +257,7 @@ def _relative_heights(plan: Plan) -> FloatArray:
     return np.ones(len(plan)) if ratio is None else ratio
 
 
-def _plan_at(places_mm: FloatArray, height: float) -> Plan:
+def _plan_at_height(places_mm: FloatArray, height: float) -> Plan:
     """Return a plan of readings at places, (n_points, 2), at `height` times that of the calibration."""
     n = len(places_mm)
     zero = np.zeros(n, dtype=np.int64)

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.inquiry.carded import CardedModel
-from probewise.inquiry.discs import DiscTable, is_known_uniform_effect
+from probewise.inquiry.discs import DiscTable, is_known_footprint_effect
 from probewise.recordings.plan import Plan
 from probewise.scene.cards import mean_albedo_with_cards
 from probewise.sensor import Chain
@@ -38,7 +38,7 @@ class TabulatedChain:
         if not isinstance(table, DiscTable) or chain.names[:3] != table.names:
             return None
         seen = (effect for effect in chain.effects if effect.stage in (Stage.SCENE, Stage.FOOTPRINT))
-        if not all(map(is_known_uniform_effect, seen)):
+        if not all(map(is_known_footprint_effect, seen)):
             return None
         return cls(chain, table, cards)
 

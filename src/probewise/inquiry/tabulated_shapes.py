@@ -22,7 +22,7 @@ from probewise.sensor import FixedMixture
 class _CrossedShapes(Protocol):
     """Shapes of one kind, each intersected by a row of places."""
 
-    def interval_within(self, reach: float) -> Interval:
+    def interval_deeper_than(self, reach: float) -> Interval:
         """Return the interval in which the footprint is `reach` sds inside, or at most -`reach` sds outside."""
         ...
 
@@ -35,7 +35,7 @@ class _ShapesOfOneKind(Protocol):
     """Shapes of one kind under a footprint."""
 
     @property
-    def rows_mm(self) -> FloatArray:
+    def y_range_mm(self) -> FloatArray:
         """Lowest and highest y of each shape, (2, n_shapes)."""
         ...
 
@@ -109,13 +109,18 @@ class TabulatedShapes:
         mass = np.zeros((grid.n_places, n_levels))
         for rows, kind in self.parts:
             own = weight[rows]
-            bottom, top = kind.rows_mm + np.array([[-pad_mm], [pad_mm]], dtype=np.float32)
+            bottom, top = kind.y_range_mm + np.array([[-pad_mm], [pad_mm]], dtype=np.float32)
             for start in range(0, grid.n_y, ROWS):
                 y_mm = to_single_precision(grid.y_mm[start : start + ROWS])
                 row, which = np.nonzero((y_mm[:, None] >= bottom) & (y_mm[:, None] <= top) & (own > 0))
                 crossed = kind.crossed_by_rows(which, y_mm[row])
                 intervals = ScanlineIntervals.from_interval_ends(
-                    grid, len(y_mm), row, which, crossed.interval_within(-reach), crossed.interval_within(reach)
+                    grid,
+                    len(y_mm),
+                    row,
+                    which,
+                    crossed.interval_deeper_than(-reach),
+                    crossed.interval_deeper_than(reach),
                 )
                 ring = intervals.places_near_edges()
                 seen = crossed.footprint_share(ring.interval, to_single_precision(grid.x_mm)[ring.column])

@@ -36,11 +36,11 @@ def mass_within_corner(first: FloatArray, second: FloatArray, opening: IntArray)
     return np.asarray(_corner_table().reshape(-1)[index])
 
 
-def mass_within_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
+def mass_within_curved_edge(distance: FloatArray, bend: FloatArray) -> FloatArray:
     """Return the mass of the unit Gaussian inside a curved edge; `bend` is the edge's curvature times the sd."""
     index = np.minimum(to_int32(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
     index += _distance_index(distance)
-    return np.asarray(_bend_table().reshape(-1)[index])
+    return np.asarray(_curved_edge_table().reshape(-1)[index])
 
 
 def _distance_index(distance: FloatArray) -> IntArray:
@@ -76,7 +76,7 @@ def _corner_table() -> FloatArray:
 
 
 @cache
-def _bend_table() -> FloatArray:
+def _curved_edge_table() -> FloatArray:
     """Tabulate (n_bends, n): for a parabola, E[F(distance - bend t^2 / 2)], t unit Gaussian, by Gauss-Hermite."""
     node, share = np.polynomial.hermite_e.hermegauss(_NODES)
     middle = (np.arange(_N_BENDS) + 0.5) / _N_BENDS

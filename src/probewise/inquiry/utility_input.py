@@ -113,7 +113,7 @@ class UtilityInput:
     def _cell_probability(self, at: IntArray) -> FloatArray:
         """Return the probability of each cell given each level, for designs with equal repeats."""
         n = int(self.designs.n_repeats[self.rows[at[0]]])
-        chance = self.readout.probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
+        chance = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
         return np.asarray(chance.astype(np.float32))
 
 

@@ -52,9 +52,11 @@ class UtilityMap:
         return self.grid.image(np.where(np.isfinite(best), best, np.nan))
 
     @property
-    def highest(self) -> float:
+    def highest_utility(self) -> float:
         """The largest utility."""
         return float(self.values[self.reachable].max())
+
+    highest = highest_utility  # its old name
 
     @property
     def is_flat(self) -> bool:

@@ -56,7 +56,7 @@ def test_the_nodes_of_a_gaussian_have_its_moments_and_those_of_a_student_t_its_q
 def test_the_sd_may_be_a_function_of_the_prediction_or_a_parameter():
     predicted = np.array([[1.0, 4.0], [9.0, 16.0]])
     np.testing.assert_allclose(ReadingNoise(np.sqrt).scale(predicted, None), [[1, 2], [3, 4]])
-    assert ReadingNoise(LogUniform(0.1, 1.0)).inferred
+    assert ReadingNoise(LogUniform(0.1, 1.0)).is_sd_inferred
     np.testing.assert_allclose(
         ReadingNoise(LogUniform(0.1, 1.0)).scale(predicted, np.array([0.2, 0.3]))[:, 1], [0.2, 0.3]
     )

@@ -14,7 +14,7 @@ from probewise._kinds import checked_finite_number, checked_whole, did_you_mean,
 from probewise.errors import ParameterError, ShapeError
 from probewise.inquiry.any_settings.acquisition import Predictive
 from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
-from probewise.inquiry.any_settings.posterior import Model, Readings, prior_samples, updated
+from probewise.inquiry.any_settings.posterior import InstrumentModel, ReadingsProblem, prior_samples, updated_posterior
 from probewise.inquiry.any_settings.settings import Settings
 from probewise.inquiry.choice import choose
 from probewise.nested import Weighted, make_problem
@@ -85,7 +85,7 @@ class Inquiry(ShowsItself):
         named = make_problem(lambda _: 0.0, prior).prior
         require_prior("prior", named, "to_unit_cube", "log_prob")
         self._settings = Settings.of(settings)
-        self._model = Model.of(model, named, ReadingNoise.of(noise), self._settings)
+        self._model = InstrumentModel.from_function(model, named, ReadingNoise.of(noise), self._settings)
         self._rng = rng
         self._goal = _checked_goal(goal, self._model.prior.names)
         self._cost_s = cost_s
@@ -95,7 +95,7 @@ class Inquiry(ShowsItself):
         )
         self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)
         self._taken: list[tuple[Any, float]] = []
-        self._readings: Readings | None = None
+        self._readings: ReadingsProblem | None = None
         self._utility: FloatArray | None = None
         self._next: Any = None
         self._costs_s()
@@ -123,7 +123,7 @@ class Inquiry(ShowsItself):
         the expected decrease of the sum of ln(sd / goal); and once the goal is reached, information again.
         """
         if self._utility is None:
-            self._utility = self._utility_by_weights(self._posterior.weight) / self._costs_s()
+            self._utility = self._utility_for_weights(self._posterior.weight) / self._costs_s()
             self._utility.flags.writeable = False
         return self._utility
 
@@ -197,11 +197,13 @@ class Inquiry(ShowsItself):
             If no hypothesis could have given these readings. The posterior is unchanged.
         """
         value = checked_finite_number("reading", reading, "a finite number; leave out a missing reading")
-        at = self._settings.parsed(self.next() if setting is None else setting)
+        at = self._settings.checked_setting(self.next() if setting is None else setting)
         readings = _append_reading(self._readings, self._model, at, value)
         theta = self._posterior.theta
         log_density = self._model.log_density(theta, at, np.array([value]))[:, 0]
-        self._posterior = updated(self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng)
+        self._posterior = updated_posterior(
+            self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng
+        )
         self._readings = readings
         self._taken.append((at[0], value))
         self._utility, self._next = None, None
@@ -225,7 +227,7 @@ class Inquiry(ShowsItself):
                 imagined = noise.draw(predicted[truth], scale[truth], rng=self._rng)
                 log_density = noise.log_density(imagined, predicted, scale)[:, 0]
                 weights[k] = weight * np.exp(log_density - log_density[weight > 0].max())
-            utility = np.mean([self._utility_by_weights(weight) for weight in weights], axis=0) / self._costs_s()
+            utility = np.mean([self._utility_for_weights(weight) for weight in weights], axis=0) / self._costs_s()
             rows.append(choose(utility, everywhere, rng=self._rng))
         return [self._settings[row] for row in rows]
 
@@ -255,7 +257,7 @@ class Inquiry(ShowsItself):
         """Whether the goal is not reached yet, but every sd is within `_NEAR_GOAL` times its goal."""
         return bool(self._goal) and 1.0 < self._largest_sd_over_goal < _NEAR_GOAL
 
-    def _utility_by_weights(self, weight: FloatArray) -> FloatArray:
+    def _utility_for_weights(self, weight: FloatArray) -> FloatArray:
         """Compute the acquisition function per reading, (n_settings,), for the posterior samples with these weights."""
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
         theta = self._posterior.theta[resampled_rows(weight, n, self._rng)]
@@ -297,14 +299,16 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
     return dict(goal)
 
 
-def _append_reading(readings: Readings | None, model: Model, at: Settings, value: float) -> Readings:
+def _append_reading(
+    readings: ReadingsProblem | None, model: InstrumentModel, at: Settings, value: float
+) -> ReadingsProblem:
     """Return the readings with one more; a setting that was read before is not listed again."""
     if readings is None:
-        return Readings(model, at, np.array([0]), np.array([value]))
+        return ReadingsProblem(model, at, np.array([0]), np.array([value]))
     known = readings.settings
     same = np.ones(len(known), dtype=np.bool_)
     for name, column in known.columns.items():
         same &= column == at.columns[name][0]
     row = int(np.argmax(same)) if same.any() else len(known)
     settings = known if same.any() else known.joined(at)
-    return Readings(model, settings, np.append(readings.row, row), np.append(readings.values, value))
+    return ReadingsProblem(model, settings, np.append(readings.row, row), np.append(readings.values, value))

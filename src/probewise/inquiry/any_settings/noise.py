@@ -51,11 +51,10 @@ class ReadingNoise:
     def __post_init__(self) -> None:
         if isinstance(self.sd, type | str | bytes):
             raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
-        if not (self.inferred or callable(self.sd)) and not 0 < checked_number("noise sd", self.sd, _ALLOWED_SD) < (
-            math.inf
-        ):
+        is_number = not (self.is_sd_inferred or callable(self.sd))
+        if is_number and not 0 < checked_number("noise sd", self.sd, _ALLOWED_SD) < math.inf:
             raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
-        if self.inferred and not np.min(self.sd.from_unit(np.array([1e-9, 0.5]))) > 0:  # type: ignore[union-attr]
+        if self.is_sd_inferred and not np.min(self.sd.from_unit(np.array([1e-9, 0.5]))) > 0:  # type: ignore[union-attr]
             raise ParameterError("noise sd", self.sd, "a prior of numbers greater than 0, such as LogUniform(0.1, 10)")
         if not checked_number("dof", self.dof) > 0:
             raise ParameterError("dof", self.dof, "greater than 0; infinity is the Gaussian")
@@ -73,9 +72,11 @@ class ReadingNoise:
         return given if isinstance(given, ReadingNoise) else cls(given)
 
     @property
-    def inferred(self) -> bool:
+    def is_sd_inferred(self) -> bool:
         """Whether the sd is unknown: a parameter with a prior."""
         return isinstance(self.sd, Marginal)
+
+    inferred = is_sd_inferred  # its old name
 
     def scale(self, predicted: FloatArray, sd: FloatArray | None) -> FloatArray:
         """Return the sd of each prediction's noise, (n_samples, n_points).

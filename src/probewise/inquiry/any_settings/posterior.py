@@ -29,7 +29,7 @@ _BLOCK = 2_000_000  # readings predicted at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class InstrumentModel:
     """Prior, predictions and noise of one instrument."""
 
     caller: Caller
@@ -37,7 +37,9 @@ class Model:
     noise: ReadingNoise
 
     @classmethod
-    def of(cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings) -> Model:
+    def from_function(
+        cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings
+    ) -> InstrumentModel:
         """Find out how a user's function can be called: with arrays, for one sample, or for one reading."""
 
         def call_with_arrays(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
@@ -64,7 +66,7 @@ class Model:
     @cached_property
     def prior(self) -> Prior:
         """The prior of the parameters, and at its end that of the noise sd if it is unknown."""
-        if not self.noise.inferred:
+        if not self.noise.is_sd_inferred:
             return self.own_prior
         return Joint((self.own_prior, Product({NOISE_SD: self.noise.sd})))  # type: ignore[dict-item]
 
@@ -98,7 +100,7 @@ class Model:
 
     def scale(self, theta: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the sd of the noise of each prediction, (n_samples, n_settings)."""
-        return self.noise.scale(predicted, theta[:, -1] if self.noise.inferred else None)
+        return self.noise.scale(predicted, theta[:, -1] if self.noise.is_sd_inferred else None)
 
     def log_density(self, theta: FloatArray, settings: Settings, readings: FloatArray) -> FloatArray:
         """Return the log density of readings, one at each setting, (n_settings,) -> (n_samples, n_settings)."""
@@ -107,13 +109,13 @@ class Model:
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
+class ReadingsProblem:
     """Readings with their settings, as a problem for nested sampling.
 
     `settings` holds each distinct setting once, `row` the setting's index for each reading, (n_readings,).
     """
 
-    model: Model
+    model: InstrumentModel
     settings: Settings
     row: IntArray
     values: FloatArray
@@ -153,8 +155,14 @@ def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted
     return Weighted(prior.names, theta, np.zeros(n), np.full(n, -math.log(n)), 0.0, 0.0, float(n), 0, -math.inf)
 
 
-def updated(
-    previous: Weighted, readings: Readings, log_density: FloatArray, n: int, n_live: int, *, rng: np.random.Generator
+def updated_posterior(
+    previous: Weighted,
+    readings: ReadingsProblem,
+    log_density: FloatArray,
+    n: int,
+    n_live: int,
+    *,
+    rng: np.random.Generator,
 ) -> Weighted:
     """Update the posterior by the last of the readings.
 

@@ -74,7 +74,7 @@ class Settings:
             return own["setting"]
         return np.array(list(own.values())) if self.form == "several" else own
 
-    def parsed(self, setting: Any) -> Settings:
+    def checked_setting(self, setting: Any) -> Settings:
         """Parse one setting given in the form of `self[row]`; it need not be one of these."""
         if self.form == "name":
             if not isinstance(setting, Mapping) or setting.keys() != self.columns.keys():

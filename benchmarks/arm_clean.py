@@ -24,7 +24,7 @@ from probewise.cli._bench import SimulatedBench
 from probewise.cli._plans import plan_for_lego_arm
 from probewise.diagnosis import diagnose
 from probewise.recordings import Recording, paper_plan, read_recording, write_recording
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 
 def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.ndarray]:
@@ -32,7 +32,7 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     geometry = read_geometry(file)
     plan = plan_for_lego_arm(paper_plan(), geometry)
     origin_mm = (524 + 0.37 * seed, 260 + 0.61 * seed)
-    bench = SimulatedBench(truth("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
+    bench = SimulatedBench(true_world("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
     arm = bench.open_emulated_arm(geometry, file)
     stands, read = [], arm.read_here
     arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]

@@ -21,7 +21,7 @@ from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.recordings import Disc
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 LEAST = 10
 """Telegrams that a measurement takes at least: a command and a look for base, shoulder, elbow and the way up, a
@@ -39,7 +39,7 @@ def run(machine_type: type[BrickMachine], places_mm: np.ndarray, *, seed: int) -
     """Measure at every place; return means over the measurements, errors as root mean squares."""
     clock = VirtualClock()
     bench = set_up_bench(
-        read_numbers(shipped_geometry_path()), truth("paper"), Disc((524.0, 260.0), 80.0), clock, seed=seed
+        read_numbers(shipped_geometry_path()), true_world("paper"), Disc((524.0, 260.0), 80.0), clock, seed=seed
     )
     geometry = read_geometry(shipped_geometry_path())
     if machine_type is AnySide:

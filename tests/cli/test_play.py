@@ -16,7 +16,7 @@ from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.cli import main
 from probewise.cli._arm import open_emulated_arm_and_bench
 from probewise.recordings import Disc
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 SHIPPED = read_geometry(shipped_geometry_path())
 KNOWN_DEG = 0.3
@@ -34,7 +34,7 @@ def built_with(play_deg, path):
 def turned_deg(play_deg, path):
     """How far the base stands from where the driver believes it, at places that it comes to from both sides."""
     arm, bench = open_emulated_arm_and_bench(
-        SHIPPED, built_with(play_deg, path), truth("paper"), Disc((500.0, 250.0), 90.0), seed=1, start_s=0.0
+        SHIPPED, built_with(play_deg, path), true_world("paper"), Disc((500.0, 250.0), 90.0), seed=1, start_s=0.0
     )
     angle = np.random.default_rng(0).uniform(0, 2 * np.pi, 8)
     places = np.stack([BASE_MM[0] + 200 * np.cos(angle), 200 + 120 * np.sin(angle)], axis=1)

@@ -20,7 +20,7 @@ from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
 from probewise.recordings import Uniform
 from probewise.report import exploration
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 GEOMETRY = read_geometry(shipped_geometry_path())
 
@@ -131,7 +131,7 @@ def strike(number, frame):
 def struck_session(n):
     """Measure once, struck at the n-th telegram; return the emulated brick, and how many telegrams came."""
     clock = VirtualClock()
-    bench = set_up_bench(read_numbers(shipped_geometry_path()), truth("paper"), Uniform(0.5), clock, seed=1)
+    bench = set_up_bench(read_numbers(shipped_geometry_path()), true_world("paper"), Uniform(0.5), clock, seed=1)
     send, sent = bench.radio.send, []
 
     def struck(data):

@@ -35,7 +35,7 @@ def forth_and_back() -> Plan:
 def noise_free(plan_name: str, *concealed: hidden.Concealed) -> Recording:
     plan = {"paper": paper_plan, "two_way": two_way_plan, "forth_and_back": forth_and_back}[plan_name]()
     spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
-    return Recording(plan, World(spot, concealed=concealed).expected(plan))
+    return Recording(plan, World(spot, concealed=concealed).expected_readings(plan))
 
 
 def recording(plan_name: str, *concealed: hidden.Concealed, seed: int = 1) -> Recording:

@@ -22,10 +22,10 @@ from probewise.emulator import (
 )
 from probewise.errors import LinkError
 from probewise.recordings import Disc
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 SEED = 11
-WORLD, CIRCLE = truth("paper"), Disc((600.0, 250.0), 80.0)
+WORLD, CIRCLE = true_world("paper"), Disc((600.0, 250.0), 80.0)
 
 
 def measured(bench: Bench, clock: VirtualClock, places_mm: np.ndarray) -> list[arm.Reading]:

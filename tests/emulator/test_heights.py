@@ -9,7 +9,7 @@ from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
 from probewise.cli._arm import open_emulated_arm_and_bench
 from probewise.recordings import Uniform
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 PLACES = ["524,260", "120,80", "520,390"]
 HANGS = re.compile(r"it hangs ([\d.]+) ± ([\d.]+) mm (higher|lower)")
@@ -26,7 +26,7 @@ def built(tmp_path, home_deg):
 def true_off_mm(file):
     """Look where the sensor of that arm hangs, relative to the first place."""
     geometry = read_geometry(shipped_geometry_path())
-    lego, bench = open_emulated_arm_and_bench(geometry, file, truth("paper"), Uniform(1.0), seed=1)
+    lego, bench = open_emulated_arm_and_bench(geometry, file, true_world("paper"), Uniform(1.0), seed=1)
     off = []
     with lego as arm:
         for text in PLACES:

@@ -20,7 +20,7 @@ from probewise.emulator import (
     shipped_geometry_path,
 )
 from probewise.recordings import Disc
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 SHIPPED = arm.read_geometry(arm.shipped_geometry_path())
 STOPS_DEG = {"base": -193.0, "shoulder": 163.0, "elbow": 43.0}  # 3 degrees outside the limits, as the emulator has them
@@ -37,7 +37,7 @@ def with_stops(*names: str) -> arm.Geometry:
 def lost(clock: VirtualClock, **turned_deg: float) -> Bench:
     """Set up an arm whose joints were turned by hand while its counters showed 0."""
     bench = set_up_bench(
-        read_geometry(shipped_geometry_path()), truth("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1
+        read_geometry(shipped_geometry_path()), true_world("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1
     )
     names = ("base", "shoulder", "elbow")
     for joint, name in zip(bench.arm.joints, names, strict=True):

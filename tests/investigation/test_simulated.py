@@ -6,7 +6,7 @@ from probewise.errors import ParameterError
 from probewise.investigation import SimulatedRecorder, parse_concealed
 from probewise.recordings import paper_plan
 from probewise.world.concealed import Backlash, Lag, Saturation
-from probewise.world.shipped import truth
+from probewise.world.shipped import true_world
 
 
 def few_rows():
@@ -15,13 +15,13 @@ def few_rows():
 
 
 def test_a_round_that_was_cut_goes_on_to_the_same_readings():
-    take = SimulatedRecorder(truth("paper"), seed=3)
+    take = SimulatedRecorder(true_world("paper"), seed=3)
     whole = list(take(2, few_rows(), "", ()))
     assert list(take(2, few_rows(), "", whole[:7])) == whole[7:]
 
 
 def test_each_round_has_noise_of_its_own():
-    take = SimulatedRecorder(truth("paper"), seed=3)
+    take = SimulatedRecorder(true_world("paper"), seed=3)
     one, other = ([r.value for r in take(number, few_rows(), "", ())] for number in (1, 2))
     assert one != other
 

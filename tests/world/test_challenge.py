@@ -23,14 +23,14 @@ from probewise.world.challenge import (
     WHEEL,
     Stratum,
     draw_case,
-    draw_plan,
+    draw_plan_with_displaced_patterns,
     draw_sensor,
     held_out_plans,
     held_out_recordings,
     stratum_of,
 )
 from probewise.world.challenge.effect_samplers import CleanSetup
-from probewise.world.challenge.regions import Region, region_of_effect
+from probewise.world.challenge.regions import CovariateRegion, region_of_effect
 from probewise.world.challenge.sensors import draw_spot
 from probewise.world.challenge.sizing import EffectSizer
 
@@ -99,7 +99,7 @@ def test_clean_cases_are_their_sensor_and_white_noise():
         assert made.truth.combination == ()
         assert made.truth.hidden == made.world.concealed == ()
         sd = NOISE_LEVELS[made.truth.noise_level]
-        z.append((made.recording.readings - made.world.expected(made.recording.plan)) / sd)
+        z.append((made.recording.readings - made.world.expected_readings(made.recording.plan)) / sd)
     z = np.concatenate(z)
     assert kstest(z, "norm").pvalue > 1e-4
     assert abs(np.mean(z[1:] * z[:-1])) < 4 / np.sqrt(len(z))
@@ -188,13 +188,13 @@ def test_what_belongs_to_a_scan_is_not_in_the_readings_kept_back():
     made = case(number_of("single", size=8.0, skip=SINGLES.index("scan_misplacement")))
     assert made.truth.combination == ("scan_misplacement",)
     for plan in made.test_plans.values():
-        clean = replace(made.world, concealed=()).expected(plan)
-        np.testing.assert_array_equal(made.world.expected(plan), clean)
+        clean = replace(made.world, concealed=()).expected_readings(plan)
+        np.testing.assert_array_equal(made.world.expected_readings(plan), clean)
 
 
 @pytest.mark.parametrize("name", PLANS)
 def test_kept_back_are_a_new_angle_a_new_pattern_and_another_direction(name):
-    plan = draw_plan(name, rng=np.random.default_rng(1))
+    plan = draw_plan_with_displaced_patterns(name, rng=np.random.default_rng(1))
     tests = held_out_plans(plan, rng=np.random.default_rng(2))
     assert list(tests) == ["angle", "pattern", "direction"]
     angles = np.unique(plan.orientation_rad)
@@ -213,7 +213,7 @@ def test_kept_back_are_a_new_angle_a_new_pattern_and_another_direction(name):
 
 @pytest.mark.parametrize("name", PLANS)
 def test_patterns_lie_off_the_grid_and_are_described_so(name):
-    plan, drawn = PLANS[name](), draw_plan(name, rng=np.random.default_rng(1))
+    plan, drawn = PLANS[name](), draw_plan_with_displaced_patterns(name, rng=np.random.default_rng(1))
     offset = drawn.patterns["boundary"].offset_mm
     assert 0 < abs(offset - plan.patterns["boundary"].offset_mm) < 0.5
     assert drawn.patterns["quadrant_a"].corner_mm != plan.patterns["quadrant_a"].corner_mm
@@ -230,7 +230,9 @@ def test_every_ssf_is_about_as_large_as_a_lego_sensors(ssf):
 @pytest.fixture(scope="module", params=list(PLANS))
 def setup(request):
     rng = np.random.default_rng(5)
-    return CleanSetup(draw_plan(request.param, rng=rng), draw_sensor("gaussian", "middle", rng=rng))
+    return CleanSetup(
+        draw_plan_with_displaced_patterns(request.param, rng=rng), draw_sensor("gaussian", "middle", rng=rng)
+    )
 
 
 def test_every_candidate_makes_effects_of_its_name(setup):
@@ -265,7 +267,7 @@ def test_a_local_effect_is_found_where_it_is(setup):
     assert (step.covariate, step.high) == ("time", setup.plan.time_s[-1])
     assert region("scan_misplacement", 1.0).scans
     assert region("backlash", 1.0) is None
-    assert isinstance(region("saturation", 0.1), Region)
+    assert isinstance(region("saturation", 0.1), CovariateRegion)
 
 
 @pytest.mark.slow

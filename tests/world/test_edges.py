@@ -7,7 +7,7 @@ import pytest
 
 from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.world import Oval, albedo_at
-from probewise.world.edges import distance_to_nearest_edge, edge_normal
+from probewise.world.edges import common_edge_normal, distance_to_nearest_edge
 
 SURFACES = {
     "half plane": HalfPlane(0.7, 1.3),
@@ -40,6 +40,6 @@ def test_what_has_no_printed_edge_is_infinitely_far_from_one(surface):
 
 
 def test_across_is_the_normal_of_straight_edges_and_x_elsewhere():
-    assert edge_normal(HalfPlane(0.7, 1.3)) == pytest.approx((math.cos(0.7), math.sin(0.7)))
-    assert edge_normal(Stripes(0.2, 7.0, 0.4, 1.0)) == pytest.approx((math.cos(0.2), math.sin(0.2)))
-    assert edge_normal(Disc((0, 0), 1.0)) == (1.0, 0.0)
+    assert common_edge_normal(HalfPlane(0.7, 1.3)) == pytest.approx((math.cos(0.7), math.sin(0.7)))
+    assert common_edge_normal(Stripes(0.2, 7.0, 0.4, 1.0)) == pytest.approx((math.cos(0.2), math.sin(0.2)))
+    assert common_edge_normal(Disc((0, 0), 1.0)) == (1.0, 0.0)

@@ -20,6 +20,7 @@ from probewise.world.concealed import (
     EdgeBlur,
     EdgeMisplacement,
     EdgeShadow,
+    ExtraGaussian,
     Flicker,
     GainDrift,
     Glint,
@@ -38,7 +39,6 @@ from probewise.world.concealed import (
     ScanAngleError,
     ScanMisplacement,
     SensorTilt,
-    SSFOrder,
 )
 
 CENTER, SD, RHO = (0.4, 1.5), (4.0, 2.5), 0.2
@@ -47,7 +47,7 @@ BLACK, SPAN = 10.0, 50.0
 
 
 def read(plan, *concealed, **more):
-    return World(SPOT, black=BLACK, white=BLACK + SPAN, concealed=concealed, **more).expected(plan)
+    return World(SPOT, black=BLACK, white=BLACK + SPAN, concealed=concealed, **more).expected_readings(plan)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +202,7 @@ def test_one_gaussian_more_is_a_share_of_it(plan):
     rows = on_boundary(plan)
     more = boundary(plan, center=(-3.0, 4.0), covariance=((4.0, 0.0), (0.0, 4.0)))
     expected = BLACK + SPAN * (0.7 * boundary(plan) + 0.3 * more)[rows]
-    np.testing.assert_allclose(read(plan, SSFOrder(0.3, -3.0, 4.0, 2.0))[rows], expected, atol=1e-3 * SPAN)
+    np.testing.assert_allclose(read(plan, ExtraGaussian(0.3, -3.0, 4.0, 2.0))[rows], expected, atol=1e-3 * SPAN)
 
 
 @pytest.mark.parametrize(
@@ -245,8 +245,8 @@ def test_a_plan_that_commands_heights_is_read_as_the_arm_reads_at_them(effect, p
         for k in range(len(plan))
     ]
     expected = BLACK + np.where(np.isnan(led), 1.0, led) * (np.array(alone) - BLACK)
-    np.testing.assert_allclose(world.expected(commanded), expected, atol=1e-9)
-    assert np.abs(world.expected(commanded) - world.expected(plan)).max() > 1.0
+    np.testing.assert_allclose(world.expected_readings(commanded), expected, atol=1e-9)
+    assert np.abs(world.expected_readings(commanded) - world.expected_readings(plan)).max() > 1.0
 
 
 def test_a_tilt_moves_the_spot_of_a_raised_sensor_farther(plan):

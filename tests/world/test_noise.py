@@ -8,13 +8,13 @@ from scipy.stats import kstest, norm, t
 
 from probewise.recordings import Plan, Ramp
 from probewise.world import World, gaussian_spot
-from probewise.world.challenge import NOISE_MODELS, with_noise
+from probewise.world.challenge import NOISE_MODELS, with_noise_model
 from probewise.world.concealed import (
     CorrelatedNoise,
-    DriftingNoise,
     Dropouts,
     HeavyTails,
     Outliers,
+    RisingNoiseSd,
     SignalDependentNoise,
 )
 from probewise.world.spots import Blob
@@ -73,7 +73,7 @@ def test_signal_dependent_noise_has_a_variance_in_proportion(noise, ramp):
 
 
 def test_drifting_noise_grows_to_its_factor_and_stays(noise, ramp):
-    z = noise(DriftingNoise(2.0, N / 2))
+    z = noise(RisingNoiseSd(2.0, N / 2))
     late = z[ramp.time_s > N / 2]
     assert abs(late.std() / 2 - 1) < 4 / math.sqrt(2 * len(late))
     early = z[:1000] / (1 + ramp.time_s[:1000] / (N / 2))
@@ -101,12 +101,12 @@ def test_dropouts_are_lost_to_one_value(ramp):
 
 def test_without_a_generator_there_is_no_noise_and_nothing_is_lost(ramp):
     world = World(SPOT, concealed=(Dropouts(0.5, -1.0), Outliers(0.5, 10.0)))
-    np.testing.assert_array_equal(world.simulate(ramp, rng=None).readings, world.expected(ramp))
+    np.testing.assert_array_equal(world.simulate(ramp, rng=None).readings, world.expected_readings(ramp))
 
 
 @pytest.mark.parametrize("model", NOISE_MODELS)
 def test_every_kind_of_noise_differs_from_white_as_it_is_called(model, ramp, noise):
-    world = with_noise(World(SPOT), model, duration_s=float(N))
+    world = with_noise_model(World(SPOT), model, duration_s=float(N))
     assert (world.step == 1.0) == (model == "quantised")
     z = noise(*world.concealed)
     kept = z[np.abs(z) < 6]  # without outliers and dropouts

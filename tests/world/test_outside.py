@@ -11,24 +11,24 @@ from probewise.world import Blob, World, gaussian_spot
 from probewise.world.challenge import INSIDE, OUTSIDE
 from probewise.world.concealed import (
     AfterGlow,
-    BentRail,
     Chirp,
-    CrossTalk,
+    CubicPositionError,
     DeadZone,
     Ghost,
+    OrientationDependentGain,
     PeakMemory,
     PlaceStep,
+    QuadraticPositionError,
     SlippedPaper,
     StickSlip,
     ThermalGain,
-    TwistedRail,
 )
 
 SPOT = gaussian_spot([Blob(1.0, (0.4, 1.5), (3.0, 2.0), 0.2)], pixel_mm=0.5)
 
 
 def read(plan, *concealed):
-    return World(SPOT, concealed=concealed).expected(plan)
+    return World(SPOT, concealed=concealed).expected_readings(plan)
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,8 @@ def test_there_are_at_least_eight_and_none_is_in_the_vocabulary():
 @pytest.mark.parametrize(
     ("effect", "x_mm"),
     [
-        (BentRail(0.5), lambda x: x + 0.005 * x**2),
-        (TwistedRail(0.5), lambda x: x + 0.0005 * x**3),
+        (QuadraticPositionError(0.5), lambda x: x + 0.005 * x**2),
+        (CubicPositionError(0.5), lambda x: x + 0.0005 * x**3),
         (PlaceStep(0.5, 1.0), lambda x: np.where(x > 1, x + 0.5, x)),
         (StickSlip(0.5, 8.0, 0.25), lambda x: x - 0.5 + np.mod(x + 2, 8) / 8),
     ],
@@ -80,7 +80,7 @@ def test_thermal_gain_is_a_sum_of_waves_with_power_in_proportion_to_their_period
 
 def test_cross_talk_is_a_gain_that_follows_the_orientation(plan, clean):
     gain = 1 + 0.1 * np.cos(2 * plan.orientation_rad + 0.3)
-    np.testing.assert_allclose(read(plan, CrossTalk(0.1, 0.3)), 10 + (clean - 10) * gain)
+    np.testing.assert_allclose(read(plan, OrientationDependentGain(0.1, 0.3)), 10 + (clean - 10) * gain)
 
 
 def test_light_below_the_floor_is_not_seen(plan, clean):

@@ -6,7 +6,7 @@ import pytest
 from probewise.errors import ParameterError
 from probewise.recordings import shipped, two_way_plan
 from probewise.world import Blob, CorrelatedNoise, World, gaussian_spot
-from probewise.world.shipped import BLACK, BLOB, CANDIDATES, NOISE_SD, WHITE, main, regenerate_recording, truth
+from probewise.world.shipped import BLACK, BLOB, CANDIDATES, NOISE_SD, WHITE, main, regenerate_recording, true_world
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def test_a_recording_that_does_not_ship_cannot_be_made():
 
 
 def test_the_paper_recording_conceals_nothing_and_the_other_one_thing():
-    assert truth("paper").concealed == ()
-    assert len(truth("concealed").concealed) == 1
+    assert true_world("paper").concealed == ()
+    assert len(true_world("concealed").concealed) == 1
 
 
 PLAN = two_way_plan()
@@ -43,7 +43,7 @@ TRUTH = np.array([*BLOB.center_mm, *BLOB.sd_mm, BLOB.correlation, BLACK, WHITE])
 
 def readings_of(theta, *concealed):
     spot = gaussian_spot([Blob(1.0, (theta[0], theta[1]), (theta[2], theta[3]), theta[4])])
-    return World(spot, theta[5], theta[6], concealed=concealed).expected(PLAN)
+    return World(spot, theta[5], theta[6], concealed=concealed).expected_readings(PLAN)
 
 
 @pytest.fixture(scope="module")

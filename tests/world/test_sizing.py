@@ -81,7 +81,7 @@ def test_an_effect_that_is_too_small_at_its_limit_is_refused():
 )
 def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
     amplitude = amplitude_of_size(lambda a: sizer.size(of(a)), 12.0, first=0.05, limit=1.0)
-    clean, changed = (World(SPOT, concealed=c).expected(plan) for c in ((), (of(amplitude),)))
+    clean, changed = (World(SPOT, concealed=c).expected_readings(plan) for c in ((), (of(amplitude),)))
     design = np.stack([np.ones(len(plan)), clean], axis=-1)
     rest = changed - design @ np.linalg.lstsq(design, changed, rcond=None)[0]
     assert np.linalg.norm(rest) / 0.5 == pytest.approx(12, rel=0.02)
@@ -89,10 +89,11 @@ def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
 
 def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
     one, other = AmbientGradient(0.1, 0.0), GainDrift(0.1, 60.0)
-    clean = sizer.clean.readings
+    clean = sizer.clean_recording.readings
     design = np.stack([np.ones(len(plan)), clean], axis=-1)
     rests = [
-        sizer.recording(e).readings - design @ np.linalg.lstsq(design, sizer.recording(e).readings, rcond=None)[0]
+        sizer.recording_with_effects(e).readings
+        - design @ np.linalg.lstsq(design, sizer.recording_with_effects(e).readings, rcond=None)[0]
         for e in (one, other)
     ]
     expected = rests[0] @ rests[1] / np.linalg.norm(rests[0]) / np.linalg.norm(rests[1])
@@ -113,8 +114,8 @@ def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, pl
 
     even = log_normal(z, np.mean(z**2))
     if isinstance(effect, CorrelatedNoise):
-        before = np.where(rows.starts_scan(), 0.0, np.roll(z, 1, axis=1))
-        fresh = np.where(rows.starts_scan(), 1.0, 1 - effect.rho**2)
+        before = np.where(rows.scan_start_mask(), 0.0, np.roll(z, 1, axis=1))
+        fresh = np.where(rows.scan_start_mask(), 1.0, 1 - effect.rho**2)
         true = log_normal(z - effect.rho * before, fresh)
     elif isinstance(effect, SignalDependentNoise):
         true = log_normal(z, 1 + effect.ratio * view.seen)
@@ -126,7 +127,7 @@ def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, pl
 
 
 def test_lost_readings_count_by_how_far_off_they_are(plan, sizer):
-    clean = sizer.clean.readings
+    clean = sizer.clean_recording.readings
     assert sizer.size(Dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
 
 

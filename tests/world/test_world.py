@@ -32,7 +32,7 @@ def world(*concealed, **more):
 
 @pytest.fixture(scope="module")
 def clean():
-    return world().expected(PLAN)
+    return world().expected_readings(PLAN)
 
 
 def test_plain_black_and_white_read_the_two_levels(clean):
@@ -69,7 +69,7 @@ def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
         AmbientGradient(0.01, 0.02),
         Saturation(50.0),
     )
-    together = effects.expected(PLAN)
+    together = effects.expected_readings(PLAN)
     for k in range(0, len(PLAN), 53):
         alone = effects.read(
             PLAN.patterns[PLAN.pattern_names[PLAN.pattern[k]]],
@@ -105,7 +105,7 @@ def test_readings_are_rounded_to_the_step():
 
 def test_backlash_shifts_the_ways_out_and_back_apart():
     """Vocabulary: position - (width/2) direction, so the two ways differ by the width."""
-    expected = world(Backlash(2.0)).expected(PLAN)
+    expected = world(Backlash(2.0)).expected_readings(PLAN)
     at = {}
     for way in ("out", "back"):
         rows = PLAN.rows_by_scan()[PLAN.scan_names.index(f"edge_0_{way}")]
@@ -115,25 +115,27 @@ def test_backlash_shifts_the_ways_out_and_back_apart():
 
 
 def test_gain_drift_scales_the_signal_and_never_the_dark(clean):
-    got = world(GainDrift(0.1, 300.0)).expected(PLAN)
+    got = world(GainDrift(0.1, 300.0)).expected_readings(PLAN)
     np.testing.assert_allclose(got - 10, (clean - 10) * (1 + 0.1 * np.exp(-PLAN.time_s / 300)), atol=1e-12)
 
 
 def test_an_ambient_gradient_is_a_plane_on_top(clean):
-    got = world(AmbientGradient(0.01, -0.02)).expected(PLAN)
+    got = world(AmbientGradient(0.01, -0.02)).expected_readings(PLAN)
     np.testing.assert_allclose(got - clean, 0.01 * PLAN.x_mm - 0.02 * PLAN.y_mm, atol=1e-12)
 
 
 def test_saturation_cuts_and_soft_saturation_bends(clean):
-    np.testing.assert_array_equal(world(Saturation(50.0)).expected(PLAN), np.minimum(clean, 50))
-    soft = world(Saturation(50.0, softness=1.0)).expected(PLAN)
+    np.testing.assert_array_equal(world(Saturation(50.0)).expected_readings(PLAN), np.minimum(clean, 50))
+    soft = world(Saturation(50.0, softness=1.0)).expected_readings(PLAN)
     assert soft.max() < 50
     np.testing.assert_allclose(soft[clean < 20], clean[clean < 20], atol=1e-6)
-    np.testing.assert_allclose(world(Saturation(50.0, softness=1e-3)).expected(PLAN), np.minimum(clean, 50), atol=1e-3)
+    np.testing.assert_allclose(
+        world(Saturation(50.0, softness=1e-3)).expected_readings(PLAN), np.minimum(clean, 50), atol=1e-3
+    )
 
 
 def test_nonlinearity_is_a_power_of_the_seen_fraction(clean):
-    got = world(Nonlinearity(1.2)).expected(PLAN)
+    got = world(Nonlinearity(1.2)).expected_readings(PLAN)
     np.testing.assert_allclose((got - 10) / 50, ((clean - 10) / 50) ** 1.2, rtol=1e-9, atol=1e-12)
 
 
@@ -151,8 +153,10 @@ def test_correlated_noise_is_ar1_within_a_scan_and_keeps_its_sd(clean):
 
 def test_effects_stack_in_the_order_of_the_chain_whatever_their_order_in_the_list():
     effects = (Saturation(45.0), AmbientGradient(0.02, 0.0), GainDrift(0.1, 300.0), Nonlinearity(1.1), Backlash(1.0))
-    np.testing.assert_array_equal(world(*effects).expected(PLAN), world(*effects[::-1]).expected(PLAN))
-    assert world(*effects).expected(PLAN).max() == 45
+    np.testing.assert_array_equal(
+        world(*effects).expected_readings(PLAN), world(*effects[::-1]).expected_readings(PLAN)
+    )
+    assert world(*effects).expected_readings(PLAN).max() == 45
 
 
 def test_an_effect_of_ones_own_is_one_short_class(clean):
@@ -164,7 +168,7 @@ def test_an_effect_of_ones_own_is_one_short_class(clean):
         def change(self, values, rows):
             return values + (rows.time_s > 100)
 
-    np.testing.assert_allclose(world(Step()).expected(PLAN) - clean, PLAN.time_s > 100, atol=1e-12)
+    np.testing.assert_allclose(world(Step()).expected_readings(PLAN) - clean, PLAN.time_s > 100, atol=1e-12)
 
 
 def test_an_effect_at_no_known_stage_is_refused():
@@ -180,13 +184,13 @@ def test_an_effect_at_no_known_stage_is_refused():
 def test_what_lies_there_can_differ_from_what_the_plan_says():
     """A pattern that the description misplaces, or that only the world knows."""
     plan = paper_plan()
-    moved = world().expected(plan, surfaces={"boundary": HalfPlane(0.0, 1.0)})
-    np.testing.assert_allclose(moved[1:101], world().expected(plan)[0:100], atol=0.02)
+    moved = world().expected_readings(plan, surfaces={"boundary": HalfPlane(0.0, 1.0)})
+    np.testing.assert_allclose(moved[1:101], world().expected_readings(plan)[0:100], atol=0.02)
     unknown = PLAN.take(np.arange(3))
     hidden = type(unknown)(**{**vars(unknown), "patterns": {}})
     with pytest.raises(ParameterError, match="boundary"):
-        world().expected(hidden)
-    np.testing.assert_allclose(world().expected(hidden, {"boundary": Uniform(1.0)}), 60)
+        world().expected_readings(hidden)
+    np.testing.assert_allclose(world().expected_readings(hidden, {"boundary": Uniform(1.0)}), 60)
 
 
 @pytest.mark.parametrize("changes", [{"noise_sd": -1.0}, {"noise_sd": np.nan}, {"step": 0.0}])

@@ -154,9 +154,9 @@ def open_arm_and_bench(
 def world_and_instrumentation(sensor: Path | None) -> tuple[World, Instrumentation | None]:
     """Return the world and instrumentation of a sensor.json; None: the world of the shipped recordings, and None."""
     if sensor is None:
-        from probewise.world.shipped import truth
+        from probewise.world.shipped import true_world
 
-        return truth("paper"), None
+        return true_world("paper"), None
     from probewise.calibration import read_sensor
     from probewise.experiment import world_like
 

@@ -62,7 +62,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
     from probewise.report import doubting_robot
-    from probewise.world.shipped import truth as world_behind
+    from probewise.world.shipped import true_world as world_behind
 
     started = time.monotonic()
     seed = arguments.seed
@@ -195,7 +195,7 @@ def _search_from_empty_field(
     from probewise.report.plots import grid_of_axes, png
     from probewise.report.words import count_with_noun
     from probewise.scene import Field, outlines
-    from probewise.world.shipped import truth as world_behind
+    from probewise.world.shipped import true_world as world_behind
 
     field, means = Field(), sensor.mean()
     experiment = experiment_for(sensor, hypothesised_circle(), field, model=model, n_live=N_LIVE_ROBOT)
@@ -233,7 +233,7 @@ def search_from_reading_on_circle(
     from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
     from probewise.inquiry import ReadingEntropy
     from probewise.scene import Field
-    from probewise.world.shipped import truth as world_behind
+    from probewise.world.shipped import true_world as world_behind
 
     field = Field()
     experiment = experiment_for(
@@ -271,7 +271,7 @@ def search_with_saturating_sensor(
     from probewise.report.doubting_robot import SATURATION
     from probewise.scene import Field
     from probewise.world import Saturation
-    from probewise.world.shipped import truth as world_behind
+    from probewise.world.shipped import true_world as world_behind
 
     field = Field()
     experiment = experiment_for(sensor, hypothesised_circle(), field, n_live=N_LIVE_ROBOT, trust=trust)

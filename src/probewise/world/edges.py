@@ -25,9 +25,11 @@ def distance_to_nearest_edge(surface: Surface, x_mm: FloatArray, y_mm: FloatArra
         case Uniform() | Ramp() | Image():
             return np.full(x_mm.shape, np.inf)
         case HalfPlane():
-            return np.abs(_place_along_normal(surface.normal_rad, x_mm, y_mm) - surface.offset_mm)
+            return np.abs(_coordinate_along_normal(surface.normal_rad, x_mm, y_mm) - surface.offset_mm)
         case Stripes():
-            since = np.mod(_place_along_normal(surface.normal_rad, x_mm, y_mm) - surface.phase_mm, surface.period_mm)
+            since = np.mod(
+                _coordinate_along_normal(surface.normal_rad, x_mm, y_mm) - surface.phase_mm, surface.period_mm
+            )
             edges = surface.period_mm * np.array([0.0, surface.duty, 1.0])
             return np.asarray(np.abs(since[:, None] - edges).min(axis=1))
         case Quadrant():
@@ -48,7 +50,7 @@ def distance_to_nearest_edge(surface: Surface, x_mm: FloatArray, y_mm: FloatArra
             return _distance_to_outline(np.array(surface.vertices_mm), x_mm, y_mm)
 
 
-def edge_normal(surface: Surface) -> tuple[float, float]:
+def common_edge_normal(surface: Surface) -> tuple[float, float]:
     """Return the unit vector across the edges of a half-plane or stripes, or up a ramp; along X for others."""
     match surface:
         case HalfPlane() | Stripes() | Ramp():
@@ -57,7 +59,7 @@ def edge_normal(surface: Surface) -> tuple[float, float]:
             return 1.0, 0.0
 
 
-def _place_along_normal(normal_rad: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _coordinate_along_normal(normal_rad: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return np.asarray(x_mm * math.cos(normal_rad) + y_mm * math.sin(normal_rad))
 
 

@@ -32,7 +32,8 @@ class Rows:
     covariates
         Other logged columns, arrays of shape (n_points,).
     across
-        Unit vector across the straight edges of the pattern below (`edge_normal`), (1, 0) for others, (n_points, 2).
+        Unit vector across the straight edges of the pattern below, (1, 0) for others (`common_edge_normal`), shape
+        (n_points, 2).
     edge_mm
         Distance from the place to the nearest edge of the pattern, infinite where it has none, (n_points,).
     """
@@ -48,7 +49,7 @@ class Rows:
     edge_mm: FloatArray
 
     @classmethod
-    def of(cls, plan: Plan, across: FloatArray, edge_mm: FloatArray) -> Rows:
+    def from_plan(cls, plan: Plan, across: FloatArray, edge_mm: FloatArray) -> Rows:
         """Build from a plan, as commanded."""
         return cls(
             place_mm=np.stack([plan.x_mm, plan.y_mm], axis=-1),
@@ -62,16 +63,23 @@ class Rows:
             edge_mm=edge_mm,
         )
 
-    def commanded(self, name: str, *, otherwise: float) -> FloatArray:
+    def commanded_column(self, name: str, *, otherwise: float) -> FloatArray:
         """Return a commanded column, `otherwise` where it is NaN or there is none, shape (n_points,)."""
         column = self.covariates.get(name, np.full(len(self.time_s), np.nan))
         return np.where(np.isfinite(column), column, otherwise)
 
-    def in_scans(self, names: tuple[str, ...]) -> BoolArray:
+    def in_scans_mask(self, names: tuple[str, ...]) -> BoolArray:
         """Return whether each row belongs to one of these scans, shape (n_points,)."""
         chosen = [k for k, name in enumerate(self.scan_names) if name in names]
         return np.isin(self.scan, chosen)
 
-    def starts_scan(self) -> BoolArray:
+    def scan_start_mask(self) -> BoolArray:
         """Return whether each row is the first, or comes after one of another scan, shape (n_points,)."""
         return np.concatenate([[True], self.scan[1:] != self.scan[:-1]])
+
+    of, commanded, in_scans, starts_scan = (
+        from_plan,
+        commanded_column,
+        in_scans_mask,
+        scan_start_mask,
+    )  # their old names

@@ -53,7 +53,7 @@ CANDIDATES: tuple[Concealed, ...] = (
 """Effects that the recording `concealed` may contain, each at a size lambda of about 20."""
 
 
-def truth(name: str) -> World:
+def true_world(name: str) -> World:
     """Return the world of a shipped recording, with its concealed effect.
 
     Raises ParameterError if there is no recording of that name.
@@ -63,6 +63,9 @@ def truth(name: str) -> World:
     if name == "paper":
         return world
     return replace(world, concealed=(CANDIDATES[int(choice.integers(len(CANDIDATES)))],))
+
+
+truth = true_world  # its old name
 
 
 def regenerate_recording(name: str) -> Recording:
@@ -75,7 +78,7 @@ def regenerate_recording(name: str) -> Recording:
     _, times, noise = _random_streams(name)
     plan = paper_plan() if name == "paper" else two_way_plan()
     plan = replace(plan, instrumentation=replace(plan.instrumentation, description=_DESCRIPTIONS[name]))
-    recording = truth(name).simulate(with_jittered_times(plan, rng=times), rng=noise)
+    recording = true_world(name).simulate(with_jittered_times(plan, rng=times), rng=noise)
     return replace(recording, readings=np.round(recording.readings, 3))
 
 

@@ -15,15 +15,15 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.concealed.stages import (
     STAGES,
-    Changes,
     ChangesFootprint,
+    ChangesQuantity,
     Concealed,
     Disturbs,
     FootprintPart,
     Retouches,
     Stage,
 )
-from probewise.world.edges import distance_to_nearest_edge, edge_normal
+from probewise.world.edges import common_edge_normal, distance_to_nearest_edge
 from probewise.world.painting import Surface
 from probewise.world.rays import seen_white_fraction
 from probewise.world.rows import Rows
@@ -130,14 +130,14 @@ class World:
             scan=np.zeros(1, dtype=np.int64),
             scan_names=("",),
             covariates={} if height_mm is None else {"height_mm": np.array([height_mm])},
-            across=np.array([edge_normal(surface)]),
+            across=np.array([common_edge_normal(surface)]),
             edge_mm=distance_to_nearest_edge(surface, np.array([x_mm]), np.array([y_mm])),
         )
         view = self._view_of_rows([(surface, np.zeros(1, dtype=np.int64))], rows)
         return float(self._recorded_readings(view, rng)[0])
 
     def view(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> View:
-        """Compute what the sensor sees at each reading of a plan, by integrating light: the costly part of `expected`.
+        """Compute what the sensor sees at each reading of a plan, by integrating light: a simulation's costly part.
 
         The plan's columns `height_mm` and `led` are commands; at NaN the sensor is as usual. The view does not depend
         on effects from the stage "response" on: a world that differs in those only may turn it into readings.
@@ -145,9 +145,9 @@ class World:
         found = self._surfaces_with_rows(plan, surfaces)
         across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
         for surface, chosen in found:
-            across[chosen] = edge_normal(surface)
+            across[chosen] = common_edge_normal(surface)
             edge_mm[chosen] = distance_to_nearest_edge(surface, plan.x_mm[chosen], plan.y_mm[chosen])
-        return self._view_of_rows(found, Rows.of(plan, across, edge_mm))
+        return self._view_of_rows(found, Rows.from_plan(plan, across, edge_mm))
 
     def noise_free_readings(self, view: View) -> FloatArray:
         """Turn a view into noise-free readings, not rounded, shape (n_points,)."""
@@ -158,7 +158,7 @@ class World:
             reading = self._apply_changes(stage, reading, rows)
         return reading
 
-    def expected(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> FloatArray:
+    def expected_readings(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> FloatArray:
         """Return the noise-free readings of a plan, not rounded, shape (n_points,).
 
         Parameters
@@ -175,7 +175,7 @@ class World:
         """
         return self.noise_free_readings(self.view(plan, surfaces))
 
-    look, answer = view, noise_free_readings  # their old names
+    look, answer, expected = view, noise_free_readings, expected_readings  # their old names
 
     @renamed_arguments(look="view")
     def simulate(
@@ -210,7 +210,7 @@ class World:
         place = self._apply_changes("place", sent.place_mm, sent)
         there = replace(sent, place_mm=place, orientation_rad=self._apply_changes("turn", sent.orientation_rad, sent))
         pattern = self._apply_changes("pattern", np.zeros_like(place), there)
-        height_mm = sent.commanded("height_mm", otherwise=self.height_mm)
+        height_mm = sent.commanded_column("height_mm", otherwise=self.height_mm)
         # A tilt moves the spot in proportion to the height.
         lever = (height_mm / self.height_mm)[:, None]
         center = place + lever * self._apply_changes("tilt", np.zeros_like(place), there)
@@ -234,7 +234,7 @@ class World:
                 seen[chosen] += part.share * white(part.spot, x_mm, y_mm)
         there = replace(there, edge_mm=edge_mm)
         # Illumination by the LED falls with the inverse square of the distance.
-        dimming = sent.commanded("led", otherwise=1.0) * scale**-2.0
+        dimming = sent.commanded_column("led", otherwise=1.0) * scale**-2.0
         return View(self._apply_changes("seen", seen, there), dimming, there)
 
     def _recorded_readings(self, view: View, rng: np.random.Generator | None) -> FloatArray:
@@ -251,7 +251,7 @@ class World:
     def _apply_changes(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
         """Return a stage's values with the effects of that stage on them."""
         for effect in self.concealed:
-            if effect.stage == stage and isinstance(effect, Changes):
+            if effect.stage == stage and isinstance(effect, ChangesQuantity):
                 values = effect.change(values, rows)
         return values
 

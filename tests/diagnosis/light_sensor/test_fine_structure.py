@@ -38,7 +38,7 @@ def usable(recording: Recording) -> np.ndarray:
 
 
 def noise_free(spot, plan) -> Recording:
-    return Recording(plan, World(spot).expected(plan))
+    return Recording(plan, World(spot).expected_readings(plan))
 
 
 def test_the_slopes_are_those_of_a_mixture_with_a_little_of_each():
@@ -79,7 +79,7 @@ def test_effects_outlast_it():
     plan = two_way_plan()
     world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
     rng = np.random.default_rng(7)
-    recording = Recording(plan, world.expected(plan) + NOISE_SD * rng.standard_normal(len(plan)))
+    recording = Recording(plan, world.expected_readings(plan) + NOISE_SD * rng.standard_normal(len(plan)))
     found = fitted(recording)
     law = white_noise(len(recording))
     extent = Extent.of(recording)

@@ -223,7 +223,7 @@ def test_lost_readings_are_found_among_rounded_ones(declared):
     plan = replace(plan, instrumentation=instrumentation)
     world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
     rng = np.random.default_rng(3)
-    readings = np.round(world.expected(plan) + 0.45 * rng.standard_normal(len(plan)))
+    readings = np.round(world.expected_readings(plan) + 0.45 * rng.standard_normal(len(plan)))
     readings[rng.choice(len(plan), 16, replace=False)] = 3.0
     found = diagnose(Recording(plan, readings), rng=rng)
     assert found.verdict == "noise"

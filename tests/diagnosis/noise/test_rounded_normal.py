@@ -33,7 +33,7 @@ LAW = RoundedNormal(0.5 * STEP / SIGMA, SIGMA)
 def rounded(noise_sd: float, seed: int, *concealed: hidden.Concealed) -> Recording:
     plan = paper_plan()
     spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
-    mean = World(spot, concealed=concealed).expected(plan)
+    mean = World(spot, concealed=concealed).expected_readings(plan)
     readings = mean + noise_sd * np.random.default_rng(seed).standard_normal(len(plan))
     return Recording(plan, STEP * np.round(readings / STEP))
 
@@ -218,7 +218,7 @@ def test_where_no_three_readings_follow_each_other_nothing_says_that_a_step_is_c
     """Every second reading is missing, and the step is a sixtieth of the noise."""
     whole = paper_plan()
     spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
-    readings = World(spot).expected(whole) + 0.6 * np.random.default_rng(2).standard_normal(len(whole))
+    readings = World(spot).expected_readings(whole) + 0.6 * np.random.default_rng(2).standard_normal(len(whole))
     readings = np.where(np.arange(len(whole)) % 2, np.nan, np.round(readings, 2))
     found = diagnose(Recording(whole, readings), rng=np.random.default_rng(0))
     assert (found.verdict, found.report.noise.model) == ("clean", "white")

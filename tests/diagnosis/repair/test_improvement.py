@@ -21,7 +21,9 @@ def test_two_bumps_in_time_are_both_repaired():
     world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
     rng = np.random.default_rng(3)
     bumps = sum(sign * np.exp(-0.5 * ((PLAN.time_s - at) / 60) ** 2) for sign, at in ((1, 500), (-1, 1400)))
-    found = diagnose(Recording(PLAN, world.expected(PLAN) + SD * rng.standard_normal(len(PLAN)) + bumps), rng=rng)
+    found = diagnose(
+        Recording(PLAN, world.expected_readings(PLAN) + SD * rng.standard_normal(len(PLAN)) + bumps), rng=rng
+    )
     assert found.verdict == "unknown"
     gain = found.improvement
     assert gain.rms_before > 1.2 * SD

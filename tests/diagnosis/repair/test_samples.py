@@ -37,7 +37,7 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     again = FittedSensor.from_json(sensor.to_json())
     np.testing.assert_allclose(again.samples, samples.theta, rtol=1e-12)
     # Four Gaussians of positive mass stand for it: mean and covariance to a pixel, no response off by a tenth.
-    mixture = sensor.mixture()
+    mixture = sensor.mean_mixture()
     np.testing.assert_allclose(mixture.mean_mm, sensor.field.mean_mm, atol=sensor.field.pixel_mm)
     assert total_variation(mixture, sensor.field) < 0.1
 

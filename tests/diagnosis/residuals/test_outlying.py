@@ -68,7 +68,7 @@ def spotted(rows: np.ndarray) -> Recording:
     plan = paper_plan()
     world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
     rng = np.random.default_rng(11)
-    readings = world.expected(plan) + 0.4 * rng.standard_normal(len(plan))
+    readings = world.expected_readings(plan) + 0.4 * rng.standard_normal(len(plan))
     readings[rows] += 5.0 * rng.choice([-1.0, 1.0], len(rows))
     return Recording(plan, readings)
 

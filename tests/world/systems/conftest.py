@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.world.systems.chain import simulate
+from probewise.world.systems.chain import simulate_noise_free
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.kind import Law, Prior, SystemKind
 from probewise.world.systems.table import SystemTable
@@ -43,9 +43,9 @@ def solve():
 
     def run(name, numbers, **options):
         kind, rows, parameters = small(**options)
-        bare = simulate(kind, rows, parameters)
+        bare = simulate_noise_free(kind, rows, parameters)
         true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
         form = next(f for f in forms_of(true) if f.name == name)
-        return simulate(kind, rows, parameters, [(form, numbers)]).readings[0], rows, bare.readings[0]
+        return simulate_noise_free(kind, rows, parameters, [(form, numbers)]).readings[0], rows, bare.readings[0]
 
     return run

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.systems import System, read_run_table, read_simulator
 from probewise.world.challenge import Stratum
-from probewise.world.systems import KINDS, SystemCase, draw_system, owners_file_text, write_system_case
+from probewise.world.systems import KINDS, SystemCase, draw_system, simulator_file_text, write_system_case
 from probewise.world.systems.formulas import FLOW
 from probewise.world.systems.noise import noise_of_size
 
@@ -48,7 +48,7 @@ def test_the_owners_file_predicts_what_the_world_does(kind, tmp_path):
 @pytest.mark.parametrize("said", ["", 'noise = {"sd": 0.5, "step": 0.1}'])
 def test_the_owner_says_of_the_noise_what_they_know(said, tmp_path):
     case = _case(KINDS[0], said)
-    assert owners_file_text(case).count("noise") == (1 if said else 0)
+    assert simulator_file_text(case).count("noise") == (1 if said else 0)
     assert read_simulator(write_system_case(case, tmp_path)[0]).noise.step == (0.1 if said else None)
 
 

@@ -85,7 +85,7 @@ def test_a_case_of_every_stratum_holds_what_it_says(number, quick):
     assert (case.noise.name != "white") is case.stratum.other_noise
     for effect in case.effects:
         assert effect.in_vocabulary is (case.stratum.kind != "outside")
-        assert case.drawn.size([effect.form_with_parameters]) == pytest.approx(case.stratum.size, rel=0.01)
+        assert case.drawn.size_of_effects([effect.form_with_parameters]) == pytest.approx(case.stratum.size, rel=0.01)
 
 
 @pytest.mark.slow
@@ -94,4 +94,4 @@ def test_a_case_of_every_stratum_holds_what_it_says_of_any_system(number):
     case = draw_system_case(31, number)
     for effect in case.effects:
         assert effect.size_lambda == pytest.approx(case.stratum.size, rel=0.01)
-        assert case.drawn.size([effect.form_with_parameters]) == pytest.approx(case.stratum.size, rel=0.01)
+        assert case.drawn.size_of_effects([effect.form_with_parameters]) == pytest.approx(case.stratum.size, rel=0.01)

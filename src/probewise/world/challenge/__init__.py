@@ -8,12 +8,19 @@ caller supplies that refit.
 from probewise.world.challenge.cases import ALIASES, Case, draw_case, held_out_recordings
 from probewise.world.challenge.in_vocabulary import INSIDE, NEEDS_SENSOR, NO_PHYSICS, SINGLES
 from probewise.world.challenge.out_of_vocabulary import OUTSIDE
-from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
-from probewise.world.challenge.regions import Region
-from probewise.world.challenge.sensors import NOISE_LEVELS, NOISE_MODELS, NOISE_NAMES, SSFS, draw_sensor, with_noise
+from probewise.world.challenge.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
+from probewise.world.challenge.regions import CovariateRegion
+from probewise.world.challenge.sensors import (
+    NOISE_LEVELS,
+    NOISE_MODELS,
+    NOISE_NAMES,
+    SSFS,
+    draw_sensor,
+    with_noise_model,
+)
 from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
 from probewise.world.challenge.strata import WHEEL, CaseKind, Stratum, stratum_of
-from probewise.world.challenge.truth import Alias, HiddenEffect, Truth
+from probewise.world.challenge.truth import AliasedEffect, HiddenEffect, Truth
 
 __all__ = [
     "ALIASES",
@@ -28,23 +35,23 @@ __all__ = [
     "SINGLES",
     "SSFS",
     "WHEEL",
-    "Alias",
+    "AliasedEffect",
     "Case",
     "CaseKind",
+    "CovariateRegion",
     "EffectSizer",
     "HiddenEffect",
     "NormAfterRefit",
-    "Region",
     "Stratum",
     "Truth",
     "amplitude_of_size",
     "draw_case",
-    "draw_plan",
+    "draw_plan_with_displaced_patterns",
     "draw_sensor",
     "held_out_plans",
     "held_out_recordings",
     "stratum_of",
-    "with_noise",
+    "with_noise_model",
 ]
 
 Kind = CaseKind
@@ -55,3 +62,15 @@ Hidden = HiddenEffect
 
 held_out = held_out_recordings
 """The old name of `held_out_recordings`."""
+
+draw_plan = draw_plan_with_displaced_patterns
+"""The old name of `draw_plan_with_displaced_patterns`."""
+
+with_noise = with_noise_model
+"""The old name of `with_noise_model`."""
+
+Region = CovariateRegion
+"""The old name of `CovariateRegion`."""
+
+Alias = AliasedEffect
+"""The old name of `AliasedEffect`."""

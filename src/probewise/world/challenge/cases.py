@@ -12,12 +12,12 @@ from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.world.challenge.effect_samplers import CleanSetup
 from probewise.world.challenge.in_vocabulary import INSIDE, PAIRABLE, SINGLES
 from probewise.world.challenge.out_of_vocabulary import OUTSIDE
-from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
+from probewise.world.challenge.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
 from probewise.world.challenge.regions import region_of_effect
-from probewise.world.challenge.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise
+from probewise.world.challenge.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise_model
 from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
 from probewise.world.challenge.strata import Stratum, stratum_of
-from probewise.world.challenge.truth import Alias, HiddenEffect, Truth
+from probewise.world.challenge.truth import AliasedEffect, HiddenEffect, Truth
 from probewise.world.concealed import Disturbs
 from probewise.world.world import World
 
@@ -91,7 +91,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
         model = "white"  # only one noise fault at a time
     plan = replace(setup.plan, instrumentation=_simulated_instrumentation(setup.plan, model))
     concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in chosen.hidden))
-    world = with_noise(concealing, model, duration_s=setup.duration_s)
+    world = with_noise_model(concealing, model, duration_s=setup.duration_s)
     truth = Truth(
         seed=seed,
         number=number,
@@ -126,7 +126,7 @@ class _ConcealedEffects:
 
     hidden: tuple[HiddenEffect, ...] = ()
     cosine: float | None = None
-    alias: Alias | None = None
+    alias: AliasedEffect | None = None
 
 
 def _draw_plan_and_effects(
@@ -145,7 +145,7 @@ def _draw_plan_and_effects(
     """
     failure = NotConvergedError("no plan to try")
     for plan_name in plan_names:
-        setup = CleanSetup(draw_plan(plan_name, rng=plan_rng), sensor)
+        setup = CleanSetup(draw_plan_with_displaced_patterns(plan_name, rng=plan_rng), sensor)
         if stratum.kind == "clean":
             return plan_name, setup, _ConcealedEffects()
         sizer = EffectSizer(setup, norm_after_refit)
@@ -184,7 +184,7 @@ def _draw_effects(
             cosine = sizer.cosine(hidden.effect, other.effect)
             if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
                 raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
-            return _ConcealedEffects((hidden,), alias=Alias(other.effect, cosine))
+            return _ConcealedEffects((hidden,), alias=AliasedEffect(other.effect, cosine))
         case _:
             return _ConcealedEffects((draw_effect(stratum.kind),))
 

@@ -97,12 +97,12 @@ def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
-def make_draw_of_amplitude(make: OfAmplitude) -> Draw:
+def make_draw_without_random_parameters(make: OfAmplitude) -> Draw:
     """Make the `Draw` of an effect whose amplitude is its only parameter: nothing is drawn."""
     return lambda setup, rng: make
 
 
-def make_draw_of_sign(make: OfAmplitude) -> Draw:
+def make_draw_with_random_sign(make: OfAmplitude) -> Draw:
     """Make the `Draw` of an effect whose only drawn parameter is the sign of its amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:

@@ -15,12 +15,12 @@ from probewise.world.challenge.effect_samplers import (
     OfAmplitude,
     draw_log_uniform,
     draw_sign,
-    make_draw_of_amplitude,
-    make_draw_of_sign,
+    make_draw_with_random_sign,
+    make_draw_without_random_parameters,
 )
 
 
-def _make_draw_of_gradient(make: Callable[[float, float], concealed.Concealed]) -> Draw:
+def _make_draw_with_random_direction(make: Callable[[float, float], concealed.Concealed]) -> Draw:
     """Make the `Draw` of a gradient within 60 degrees of X, the direction in which every plan moves."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -67,7 +67,7 @@ def _draw_scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAm
     return lambda a: concealed.ScanMisplacement(s * a, scan)
 
 
-def _make_draw_on_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
+def _make_draw_with_random_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
     """Make the `Draw` of an effect of random sign on a random scan, or on all scans at that scan's orientation."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -103,9 +103,9 @@ def _draw_halo(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     return lambda a: concealed.Halo(a, r_mm)
 
 
-def _draw_ssf_order(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+def _draw_extra_gaussian(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     turn, sd_mm = rng.uniform(0, 2 * math.pi), rng.uniform(1.5, 4.0)
-    return lambda a: concealed.SSFOrder(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
+    return lambda a: concealed.ExtraGaussian(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
 
 
 def _draw_outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -120,42 +120,54 @@ def _draw_dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 INSIDE: Mapping[str, EffectSampler] = {
-    "ambient_gradient": EffectSampler(("place",), _make_draw_of_gradient(concealed.AmbientGradient), 0.01, 2.0),
+    "ambient_gradient": EffectSampler(
+        ("place",), _make_draw_with_random_direction(concealed.AmbientGradient), 0.01, 2.0
+    ),
     "ambient_step": EffectSampler(("time",), _draw_ambient_step, 0.5, 30.0),
-    "offset_drift": EffectSampler(("time",), make_draw_of_sign(concealed.OffsetDrift), 5.0, 500.0),
+    "offset_drift": EffectSampler(("time",), make_draw_with_random_sign(concealed.OffsetDrift), 5.0, 500.0),
     "gain_drift": EffectSampler(("time",), _draw_gain_drift, 0.03, 0.9),
-    "battery_sag": EffectSampler(("battery_mv",), make_draw_of_sign(concealed.BatterySag), 0.5, 10.0),
+    "battery_sag": EffectSampler(("battery_mv",), make_draw_with_random_sign(concealed.BatterySag), 0.5, 10.0),
     "flicker": EffectSampler(("time",), _draw_flicker, 0.3, 20.0),
     "saturation": EffectSampler(("level",), _draw_saturation, 0.05, 0.9),
     "nonlinearity": EffectSampler(
-        ("level",), make_draw_of_sign(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5
+        ("level",), make_draw_with_random_sign(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5
     ),
-    "quantisation": EffectSampler(("lattice",), make_draw_of_amplitude(concealed.Quantisation), 1.0, 20.0),
-    "hysteresis": EffectSampler(("direction",), make_draw_of_sign(concealed.Hysteresis), 0.3, 20.0),
-    "lag": EffectSampler(("slope", "direction"), make_draw_of_amplitude(concealed.Lag), 0.5, 20.0),
-    "backlash": EffectSampler(("slope", "direction"), make_draw_of_amplitude(concealed.Backlash), 0.5, 15.0),
+    "quantisation": EffectSampler(("lattice",), make_draw_without_random_parameters(concealed.Quantisation), 1.0, 20.0),
+    "hysteresis": EffectSampler(("direction",), make_draw_with_random_sign(concealed.Hysteresis), 0.3, 20.0),
+    "lag": EffectSampler(("slope", "direction"), make_draw_without_random_parameters(concealed.Lag), 0.5, 20.0),
+    "backlash": EffectSampler(
+        ("slope", "direction"), make_draw_without_random_parameters(concealed.Backlash), 0.5, 15.0
+    ),
     "position_scale": EffectSampler(("place",), _draw_position_scale, 0.02, 0.4),
     "periodic_position_error": EffectSampler(("place",), _draw_periodic_position_error, 0.3, 10.0),
-    "edge_misplacement": EffectSampler(("slope",), make_draw_of_sign(concealed.EdgeMisplacement), 0.3, 8.0),
+    "edge_misplacement": EffectSampler(("slope",), make_draw_with_random_sign(concealed.EdgeMisplacement), 0.3, 8.0),
     "scan_misplacement": EffectSampler(("slope", "scan"), _draw_scan_misplacement, 0.3, 8.0),
     "scan_angle_error": EffectSampler(
-        ("scan", "orientation"), _make_draw_on_scans(concealed.ScanAngleError), 5.0, 45.0
+        ("scan", "orientation"), _make_draw_with_random_scans(concealed.ScanAngleError), 5.0, 45.0
     ),
-    "orientation_error": EffectSampler(("orientation",), make_draw_of_sign(concealed.OrientationError), 5.0, 45.0),
-    "sensor_tilt": EffectSampler(("orientation", "slope"), _make_draw_of_gradient(concealed.SensorTilt), 0.3, 8.0),
-    "height_gradient": EffectSampler(("place",), make_draw_of_sign(concealed.HeightGradient), 0.01, 0.12),
-    "height_offset": EffectSampler(("scan",), _make_draw_on_scans(concealed.HeightOffset), 0.3, 8.0),
-    "albedo_gradient": EffectSampler(("place",), _make_draw_of_gradient(concealed.AlbedoGradient), 5e-4, 0.012),
+    "orientation_error": EffectSampler(
+        ("orientation",), make_draw_with_random_sign(concealed.OrientationError), 5.0, 45.0
+    ),
+    "sensor_tilt": EffectSampler(
+        ("orientation", "slope"), _make_draw_with_random_direction(concealed.SensorTilt), 0.3, 8.0
+    ),
+    "height_gradient": EffectSampler(("place",), make_draw_with_random_sign(concealed.HeightGradient), 0.01, 0.12),
+    "height_offset": EffectSampler(("scan",), _make_draw_with_random_scans(concealed.HeightOffset), 0.3, 8.0),
+    "albedo_gradient": EffectSampler(
+        ("place",), _make_draw_with_random_direction(concealed.AlbedoGradient), 5e-4, 0.012
+    ),
     "albedo_patch": EffectSampler(("place",), _draw_albedo_patch, 0.05, 1.0),
-    "edge_blur": EffectSampler(("edge_distance",), make_draw_of_amplitude(concealed.EdgeBlur), 1.0, 8.0),
+    "edge_blur": EffectSampler(("edge_distance",), make_draw_without_random_parameters(concealed.EdgeBlur), 1.0, 8.0),
     "edge_shadow": EffectSampler(("edge_distance",), _draw_edge_shadow, 0.02, 0.6),
     "halo": EffectSampler(("edge_distance",), _draw_halo, 0.05, 0.6),
     "glint": EffectSampler(("place",), _draw_glint, 1.0, 40.0),
-    "ssf_order": EffectSampler(("edge_distance",), _draw_ssf_order, 0.05, 0.5),
+    "ssf_order": EffectSampler(("edge_distance",), _draw_extra_gaussian, 0.05, 0.5),
     "signal_dependent_noise": EffectSampler(
-        ("level",), make_draw_of_amplitude(concealed.SignalDependentNoise), 1.0, 100.0
+        ("level",), make_draw_without_random_parameters(concealed.SignalDependentNoise), 1.0, 100.0
     ),
-    "correlated_noise": EffectSampler(("scan",), make_draw_of_amplitude(concealed.CorrelatedNoise), 0.3, 0.95),
+    "correlated_noise": EffectSampler(
+        ("scan",), make_draw_without_random_parameters(concealed.CorrelatedNoise), 0.3, 0.95
+    ),
     "outliers": EffectSampler((), _draw_outliers, 5.0, 30.0),
     "dropouts": EffectSampler((), _draw_dropouts, 0.01, 0.01, scalable=False),
 }

@@ -14,8 +14,8 @@ from probewise.world.challenge.effect_samplers import (
     OfAmplitude,
     draw_log_uniform,
     draw_sign,
-    make_draw_of_amplitude,
-    make_draw_of_sign,
+    make_draw_with_random_sign,
+    make_draw_without_random_parameters,
 )
 
 
@@ -44,9 +44,9 @@ def _draw_thermal_gain(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitu
     return lambda a: concealed.ThermalGain(a, setup.duration_s, phases)
 
 
-def _draw_cross_talk(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+def _draw_orientation_dependent_gain(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     phase = rng.uniform(0, 2 * math.pi)
-    return lambda a: concealed.CrossTalk(a, phase)
+    return lambda a: concealed.OrientationDependentGain(a, phase)
 
 
 def _draw_after_glow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -63,16 +63,16 @@ def _draw_chirp(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 OUTSIDE: Mapping[str, EffectSampler] = {
-    "bent_rail": EffectSampler(("place",), make_draw_of_sign(concealed.BentRail), 0.5, 20.0),
-    "twisted_rail": EffectSampler(("place",), make_draw_of_sign(concealed.TwistedRail), 0.5, 20.0),
+    "bent_rail": EffectSampler(("place",), make_draw_with_random_sign(concealed.QuadraticPositionError), 0.5, 20.0),
+    "twisted_rail": EffectSampler(("place",), make_draw_with_random_sign(concealed.CubicPositionError), 0.5, 20.0),
     "place_step": EffectSampler(("place",), _draw_place_step, 0.5, 10.0),
     "stick_slip": EffectSampler(("place",), _draw_stick_slip, 0.5, 8.0),
     "slipped_paper": EffectSampler(("time",), _draw_slipped_paper, 0.5, 10.0),
     "ghost": EffectSampler(("edge_distance",), _draw_ghost, 0.03, 0.5),
     "thermal_gain": EffectSampler(("time",), _draw_thermal_gain, 0.02, 0.5),
-    "cross_talk": EffectSampler(("orientation",), _draw_cross_talk, 0.03, 0.9),
-    "floor": EffectSampler(("level",), make_draw_of_amplitude(concealed.DeadZone), 0.03, 0.6),
-    "peak_memory": EffectSampler(("level",), make_draw_of_amplitude(concealed.PeakMemory), 0.05, 2.0),
+    "cross_talk": EffectSampler(("orientation",), _draw_orientation_dependent_gain, 0.03, 0.9),
+    "floor": EffectSampler(("level",), make_draw_without_random_parameters(concealed.DeadZone), 0.03, 0.6),
+    "peak_memory": EffectSampler(("level",), make_draw_without_random_parameters(concealed.PeakMemory), 0.05, 2.0),
     "after_glow": EffectSampler(("time",), _draw_after_glow, 1.0, 40.0),
     "chirp": EffectSampler(("time",), _draw_chirp, 0.3, 20.0),
 }

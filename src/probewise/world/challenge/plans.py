@@ -28,7 +28,7 @@ class _HeldOutScan:
     orientation_rad: float
 
 
-def draw_plan(name: str, *, rng: np.random.Generator) -> Plan:
+def draw_plan_with_displaced_patterns(name: str, *, rng: np.random.Generator) -> Plan:
     """Return a plan by name, its patterns displaced at random (and described so), its readings at an arm's times."""
     plan = PLANS[name]()
     patterns = {key: _randomly_displaced_pattern(pattern, rng) for key, pattern in plan.patterns.items()}

@@ -24,7 +24,7 @@ from probewise.world.concealed import (
 
 
 @dataclass(frozen=True)
-class Region:
+class CovariateRegion:
     """An interval of a covariate in its unit, or scans by name."""
 
     covariate: str
@@ -33,29 +33,29 @@ class Region:
     scans: tuple[str, ...] = ()
 
 
-def region_of_effect(effect: Concealed, sizer: EffectSizer) -> Region | None:
+def region_of_effect(effect: Concealed, sizer: EffectSizer) -> CovariateRegion | None:
     """Return the region of a local effect, or None for a global one.
 
     Of an effect on named scans: these scans. Of a step in time: the rest of the recording. Of a saturation: the levels
     above it. Of an edge shadow or an effect about a place: the distances, or the range of X in scans along X, where it
     is at least half its maximum.
     """
-    plan, clean = sizer.clean.plan, sizer.clean.readings
+    plan, clean = sizer.clean_recording.plan, sizer.clean_recording.readings
     match effect:
         case ScanMisplacement():
-            return Region("scan", scans=(effect.scan,))
+            return CovariateRegion("scan", scans=(effect.scan,))
         case ScanAngleError() | HeightOffset():
-            return Region("scan", scans=effect.scans)
+            return CovariateRegion("scan", scans=effect.scans)
         case AmbientStep():
-            return Region("time", effect.at_s, float(plan.time_s[-1]))
+            return CovariateRegion("time", effect.at_s, float(plan.time_s[-1]))
         case Saturation():
-            return Region("level", effect.level, float(clean.max()))
+            return CovariateRegion("level", effect.level, float(clean.max()))
         case EdgeShadow():
-            return Region("edge_distance", 0.0, effect.w * math.sqrt(2 * math.log(2)))
+            return CovariateRegion("edge_distance", 0.0, effect.w * math.sqrt(2 * math.log(2)))
         case AlbedoPatch() | Glint() | PlaceStep():
             along_x: BoolArray = np.abs(plan.direction_of_motion[:, 0]) > 0
-            strength = np.where(along_x, np.abs(sizer.recording(effect).readings - clean), 0.0)
+            strength = np.where(along_x, np.abs(sizer.recording_with_effects(effect).readings - clean), 0.0)
             there = plan.x_mm[strength >= strength.max() / 2]
-            return Region("place", float(there.min()), float(there.max()))
+            return CovariateRegion("place", float(there.min()), float(there.max()))
         case _:
             return None

@@ -10,10 +10,10 @@ import numpy as np
 from probewise.world.concealed import (
     Concealed,
     CorrelatedNoise,
-    DriftingNoise,
     Dropouts,
     HeavyTails,
     Outliers,
+    RisingNoiseSd,
     SignalDependentNoise,
 )
 from probewise.world.spots import Blob, Spot, gaussian_spot, ridge_spot, ring_spot, tailed_spot
@@ -37,18 +37,18 @@ NOISE_NAMES: Mapping[str, str] = {
 """Names of noise models in the vocabulary; the other models are declared in the plan or out of vocabulary."""
 
 
-def _draw_gaussian(rng: np.random.Generator) -> Spot:
+def _draw_gaussian_spot(rng: np.random.Generator) -> Spot:
     blob = Blob(
         1.0,
-        _draw_center(rng),
+        _draw_spot_center(rng),
         (4.0 * _draw_factor_about_one(rng), 2.5 * _draw_factor_about_one(rng)),
         float(rng.uniform(-0.4, 0.4)),
     )
     return gaussian_spot([blob], pixel_mm=_PIXEL_MM)
 
 
-def _draw_two_lobes(rng: np.random.Generator) -> Spot:
-    u, v = _draw_center(rng)
+def _draw_two_lobed_spot(rng: np.random.Generator) -> Spot:
+    u, v = _draw_spot_center(rng)
     apart = 3.5 * _draw_factor_about_one(rng)
     blobs = [
         Blob(
@@ -67,10 +67,10 @@ def _draw_two_lobes(rng: np.random.Generator) -> Spot:
     return gaussian_spot(blobs, pixel_mm=_PIXEL_MM)
 
 
-def _draw_ridge(rng: np.random.Generator) -> Spot:
+def _draw_ridge_spot(rng: np.random.Generator) -> Spot:
     return ridge_spot(
         9.0 * _draw_factor_about_one(rng),
-        center_mm=_draw_center(rng),
+        center_mm=_draw_spot_center(rng),
         lobes=float(rng.uniform(0.15, 0.35)),
         ridge_mm=float(rng.uniform(-4.0, -2.0)),
         ridge_width_mm=1.5,
@@ -79,28 +79,28 @@ def _draw_ridge(rng: np.random.Generator) -> Spot:
     )
 
 
-def _draw_ring(rng: np.random.Generator) -> Spot:
+def _draw_ring_spot(rng: np.random.Generator) -> Spot:
     off_axis = float(rng.uniform(0.2, 0.6))
     return ring_spot(
         3.3 * _draw_factor_about_one(rng),
         2.0 * _draw_factor_about_one(rng),
-        center_mm=_draw_center(rng),
+        center_mm=_draw_spot_center(rng),
         off_axis=off_axis,
         pixel_mm=_PIXEL_MM,
     )
 
 
-def _draw_skewed(rng: np.random.Generator) -> Spot:
+def _draw_skewed_spot(rng: np.random.Generator) -> Spot:
     core = (1.6 * _draw_factor_about_one(rng), 1.1 * _draw_factor_about_one(rng))
-    return tailed_spot(core, center_mm=_draw_center(rng), skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
+    return tailed_spot(core, center_mm=_draw_spot_center(rng), skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
 
 
 SSFS: Mapping[str, Callable[[np.random.Generator], Spot]] = {
-    "gaussian": _draw_gaussian,
-    "two_lobes": _draw_two_lobes,
-    "ridge": _draw_ridge,
-    "ring": _draw_ring,
-    "skewed": _draw_skewed,
+    "gaussian": _draw_gaussian_spot,
+    "two_lobes": _draw_two_lobed_spot,
+    "ridge": _draw_ridge_spot,
+    "ring": _draw_ring_spot,
+    "skewed": _draw_skewed_spot,
 }
 """The last three are not mixtures of Gaussians; the best mixture of four leaves a residual of lambda about 1 at the
 middle noise level: a good but inexact model."""
@@ -117,7 +117,7 @@ def draw_sensor(ssf: str, noise_level: str, *, rng: np.random.Generator) -> Worl
     return World(draw_spot(ssf, rng=rng), black=black, white=white, noise_sd=NOISE_LEVELS[noise_level])
 
 
-def with_noise(world: World, model: str, *, duration_s: float) -> World:
+def with_noise_model(world: World, model: str, *, duration_s: float) -> World:
     """Return the world with a noise model of NOISE_MODELS; `noise_sd` remains the sd of its Gaussian core.
 
     "quantised" readings are rounded to whole units, which the plan should declare.
@@ -127,7 +127,7 @@ def with_noise(world: World, model: str, *, duration_s: float) -> World:
     more: Mapping[str, tuple[Concealed, ...]] = {
         "white": (),
         "ar1": (CorrelatedNoise(0.3),),
-        "drifting": (DriftingNoise(2.0, duration_s),),
+        "drifting": (RisingNoiseSd(2.0, duration_s),),
         "t4": (HeavyTails(4.0),),
         "outliers": (Outliers(0.02, 8.0),),
         "signal_dependent": (SignalDependentNoise(2.0),),
@@ -140,5 +140,5 @@ def _draw_factor_about_one(rng: np.random.Generator) -> float:
     return float(rng.uniform(0.85, 1.15))
 
 
-def _draw_center(rng: np.random.Generator) -> tuple[float, float]:
+def _draw_spot_center(rng: np.random.Generator) -> tuple[float, float]:
     return float(rng.uniform(-0.8, 0.8)), float(rng.uniform(0.8, 2.2))

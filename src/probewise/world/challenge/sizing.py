@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import TypeAlias
 
 import numpy as np
@@ -116,11 +117,11 @@ class EffectSizer:
         return self.setup.world.view(self.setup.plan)
 
     @cached_property
-    def clean(self) -> Recording:
+    def clean_recording(self) -> Recording:
         """Recording of noise-free readings without any effect."""
         return self.setup.world.simulate(self.setup.plan, rng=None, view=self._clean_view).without_declared_range()
 
-    def recording(self, *concealed: Concealed) -> Recording:
+    def recording_with_effects(self, *concealed: Concealed) -> Recording:
         """Return a recording of the noise-free readings with these effects."""
         same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
         world = replace(self.setup.world, concealed=concealed)
@@ -131,13 +132,21 @@ class EffectSizer:
     def size(self, *concealed: Concealed) -> float:
         """Return lambda of the effects together, in sds of the noise's Gaussian core."""
         if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
-            return noise_effect_size(concealed[0], self._clean_view, self.clean.readings, self.setup.world.noise_sd)
-        return self.norm_after_refit(self.clean, self.recording(*concealed)) / self.setup.world.noise_sd
+            return noise_effect_size(
+                concealed[0], self._clean_view, self.clean_recording.readings, self.setup.world.noise_sd
+            )
+        return (
+            self.norm_after_refit(self.clean_recording, self.recording_with_effects(*concealed))
+            / self.setup.world.noise_sd
+        )
 
     def cosine(self, one: Concealed, other: Concealed) -> float:
         """Return the cosine of two effects after the refit, from the sizes of both together and of each."""
         a, b, both = self.size(one), self.size(other), self.size(one, other)
         return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
+
+    # Old names.
+    clean, recording = property(attrgetter("clean_recording")), recording_with_effects
 
 
 def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_sd: float) -> float:
@@ -164,7 +173,7 @@ def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_
     n_points = len(view.seen)
     match effect:
         case CorrelatedNoise():
-            n_correlated = n_points - int(view.rows.starts_scan().sum())
+            n_correlated = n_points - int(view.rows.scan_start_mask().sum())
             return math.sqrt(-n_correlated * math.log(1 - effect.rho**2))
         case SignalDependentNoise():
             variance = 1 + effect.ratio * view.seen

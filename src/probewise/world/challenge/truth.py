@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from probewise.world.challenge.in_vocabulary import INSIDE, NO_PHYSICS
 from probewise.world.challenge.out_of_vocabulary import OUTSIDE
-from probewise.world.challenge.regions import Region
+from probewise.world.challenge.regions import CovariateRegion
 from probewise.world.challenge.sensors import NOISE_NAMES
 from probewise.world.challenge.strata import Stratum
 from probewise.world.concealed import Concealed
@@ -30,7 +30,7 @@ class HiddenEffect:
 
     effect: Concealed
     size_lambda: float
-    region: Region | None = None
+    region: CovariateRegion | None = None
 
     @property
     def name(self) -> str:
@@ -56,7 +56,7 @@ class HiddenEffect:
 
 
 @dataclass(frozen=True)
-class Alias:
+class AliasedEffect:
     """An effect that is aliased with the concealed one in this plan, and their cosine."""
 
     effect: Concealed
@@ -97,7 +97,7 @@ class Truth:
     white: float
     hidden: tuple[HiddenEffect, ...] = ()
     cosine: float | None = None
-    alias: Alias | None = None
+    alias: AliasedEffect | None = None
 
     @property
     def combination(self) -> tuple[str, ...]:

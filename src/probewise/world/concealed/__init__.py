@@ -15,19 +15,19 @@ from probewise.world.concealed.converter import Lag, Quantisation, Saturation
 from probewise.world.concealed.footprint import (
     EdgeBlur,
     EdgeShadow,
+    ExtraGaussian,
     Halo,
     HeightGradient,
     HeightOffset,
     SensorTilt,
-    SSFOrder,
 )
 from probewise.world.concealed.light import BatterySag, GainDrift, Nonlinearity
 from probewise.world.concealed.noise import (
     CorrelatedNoise,
-    DriftingNoise,
     Dropouts,
     HeavyTails,
     Outliers,
+    RisingNoiseSd,
     SignalDependentNoise,
 )
 from probewise.world.concealed.offsets import (
@@ -40,22 +40,22 @@ from probewise.world.concealed.offsets import (
 )
 from probewise.world.concealed.out_of_vocabulary import (
     AfterGlow,
-    BentRail,
     Chirp,
-    CrossTalk,
+    CubicPositionError,
     DeadZone,
     Ghost,
+    OrientationDependentGain,
     PeakMemory,
     PlaceStep,
+    QuadraticPositionError,
     SlippedPaper,
     StickSlip,
     ThermalGain,
-    TwistedRail,
 )
 from probewise.world.concealed.stages import (
     STAGES,
-    Changes,
     ChangesFootprint,
+    ChangesQuantity,
     Concealed,
     Disturbs,
     FootprintPart,
@@ -73,20 +73,19 @@ __all__ = [
     "AmbientStep",
     "Backlash",
     "BatterySag",
-    "BentRail",
-    "Changes",
     "ChangesFootprint",
+    "ChangesQuantity",
     "Chirp",
     "Concealed",
     "CorrelatedNoise",
-    "CrossTalk",
+    "CubicPositionError",
     "DeadZone",
     "Disturbs",
-    "DriftingNoise",
     "Dropouts",
     "EdgeBlur",
     "EdgeMisplacement",
     "EdgeShadow",
+    "ExtraGaussian",
     "Flicker",
     "FootprintPart",
     "GainDrift",
@@ -100,15 +99,17 @@ __all__ = [
     "Lag",
     "Nonlinearity",
     "OffsetDrift",
+    "OrientationDependentGain",
     "OrientationError",
     "Outliers",
     "PeakMemory",
     "PeriodicPositionError",
     "PlaceStep",
     "PositionScale",
+    "QuadraticPositionError",
     "Quantisation",
     "Retouches",
-    "SSFOrder",
+    "RisingNoiseSd",
     "Saturation",
     "ScanAngleError",
     "ScanMisplacement",
@@ -118,7 +119,6 @@ __all__ = [
     "Stage",
     "StickSlip",
     "ThermalGain",
-    "TwistedRail",
 ]
 
 Glimpse = FootprintPart
@@ -126,3 +126,21 @@ Glimpse = FootprintPart
 
 Looks = ChangesFootprint
 """The old name of `ChangesFootprint`."""
+
+Changes = ChangesQuantity
+"""The old name of `ChangesQuantity`."""
+
+BentRail = QuadraticPositionError
+"""The old name of `QuadraticPositionError`."""
+
+TwistedRail = CubicPositionError
+"""The old name of `CubicPositionError`."""
+
+CrossTalk = OrientationDependentGain
+"""The old name of `OrientationDependentGain`."""
+
+SSFOrder = ExtraGaussian
+"""The old name of `ExtraGaussian`."""
+
+DriftingNoise = RisingNoiseSd
+"""The old name of `RisingNoiseSd`."""

@@ -64,7 +64,7 @@ class ScanAngleError:
     scans: tuple[str, ...]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        return values + math.radians(self.deg) * rows.in_scans(self.scans)
+        return values + math.radians(self.deg) * rows.in_scans_mask(self.scans)
 
 
 @dataclass(frozen=True)

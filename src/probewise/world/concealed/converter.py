@@ -23,7 +23,7 @@ class Lag:
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
         """Mix each reading with the one before: v_k = a v_(k-1) + (1 - a) y_k, a = exp(-(t_k - t_(k-1))/tau)."""
         kept = np.exp(-np.diff(rows.time_s, prepend=-np.inf) / self.tau_s)
-        kept[rows.starts_scan()] = 0.0
+        kept[rows.scan_start_mask()] = 0.0
         out = values.copy()
         for k in range(1, len(out)):
             out[k] = kept[k] * out[k - 1] + (1 - kept[k]) * values[k]

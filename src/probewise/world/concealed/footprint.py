@@ -49,7 +49,7 @@ class HeightOffset:
     scans: tuple[str, ...]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        return values + self.mm * rows.in_scans(self.scans)
+        return values + self.mm * rows.in_scans_mask(self.scans)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Halo:
 
 
 @dataclass(frozen=True)
-class SSFOrder:
+class ExtraGaussian:
     """One more round Gaussian in the footprint, in the sensor frame; not a physical fault."""
 
     name: ClassVar[str] = "ssf_order"

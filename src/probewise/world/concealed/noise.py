@@ -25,7 +25,7 @@ class CorrelatedNoise:
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
         fresh = math.sqrt(1 - self.rho**2)
         out = values.copy()
-        for k in np.flatnonzero(~rows.starts_scan()):
+        for k in np.flatnonzero(~rows.scan_start_mask()):
             out[k] = self.rho * out[k - 1] + fresh * values[k]
         return out
 
@@ -43,7 +43,7 @@ class SignalDependentNoise:
 
 
 @dataclass(frozen=True)
-class DriftingNoise:
+class RisingNoiseSd:
     """Noise sd that rises to `factor` times its value within `over_s`, then stays constant."""
 
     name: ClassVar[str] = "drifting_noise"

@@ -15,7 +15,7 @@ from probewise.world.rows import Rows
 
 
 @dataclass(frozen=True)
-class BentRail:
+class QuadraticPositionError:
     """An error in X quadratic in X: `amp_mm` at 10 mm from the origin."""
 
     name: ClassVar[str] = "bent_rail"
@@ -27,7 +27,7 @@ class BentRail:
 
 
 @dataclass(frozen=True)
-class TwistedRail:
+class CubicPositionError:
     """An error in X cubic in X: `amp_mm` at 10 mm from the origin."""
 
     name: ClassVar[str] = "twisted_rail"
@@ -121,7 +121,7 @@ class ThermalGain:
 
 
 @dataclass(frozen=True)
-class CrossTalk:
+class OrientationDependentGain:
     """Gain that varies with twice the orientation: a pull of the cable gets into the signal."""
 
     name: ClassVar[str] = "cross_talk"
@@ -156,7 +156,7 @@ class PeakMemory:
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
         peaks = values.copy()
-        for part in np.split(np.arange(len(values)), np.flatnonzero(rows.starts_scan())[1:]):
+        for part in np.split(np.arange(len(values)), np.flatnonzero(rows.scan_start_mask())[1:]):
             peaks[part] = np.maximum.accumulate(values[part])
         return values + self.share * peaks
 

@@ -47,7 +47,7 @@ class FootprintPart:
 
 
 @runtime_checkable
-class Changes(Protocol):
+class ChangesQuantity(Protocol):
     """An effect that changes one quantity per reading.
 
     The quantity by stage: "place", position of the sensor, (n_points, 2), mm; "turn", its orientation, rad; "pattern",
@@ -105,4 +105,4 @@ class Disturbs(Protocol):
         ...
 
 
-Concealed: TypeAlias = Changes | Retouches | ChangesFootprint | Disturbs
+Concealed: TypeAlias = ChangesQuantity | Retouches | ChangesFootprint | Disturbs

@@ -34,7 +34,7 @@ class ScanMisplacement:
     scan: str
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        return values + self.offset_mm * rows.across * rows.in_scans((self.scan,))[:, None]
+        return values + self.offset_mm * rows.across * rows.in_scans_mask((self.scan,))[:, None]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ fits are implemented a second time.
 """
 
 from probewise.world.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, draw_system_case
-from probewise.world.systems.files import owners_file_text, truth_of, write_system_case
+from probewise.world.systems.files import simulator_file_text, truth_of, write_system_case
 from probewise.world.systems.noise import OTHER_NOISE
 from probewise.world.systems.right_model import right_predictions
 from probewise.world.systems.strata import SYSTEMS_WHEEL, system_stratum_of
@@ -19,8 +19,8 @@ __all__ = [
     "SystemEffect",
     "draw_system",
     "draw_system_case",
-    "owners_file_text",
     "right_predictions",
+    "simulator_file_text",
     "system_stratum_of",
     "truth_of",
     "write_system_case",
@@ -29,5 +29,5 @@ __all__ = [
 Drawn = DrawnSystem
 """The old name of `DrawnSystem`."""
 
-owners_file = owners_file_text
-"""The old name of `owners_file_text`."""
+owners_file = owners_file_text = simulator_file_text
+"""The old names of `simulator_file_text`."""

@@ -15,9 +15,9 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
 from probewise.world.challenge.sizing import amplitude_of_size
 from probewise.world.challenge.strata import Stratum
-from probewise.world.systems.chain import simulate
+from probewise.world.systems.chain import simulate_noise_free
 from probewise.world.systems.designs import design_runs
-from probewise.world.systems.fit import AddedForm, LeastSquaresFit, Model, project_out
+from probewise.world.systems.fit import AddedForm, LeastSquaresFit, ModelWithForms, project_out
 from probewise.world.systems.forms.form import Form, FormWithParameters, parameter_arrays
 from probewise.world.systems.forms.out_of_vocabulary import OUT_OF_VOCABULARY, forms_out_of_vocabulary
 from probewise.world.systems.forms.true_system import TrueSystem
@@ -65,12 +65,12 @@ class DrawnSystem:
     @cached_property
     def diagnosed_table(self) -> SystemTable:
         """The table of the rows given to the diagnosis."""
-        return self.table.take(self.diagnosed_row_numbers)
+        return self.table.select_rows(self.diagnosed_row_numbers)
 
     @cached_property
-    def nominal_model(self) -> Model:
+    def nominal_model(self) -> ModelWithForms:
         """The nominal model of those rows."""
-        return Model(self.kind, self.diagnosed_table)
+        return ModelWithForms(self.kind, self.diagnosed_table)
 
     @cached_property
     def true_coordinates(self) -> FloatArray:
@@ -87,7 +87,7 @@ class DrawnSystem:
     def true_system(self) -> TrueSystem:
         """The system at its true parameters, about which effects are built."""
         parameters = self.nominal_model.parameters_at(self.true_coordinates[None, :])
-        trace = simulate(self.kind, self.diagnosed_table, parameters)
+        trace = simulate_noise_free(self.kind, self.diagnosed_table, parameters)
         return TrueSystem(
             self.kind,
             self.diagnosed_table,
@@ -98,10 +98,10 @@ class DrawnSystem:
 
     def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
         """Return noise-free readings with these effects at all rows, (n_points,)."""
-        whole = Model(self.kind, self.table)
+        whole = ModelWithForms(self.kind, self.table)
         with np.errstate(all="ignore"):
             at = whole.coordinates_of(self.shared, self.by_run)
-            trace = simulate(self.kind, self.table, whole.parameters_at(at[None, :]), effects)
+            trace = simulate_noise_free(self.kind, self.table, whole.parameters_at(at[None, :]), effects)
         return np.asarray(trace.readings[0])
 
     def simulate_diagnosed_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
@@ -110,7 +110,7 @@ class DrawnSystem:
         Raises NotConvergedError if they are not finite.
         """
         with np.errstate(all="ignore"):
-            readings: FloatArray = simulate(
+            readings: FloatArray = simulate_noise_free(
                 self.kind,
                 self.diagnosed_table,
                 self.nominal_model.parameters_at(self.true_coordinates[None, :]),
@@ -120,14 +120,14 @@ class DrawnSystem:
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
 
-    def size(self, effects: Sequence[FormWithParameters]) -> float:
+    def size_of_effects(self, effects: Sequence[FormWithParameters]) -> float:
         """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
         return math.sqrt(
             self.nominal_model.fit(self.simulate_diagnosed_rows(effects), self.true_coordinates).chi_square
         )
 
     # Old names.
-    everywhere, changed = simulate_all_rows, simulate_diagnosed_rows
+    everywhere, changed, size = simulate_all_rows, simulate_diagnosed_rows, size_of_effects
     rows, kept, seen, at, bare = (
         property(attrgetter(name))
         for name in ("table", "diagnosed_row_numbers", "diagnosed_table", "true_coordinates", "fit_without_effects")
@@ -314,7 +314,7 @@ def _draw_effects(
         _draw_form([f for f in forms if vocabulary_name(f).split(":")[0] == name], str(name), rng) for name in names
     ]
     first, second = (_draw_effect_of_size(form, stratum.size, drawn, rng) for form in both)
-    cosine = _cosine(drawn, first, second)
+    cosine = _cosine_of_effects(drawn, first, second)
     if abs(cosine) >= _APART:
         raise NotConvergedError(f"{first.name} and {second.name} are alike: cosine {cosine:.2f}")
     return (
@@ -346,7 +346,7 @@ def _draw_effect_of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.
         raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
     first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
     amplitude = amplitude_of_size(
-        lambda a: drawn.size(at_amplitude(a)),
+        lambda a: drawn.size_of_effects(at_amplitude(a)),
         wanted,
         first=first,
         limit=form.limit,
@@ -354,16 +354,18 @@ def _draw_effect_of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.
         acceptable=0.01,
         max_calls=14,
     )
-    return SystemEffect(form, form.of_amplitude(sign * amplitude, more), drawn.size(at_amplitude(amplitude)), {}, ())
+    return SystemEffect(
+        form, form.of_amplitude(sign * amplitude, more), drawn.size_of_effects(at_amplitude(amplitude)), {}, ()
+    )
 
 
-def _with_true_time_in_bank(form: Form, values: Mapping[str, float]) -> Form:
+def _form_with_true_step_time_in_bank(form: Form, values: Mapping[str, float]) -> Form:
     """Add the effect's own time of a step to the bank of a form with a step; return other forms unchanged."""
     at = next((name for name in ("at_s", "at_row") if name in values and name in form.bank[0][0]), None)
     return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
 
 
-def _cosine(drawn: DrawnSystem, one: SystemEffect, other: SystemEffect) -> float:
+def _cosine_of_effects(drawn: DrawnSystem, one: SystemEffect, other: SystemEffect) -> float:
     a, b = (
         project_out(
             drawn.simulate_diagnosed_rows([e.form_with_parameters]) - drawn.fit_without_effects.readings,
@@ -380,12 +382,12 @@ def _effect_with_rivals(
     """Return an effect with its aliases and visible covariates, found in the presence of the other effects."""
     target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
     beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
-    model = Model(drawn.kind, drawn.diagnosed_table, beside)
+    model = ModelWithForms(drawn.kind, drawn.diagnosed_table, beside)
     start = model.coordinates_of(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
     rivals = rivals_with_nats(
         drawn.true_system,
-        [_with_true_time_in_bank(form, effect.values) for form in forms],
+        [_form_with_true_step_time_in_bank(form, effect.values) for form in forms],
         target,
         fitted,
         model,

@@ -22,7 +22,7 @@ class NoiseFreeResult:
     states: Mapping[str, FloatArray]
 
 
-def simulate(
+def simulate_noise_free(
     kind: SystemKind,
     rows: SystemTable,
     parameters: Mapping[str, FloatArray],

@@ -22,7 +22,7 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
     seen = case.drawn.diagnosed_row_numbers
     later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
     texts = {
-        "simulator.py": owners_file_text(case),
+        "simulator.py": simulator_file_text(case),
         "table.csv": table_text(case, seen),
         "table_test.csv": table_text(case, later),
         "truth.json": json.dumps(truth_of(case), indent=1, allow_nan=False) + "\n",
@@ -33,7 +33,7 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
     return simulator, table, test, truth
 
 
-def owners_file_text(case: SystemCase) -> str:
+def simulator_file_text(case: SystemCase) -> str:
     """Return the text of simulator.py: the nominal simulator as its owner would hand it in."""
     return case.drawn.kind.text.replace("{noise}\n", f"{case.noise_text}\n" if case.noise_text else "")
 
@@ -69,8 +69,8 @@ def truth_of(case: SystemCase) -> dict[str, Any]:
         )
     return {
         "effects": effects,
-        "rivals": [] if pair or not case.effects else _name_and_nats_rows(case.effects[0]),
-        "rivals_of": {effect.name: _name_and_nats_rows(effect) for effect in case.effects} if pair else {},
+        "rivals": [] if pair or not case.effects else _rival_name_and_nats_rows(case.effects[0]),
+        "rivals_of": {effect.name: _rival_name_and_nats_rows(effect) for effect in case.effects} if pair else {},
         "covariates": list(case.effects[0].covariates) if len(case.effects) == 1 else [],
         "parameters": dict(case.drawn.shared),
         "noise_sd": case.drawn.kind.sd,
@@ -91,5 +91,5 @@ def _effect_json(effect: SystemEffect) -> dict[str, Any]:
     )
 
 
-def _name_and_nats_rows(effect: SystemEffect) -> list[list[Any]]:
+def _rival_name_and_nats_rows(effect: SystemEffect) -> list[list[Any]]:
     return [[name, round(nats, 3)] for name, nats in effect.rivals.items()]

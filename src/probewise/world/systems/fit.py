@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.world.systems.chain import simulate
+from probewise.world.systems.chain import simulate_noise_free
 from probewise.world.systems.forms.form import Form, FormWithParameters
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.table import SystemTable
@@ -21,7 +21,7 @@ _FORM_STEP = 0.1  # of the form's own step
 _FAR = 1e9  # residual in sds where a law diverges
 
 
-def fitted_parameters(form: Form) -> tuple[str, ...]:
+def names_of_fitted_parameters(form: Form) -> tuple[str, ...]:
     """Return the names of a form's fitted parameters: not the time of a step, nor values of runs without rows."""
     return tuple(name for name, step in form.steps.items() if step > 0)
 
@@ -46,7 +46,7 @@ class LeastSquaresFit:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class ModelWithForms:
     """A nominal model with additional forms, as a function of coordinates.
 
     Coordinates are the shared parameters, each `per_run` parameter in every run, and the fitted parameters of the forms
@@ -58,30 +58,30 @@ class Model:
     added: Sequence[AddedForm] = field(default=())
 
     @cached_property
-    def _runs(self) -> list[int]:
+    def _run_numbers(self) -> list[int]:
         return [int(self.table.run[own[0]]) for own in self.table.rows_by_run]
 
     @property
     def n_nominal_coordinates(self) -> int:
         """Number of coordinates of the nominal model."""
-        return len(self.kind.shared_names) + len(self.kind.per_run) * len(self._runs)
+        return len(self.kind.shared_parameter_names) + len(self.kind.per_run) * len(self._run_numbers)
 
     def coordinates_of(self, shared: Mapping[str, float], by_run: Mapping[str, FloatArray]) -> FloatArray:
         """Return the coordinates of parameters (`by_run` for all runs of the case) and of the forms' start values."""
-        own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared_names]
-        each = [self.kind.priors[name].coordinate(by_run[name][self._runs]) for name in self.kind.per_run]
+        own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared_parameter_names]
+        each = [self.kind.priors[name].coordinate(by_run[name][self._run_numbers]) for name in self.kind.per_run]
         numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.added for name in b.free]
         return np.concatenate([np.ravel(own), *each, numbers])
 
     def parameters_at(self, x: FloatArray) -> dict[str, FloatArray]:
         """Return parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points)."""
-        out, n = {}, len(self.kind.shared_names)
-        for k, name in enumerate(self.kind.shared_names):
+        out, n = {}, len(self.kind.shared_parameter_names)
+        for k, name in enumerate(self.kind.shared_parameter_names):
             out[name] = self.kind.priors[name].value(x[:, k : k + 1])
-        at = np.searchsorted(self._runs, self.table.run)
+        at = np.searchsorted(self._run_numbers, self.table.run)
         for name in self.kind.per_run:
-            out[name] = self.kind.priors[name].value(x[:, n : n + len(self._runs)])[:, at]
-            n += len(self._runs)
+            out[name] = self.kind.priors[name].value(x[:, n : n + len(self._run_numbers)])[:, at]
+            n += len(self._run_numbers)
         return out
 
     def effects_at(self, x: FloatArray) -> list[FormWithParameters]:
@@ -98,14 +98,14 @@ class Model:
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return noise-free readings at coordinates (n_samples, n_coordinates): (n_samples, n_points)."""
-        return simulate(self.kind, self.table, self.parameters_at(x), self.effects_at(x)).readings
+        return simulate_noise_free(self.kind, self.table, self.parameters_at(x), self.effects_at(x)).readings
 
     def predict_with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (n_points,) and their slopes (n_points, n_coordinates).
 
         Parameters per run are varied in all runs at once.
         """
-        n_shared, n_runs = len(self.kind.shared_names), len(self._runs)
+        n_shared, n_runs = len(self.kind.shared_parameter_names), len(self._run_numbers)
         moves = [np.eye(len(x))[k] for k in range(n_shared)]
         for j in range(len(self.kind.per_run)):
             moves.append(np.isin(np.arange(len(x)), n_shared + j * n_runs + np.arange(n_runs)).astype(float))
@@ -121,7 +121,7 @@ class Model:
             if len(columns) == 1 and not n_shared <= columns[0] < self.n_nominal_coordinates:
                 out[:, columns[0]] = slope
             else:
-                for column, run in zip(columns, self._runs, strict=True):
+                for column, run in zip(columns, self._run_numbers, strict=True):
                     here = self.table.run == run
                     out[here, column] = slope[here]
         return found[0], out

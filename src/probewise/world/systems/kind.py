@@ -160,6 +160,6 @@ class SystemKind:
     defines_states: bool = True
 
     @property
-    def shared_names(self) -> tuple[str, ...]:
+    def shared_parameter_names(self) -> tuple[str, ...]:
         """Parameters that all runs share."""
         return tuple(name for name in self.priors if name not in self.per_run)

@@ -65,7 +65,7 @@ class _Integration:
     effects: Sequence[FormWithParameters]
 
     @cached_property
-    def row_by_position(self) -> IntArray:
+    def rows_by_position_and_run(self) -> IntArray:
         """Row at each position of each run, (n_places, n_runs); short runs repeat their last row."""
         longest = max(len(own) for own in self.table.rows_by_run)
         filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.table.rows_by_run]
@@ -101,16 +101,16 @@ class _Integration:
             at = (
                 self._at_first_rows(self.parameters[given]) if isinstance(given, str) else np.full((1, 1), float(given))
             )
-            out.append(np.broadcast_to(at, (self.n_samples, self.row_by_position.shape[1])))
+            out.append(np.broadcast_to(at, (self.n_samples, self.rows_by_position_and_run.shape[1])))
         return np.array(out)
 
     def _at_first_rows(self, values: FloatArray) -> FloatArray:
-        return values if values.shape[1] == 1 else values[:, self.row_by_position[0]]
+        return values if values.shape[1] == 1 else values[:, self.rows_by_position_and_run[0]]
 
     def rate_inputs_in_gap(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Instants]]:
         """Return a function of the share of the gap from position k to the next, giving parameters and columns."""
-        here, there = self.row_by_position[k, runs], self.row_by_position[k + 1, runs]
-        first = self.row_by_position[0, runs]
+        here, there = self.rows_by_position_and_run[k, runs], self.rows_by_position_and_run[k + 1, runs]
+        first = self.rows_by_position_and_run[0, runs]
         law, time = self.kind.law, self.table.time
         assert law is not None
         assert time is not None
@@ -166,7 +166,7 @@ class _Integration:
 
     def discontinuity_shares(self, k: int) -> list[float]:
         """Return shares of the gap from position k to the next: 0, the discontinuities of any sample or run, and 1."""
-        here, there = self.row_by_position[k], self.row_by_position[k + 1]
+        here, there = self.rows_by_position_and_run[k], self.rows_by_position_and_run[k + 1]
         begin, gap = self.table.t[here], self.table.t[there] - self.table.t[here]
         moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
         if self.delays:
@@ -183,7 +183,7 @@ class _Integration:
         """Return every state at every row, (n_samples, n_points)."""
         law = self.kind.law
         assert law is not None
-        names, n_positions = list(law.start), len(self.row_by_position)
+        names, n_positions = list(law.start), len(self.rows_by_position_and_run)
         s = self.clipped_to_bounds(self.initial_states().copy(), names)
         kept = np.empty((*s.shape, n_positions))
         kept[..., 0] = s
@@ -201,9 +201,9 @@ class _Integration:
         assert time is not None
         t = self.columns[time]
         gap, at, hard = (
-            t[:, self.row_by_position[k + 1]] - t[:, self.row_by_position[k]],
+            t[:, self.rows_by_position_and_run[k + 1]] - t[:, self.rows_by_position_and_run[k]],
             self.rate_inputs_in_gap(k),
-            self.frictions_and_bounds,
+            self.friction_and_bound_forms,
         )
 
         def free_rates(share: float, y: FloatArray) -> dict[str, Any]:
@@ -258,7 +258,7 @@ class _Integration:
         return s
 
     @property
-    def frictions_and_bounds(self) -> list[tuple[Any, FloatArray]]:
+    def friction_and_bound_forms(self) -> list[tuple[Any, FloatArray]]:
         """The forms of dry friction and of bounds, each with its sizes or levels, (n_samples or 1, 1)."""
         return [(f, np.atleast_2d(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
 
@@ -272,21 +272,21 @@ class _Integration:
         return out
 
     def _integration_of_sample(self, i: int) -> _Integration:
-        def of_sample(v: Any) -> Any:
+        def values_of_sample(v: Any) -> Any:
             v = np.atleast_2d(v)
             return v[i : i + 1] if len(v) > 1 else v
 
         return _Integration(
             self.kind,
             self.table,
-            {name: of_sample(v) for name, v in self.parameters.items()},
-            {name: of_sample(v) for name, v in self.columns.items()},
-            [(form, {name: of_sample(v) for name, v in numbers.items()}) for form, numbers in self.effects],
+            {name: values_of_sample(v) for name, v in self.parameters.items()},
+            {name: values_of_sample(v) for name, v in self.columns.items()},
+            [(form, {name: values_of_sample(v) for name, v in numbers.items()}) for form, numbers in self.effects],
         )
 
     def clipped_to_bounds(self, s: FloatArray, names: list[str]) -> FloatArray:
         """Clip initial states to their bounds."""
-        for form, size in self.frictions_and_bounds:
+        for form, size in self.friction_and_bound_forms:
             if form.stops:
                 k = names.index(form.target)
                 s[k] = np.minimum(s[k], size)
@@ -297,9 +297,9 @@ class _Integration:
         time = self.table.time
         assert time is not None
         t = self.columns[time]
-        gap = float(t[0, self.row_by_position[k + 1, j]] - t[0, self.row_by_position[k, j]])
+        gap = float(t[0, self.rows_by_position_and_run[k + 1, j]] - t[0, self.rows_by_position_and_run[k, j]])
         at = self.rate_inputs_in_gap(k, slice(j, j + 1))
-        hard = [(form, float(size[0, 0])) for form, size in self.frictions_and_bounds]
+        hard = [(form, float(size[0, 0])) for form, size in self.friction_and_bound_forms]
 
         def free_rates(share: float, y: FloatArray) -> dict[str, float]:
             p, now = at(share)

@@ -8,8 +8,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.cases import SystemCase
-from probewise.world.systems.chain import simulate
-from probewise.world.systems.fit import AddedForm, Model, fitted_parameters
+from probewise.world.systems.chain import simulate_noise_free
+from probewise.world.systems.fit import AddedForm, ModelWithForms, names_of_fitted_parameters
 from probewise.world.systems.forms.form import Numbers
 
 _MOMENTS = 8  # distinct values of a dead time over samples, since the integration stops at each of them in every gap
@@ -27,8 +27,8 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
         If the fit diverges.
     """
     drawn, kind = case.drawn, case.drawn.kind
-    beside = [AddedForm(e.form, e.values, fitted_parameters(e.form)) for e in case.effects]
-    model = Model(kind, drawn.diagnosed_table, beside)
+    beside = [AddedForm(e.form, e.values, names_of_fitted_parameters(e.form)) for e in case.effects]
+    model = ModelWithForms(kind, drawn.diagnosed_table, beside)
     fitted = model.fit(case.readings[drawn.diagnosed_row_numbers], model.coordinates_of(drawn.shared, drawn.by_run))
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
@@ -36,9 +36,9 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     for k, name in enumerate(name for b in beside for name in b.free):
         if name == "tau_s" and kind.law is not None:
             x[:, model.n_nominal_coordinates + k] = _rounded_to_quantiles(x[:, model.n_nominal_coordinates + k])
-    later = drawn.table.take(np.flatnonzero(drawn.table.run >= drawn.table.n_runs - 2))
-    ahead = Model(kind, later, beside)
-    n_shared = len(kind.shared_names)
+    later = drawn.table.select_rows(np.flatnonzero(drawn.table.run >= drawn.table.n_runs - 2))
+    ahead = ModelWithForms(kind, later, beside)
+    n_shared = len(kind.shared_parameter_names)
     n_runs = len(later.rows_by_run)
     own = [
         np.stack(
@@ -57,7 +57,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
         for (form, numbers), b in zip(ahead.effects_at(there), beside, strict=True)
     ]
     with np.errstate(all="ignore"):
-        return simulate(kind, later, ahead.parameters_at(there), effects).readings
+        return simulate_noise_free(kind, later, ahead.parameters_at(there), effects).readings
 
 
 def _with_unseen_runs_at_mean(numbers: Numbers, free: Sequence[str]) -> Numbers:

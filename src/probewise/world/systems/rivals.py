@@ -12,8 +12,14 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.world.systems.chain import apply_reading_effects, simulate
-from probewise.world.systems.fit import AddedForm, LeastSquaresFit, Model, fitted_parameters, project_out
+from probewise.world.systems.chain import apply_reading_effects, simulate_noise_free
+from probewise.world.systems.fit import (
+    AddedForm,
+    LeastSquaresFit,
+    ModelWithForms,
+    names_of_fitted_parameters,
+    project_out,
+)
 from probewise.world.systems.forms.form import Form, FormWithParameters, parameter_arrays
 from probewise.world.systems.forms.true_system import TrueSystem
 
@@ -48,7 +54,7 @@ def rivals_with_nats(
     forms: Sequence[Form],
     target: FloatArray,
     fitted: LeastSquaresFit,
-    model: Model,
+    model: ModelWithForms,
     without: frozenset[str],
 ) -> dict[str, float]:
     """Find the forms that explain an effect's noise-free readings almost as well as the effect itself.
@@ -79,12 +85,15 @@ def rivals_with_nats(
         if hard:  # fits with dry friction or a bound take minutes: the linearised result is used
             found[name] = min(candidate.nats, found.get(name, np.inf))
             continue
-        wider = Model(
+        wider = ModelWithForms(
             true.kind,
             true.table,
-            [*model.added, AddedForm(candidate.form, candidate.start, fitted_parameters(candidate.form))],
+            [*model.added, AddedForm(candidate.form, candidate.start, names_of_fitted_parameters(candidate.form))],
         )
-        own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in fitted_parameters(candidate.form)]
+        own = [
+            candidate.start[name] / (0.1 * candidate.form.steps[name])
+            for name in names_of_fitted_parameters(candidate.form)
+        ]
         try:
             nats = (
                 0.5
@@ -102,7 +111,7 @@ def rivals_with_nats(
 
 
 def _best_by_linearisation(
-    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: Model
+    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
 ) -> list[_StartOfFit]:
     """Return the best candidates by linearisation, with each form's best two starts."""
     size = float(left @ left)
@@ -128,7 +137,7 @@ def _best_by_linearisation(
 
 
 def templates_of(
-    true: TrueSystem, forms: Sequence[Form], fitted: LeastSquaresFit, model: Model
+    true: TrueSystem, forms: Sequence[Form], fitted: LeastSquaresFit, model: ModelWithForms
 ) -> dict[Form, FloatArray]:
     """Return, by form, the changes of the readings about a fit by every setting of its bank, (n_settings, n_points)."""
     settings = {form: [each for group in form.bank for each in group] for form in forms}
@@ -136,7 +145,7 @@ def templates_of(
     parameters, beside = model.parameters_at(x), model.effects_at(x)
     inner = [e for e in beside if e[0].side != "reading"]
     outer = [e for e in beside if e[0].side == "reading"]
-    bare = simulate(true.kind, true.table, parameters, inner).readings
+    bare = simulate_noise_free(true.kind, true.table, parameters, inner).readings
     out: dict[Form, FloatArray] = {}
     with np.errstate(all="ignore"):
         for form in (f for f in forms if f.side == "reading"):
@@ -179,7 +188,7 @@ def _changes_of_chunk(
     forms: Sequence[Form],
     settings: dict[Form, list[dict[str, float]]],
     fitted: LeastSquaresFit,
-    model: Model,
+    model: ModelWithForms,
 ) -> dict[Form, FloatArray]:
     """Return the changes of the readings by many forms, simulated at once: each is neutral but in its own samples."""
     ends = np.cumsum([len(settings[form]) for form in forms])
@@ -209,6 +218,6 @@ def _simulated_or_nan(
 ) -> FloatArray:
     """Simulate; NaN if a law diverges."""
     try:
-        return simulate(true.kind, true.table, parameters, effects).readings
+        return simulate_noise_free(true.kind, true.table, parameters, effects).readings
     except NotConvergedError:
         return np.full((n, len(true.table)), np.nan)

@@ -23,11 +23,11 @@ def system_stratum_of(number: int) -> tuple[Stratum, int]:
     """Return the stratum of a case, and the number of earlier cases of its kind and noise, of any size."""
     order = [SYSTEMS_WHEEL[k * _STRIDE % len(SYSTEMS_WHEEL)] for k in range(len(SYSTEMS_WHEEL))]
 
-    def same_kind_and_noise(a: Stratum, b: Stratum) -> bool:
+    def have_same_kind_and_noise(a: Stratum, b: Stratum) -> bool:
         return (a.kind, a.other_noise) == (b.kind, b.other_noise)
 
     turn, slot = divmod(number, len(order))
     own = order[slot]
-    return own, turn * sum(same_kind_and_noise(s, own) for s in order) + sum(
-        same_kind_and_noise(s, own) for s in order[:slot]
+    return own, turn * sum(have_same_kind_and_noise(s, own) for s in order) + sum(
+        have_same_kind_and_noise(s, own) for s in order[:slot]
     )

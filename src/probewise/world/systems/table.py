@@ -64,6 +64,6 @@ class SystemTable:
         """Time from the first row to the last."""
         return float(np.ptp(self.t))
 
-    def take(self, kept: FloatArray | IntArray) -> SystemTable:
+    def select_rows(self, kept: FloatArray | IntArray) -> SystemTable:
         """Keep these rows; runs keep their numbers."""
         return replace(self, columns={name: values[kept] for name, values in self.columns.items()}, run=self.run[kept])

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
-from probewise.world.systems.forms.modulations import scale_only_member, starting_point_of_wave, wave_bank
+from probewise.world.systems.forms.modulations import start_values_of_single_member, start_values_of_wave, wave_bank
 from probewise.world.systems.forms.readings import delayed_values
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.table import SystemTable
@@ -24,27 +24,29 @@ def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
     time = true.table.time
     # A clock error is detectable only if the law or the formula uses time.
     if time is not None and (true.kind.law is not None or true.kind.restarts_time):
-        yield _linear_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
+        yield _linear_one_parameter_form(
+            "clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time)
+        )
 
 
-def _act_on_column(
+def _make_act_on_column(
     column: str, change: Change
 ) -> Callable[[Mapping[str, FloatArray], SystemTable, Numbers], dict[str, Any]]:
     """Return the `Form.act` that changes one column."""
     return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
 
 
-def _linear_form(
+def _linear_one_parameter_form(
     name: str, column: str, change: Change, first: float, limit: float, covariates: tuple[str, ...]
 ) -> Form:
     return Form(
         name,
         "input",
-        _act_on_column(column, change),
+        _make_act_on_column(column, change),
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": first}]],
-        scale_only_member,
+        start_values_of_single_member,
         {"a": first},
         first,
         limit,
@@ -53,13 +55,13 @@ def _linear_form(
     )
 
 
-def _nonlinear_form(
+def _nonlinear_one_parameter_form(
     name: str, number: str, change: Change, column: str, tried: FloatArray, covariates: tuple[str, ...], late: str = ""
 ) -> Form:
     return Form(
         name,
         "input",
-        _act_on_column(column, change),
+        _make_act_on_column(column, change),
         lambda a, drawn: {number: a},
         lambda rng: {},
         [[{number: float(size)}] for size in tried],
@@ -79,13 +81,17 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
     span, own = high - low, (column, "level")
     if not span > 0:
         return
-    yield _linear_form(f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own)
-    yield _linear_form(f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own)
+    yield _linear_one_parameter_form(
+        f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own
+    )
+    yield _linear_one_parameter_form(
+        f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own
+    )
     levels = high - span * np.geomspace(0.004, 0.5, 12)
     yield Form(
         f"input_saturation:{column}",
         "input",
-        _act_on_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
+        _make_act_on_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
         lambda a, drawn: {"level": high - a},
         lambda rng: {},
         [[{"level": float(level)}] for level in levels],
@@ -98,7 +104,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
     )
     sizes = span * np.geomspace(1e-4, 0.3, 10)
     if low <= 0.1 * span:
-        yield _nonlinear_form(
+        yield _nonlinear_one_parameter_form(
             f"dead_zone:{column}",
             "width",
             lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0),
@@ -108,11 +114,13 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
     moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
-        yield _nonlinear_form(f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column))
+        yield _nonlinear_one_parameter_form(
+            f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column)
+        )
     if len(np.unique(values)) > 20:
         waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
 
-        def add_wave(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        def column_plus_sine_error(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
             return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
 
         first = 0.01 * spread
@@ -122,14 +130,14 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         yield Form(
             f"periodic_error:{column}",
             "input",
-            _act_on_column(column, add_wave),
+            _make_act_on_column(column, column_plus_sine_error),
             lambda a, drawn: {"a": a, **drawn},
             lambda rng: {
                 "period": span / draw_log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
                 "phase": float(rng.uniform(0, 2 * np.pi)),
             },
             bank,
-            starting_point_of_wave,
+            start_values_of_wave,
             {"a": first, "period": 0.002 * span, "phase": 0.05},
             first,
             0.2 * span,
@@ -138,7 +146,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
     if true.table.time is not None:
         taus = true.table.median_gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
-        yield _nonlinear_form(
+        yield _nonlinear_one_parameter_form(
             f"input_delay:{column}",
             "tau_s",
             lambda c, rows, v: delayed_values(c, rows, np.maximum(v["tau_s"], 0.0)),

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form
-from probewise.world.systems.forms.modulations import Modulation, scale_only_member
+from probewise.world.systems.forms.modulations import Modulation, start_values_of_single_member
 from probewise.world.systems.forms.true_system import TrueSystem
 
 _N_WAVES = 20
@@ -76,7 +76,7 @@ def rate_term_form(
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": 0.1 * first}]],
-        scale_only_member,
+        start_values_of_single_member,
         {"a": first},
         first,
         300 * first,
@@ -96,36 +96,36 @@ def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
         size = float(np.abs(values).max())
         own = (f"state:{state}", "time")
         yield rate_term_form(
-            true, f"damping:{state}", state, _term_in_state(state, lambda r: -r), size, own, signed=False
+            true, f"damping:{state}", state, _make_term_of_state(state, lambda r: -r), size, own, signed=False
         )
-        drags = _term_in_state(state, lambda r: -np.abs(r) * r)
+        drags = _make_term_of_state(state, lambda r: -np.abs(r) * r)
         yield rate_term_form(true, f"drag:{state}", state, drags, size**2, own, signed=False)
         yield rate_term_form(
-            true, f"forcing:{state}", state, _term_in_state(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
+            true, f"forcing:{state}", state, _make_term_of_state(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
         )
         for other, there in true.states.items():
             most = float(np.abs(there).max())
             seen = (f"state:{other}", "time")
             yield rate_term_form(
-                true, f"cubic:{state}:{other}", state, _term_in_state(other, lambda r: -(r**3)), most**3, seen
+                true, f"cubic:{state}:{other}", state, _make_term_of_state(other, lambda r: -(r**3)), most**3, seen
             )
             yield rate_term_form(
-                true, f"quadratic:{state}:{other}", state, _term_in_state(other, lambda r: -(r**2)), most**2, seen
+                true, f"quadratic:{state}:{other}", state, _make_term_of_state(other, lambda r: -(r**2)), most**2, seen
             )
             if other != state:
                 yield rate_term_form(
-                    true, f"coupling:{state}:{other}", state, _term_in_state(other, lambda r: -r), most, seen
+                    true, f"coupling:{state}:{other}", state, _make_term_of_state(other, lambda r: -r), most, seen
                 )
-        yield _periodic_term(true, state)
+        yield _periodic_forcing_form(true, state)
         yield from _friction_and_bound_forms(true, state)
 
 
-def _term_in_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
+def _make_term_of_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
     """Return the push that is a function of one state alone."""
     return lambda s, now, v: term(s[state])
 
 
-def _periodic_term(true: TrueSystem, state: str) -> Form:
+def _periodic_forcing_form(true: TrueSystem, state: str) -> Form:
     how = modulations.sinusoid_in_time(true, _N_WAVES)
     first = 0.02 * true.rms_rate(state)
     return Form(

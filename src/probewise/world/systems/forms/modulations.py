@@ -33,12 +33,12 @@ class Modulation:
     signed: bool = True
 
 
-def scale_only_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+def start_values_of_single_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
     """Return the only member of a group with its amplitude scaled by the only amount."""
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
-def _of_amplitude_alone(
+def _amplitude_only_modulation(
     value_at: Callable[[Instants, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
 ) -> Modulation:
     return Modulation(
@@ -46,7 +46,7 @@ def _of_amplitude_alone(
         lambda a, drawn: {"a": a},
         lambda rng: {},
         lambda a: [[{"a": a}]],
-        scale_only_member,
+        start_values_of_single_member,
         lambda a: {"a": a},
         covariates,
         reach,
@@ -57,13 +57,13 @@ def _of_amplitude_alone(
 def linear_drift(true: TrueSystem) -> Modulation:
     """Return a linear drift in recorded time."""
     names = ("time",) if true.table.time in (None, "time") else ("time", str(true.table.time))
-    return _of_amplitude_alone(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
+    return _amplitude_only_modulation(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
 
 
 def proportional_to_column(true: TrueSystem, column: str) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording."""
     middle = true.mean_of(column)
-    return _of_amplitude_alone(
+    return _amplitude_only_modulation(
         lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.sd_of(column), (column,)
     )
 
@@ -81,7 +81,7 @@ def step_at_change_point(true: TrueSystem) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {at: true.random_time(rng)},
         lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
-        scale_only_member,
+        start_values_of_single_member,
         lambda a: {"a": a, at: 0.0},
         ("time", str(true.table.time)) if timed else ("row",),
         1.0,
@@ -119,7 +119,7 @@ def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
     return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
 
 
-def starting_point_of_wave(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+def start_values_of_wave(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
     """Return the setting of the wave that the amounts of sine and cosine add up to."""
     sine, cosine = amounts * group[0]["a"]
     return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
@@ -134,7 +134,7 @@ def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
         lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
-        starting_point_of_wave,
+        start_values_of_wave,
         lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
         ("time", str(rows.time)),
         1.0,
@@ -151,7 +151,7 @@ def settling(true: TrueSystem) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
         lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
-        scale_only_member,
+        start_values_of_single_member,
         lambda a: {"a": a, "tau_s": 0.05 * longest},
         ("time", "run", str(true.table.time)),
         1.0,

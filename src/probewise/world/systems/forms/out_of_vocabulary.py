@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Instants, Numbers
 from probewise.world.systems.forms.inside import rate_term_form
-from probewise.world.systems.forms.modulations import scale_only_member
+from probewise.world.systems.forms.modulations import start_values_of_single_member
 from probewise.world.systems.forms.readings import OFFSET
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.table import SystemTable
@@ -33,22 +33,22 @@ def forms_out_of_vocabulary(true: TrueSystem, rng: np.random.Generator) -> Itera
     """Yield the effects outside the vocabulary that this system can have, on randomly drawn columns and states."""
     columns = [str(name) for name in rng.permutation(true.varying_columns)]
     first, second = columns[0], columns[1]
-    yield _product(true, first, second)
-    yield _switch(true, first, float(rng.uniform(0.55, 0.8)))
-    yield _soft_limited_sum(true, first)
-    yield _bend_with_column(true, first)
+    yield _product_form(true, first, second)
+    yield _switch_form(true, first, float(rng.uniform(0.55, 0.8)))
+    yield _soft_limited_sum_form(true, first)
+    yield _column_dependent_bend_form(true, first)
     if true.table.time is not None:
-        yield _square_wave(true, rng)
-        yield _chirp(true)
-        yield _two_settlings(true)
+        yield _square_wave_form(true, rng)
+        yield _chirp_form(true)
+        yield _two_settlings_form(true)
     if true.kind.law is not None and true.states:
         state = str(rng.choice(list(true.states)))
-        yield _one_sided_spring(true, state)
-        yield _leak(true, state)
-        yield _column_times_state(true, state, first)
+        yield _one_sided_spring_form(true, state)
+        yield _leak_form(true, state)
+        yield _column_times_state_form(true, state, first)
 
 
-def _added_to_reading(
+def _form_added_to_reading(
     true: TrueSystem,
     name: str,
     shape: str,
@@ -67,7 +67,7 @@ def _added_to_reading(
         lambda a, more: {"a": a, **more},
         lambda rng: dict(drawn or {}),
         [[{"a": sd}]],
-        scale_only_member,
+        start_values_of_single_member,
         {"a": sd},
         sd,
         1e4 * sd,
@@ -77,10 +77,10 @@ def _added_to_reading(
     )
 
 
-def _product(true: TrueSystem, one: str, other: str) -> Form:
+def _product_form(true: TrueSystem, one: str, other: str) -> Form:
     a, b = true.mean_of(one), true.mean_of(other)
     scale = true.sd_of(one) * true.sd_of(other)
-    return _added_to_reading(
+    return _form_added_to_reading(
         true,
         f"product:{one}:{other}",
         "y + a (C - mean C)(D - mean D) / (sd C sd D)",
@@ -89,9 +89,9 @@ def _product(true: TrueSystem, one: str, other: str) -> Form:
     )
 
 
-def _switch(true: TrueSystem, column: str, share: float) -> Form:
+def _switch_form(true: TrueSystem, column: str, share: float) -> Form:
     at = float(np.quantile(true.table.columns[column], share))
-    return _added_to_reading(
+    return _form_added_to_reading(
         true,
         f"switch:{column}",
         "y + a 1(C > c)",
@@ -100,7 +100,7 @@ def _switch(true: TrueSystem, column: str, share: float) -> Form:
     )
 
 
-def _soft_limited_sum(true: TrueSystem, column: str) -> Form:
+def _soft_limited_sum_form(true: TrueSystem, column: str) -> Form:
     """Return the form that adds the sum of a column's absolute deviations since the start of the run, soft-limited."""
     middle, spread = true.mean_of(column), true.sd_of(column)
 
@@ -110,7 +110,7 @@ def _soft_limited_sum(true: TrueSystem, column: str) -> Form:
             out[own] = np.tanh(np.cumsum(np.abs(rows.columns[column][own] - middle)) / spread / 12)
         return out
 
-    return _added_to_reading(
+    return _form_added_to_reading(
         true,
         f"memory:{column}",
         "y + a tanh(sum of abs(C - mean C) since the start of the run)",
@@ -119,7 +119,7 @@ def _soft_limited_sum(true: TrueSystem, column: str) -> Form:
     )
 
 
-def _bend_with_column(true: TrueSystem, column: str) -> Form:
+def _column_dependent_bend_form(true: TrueSystem, column: str) -> Form:
     middle, spread, low, high = (
         true.mean_of(column),
         true.sd_of(column),
@@ -131,30 +131,30 @@ def _bend_with_column(true: TrueSystem, column: str) -> Form:
         z = np.clip((y - low) / (high - low), 0, 1)
         return np.asarray(4 * z * (1 - z) * (rows.columns[column] - middle) / spread)
 
-    return _added_to_reading(
+    return _form_added_to_reading(
         true, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", addition, (column, "level")
     )
 
 
-def _square_wave(true: TrueSystem, rng: np.random.Generator) -> Form:
+def _square_wave_form(true: TrueSystem, rng: np.random.Generator) -> Form:
     hz = draw_log_uniform(rng, 4 / true.table.duration, 0.06 / true.table.median_gap)
 
     def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         return np.where((hz * rows.t) % 1.0 < 0.3, 1.0, 0.0)
 
-    return _added_to_reading(
+    return _form_added_to_reading(
         true, "square_wave", "y + a while (t / P) mod 1 < 0.3", addition, ("time", str(true.table.time)), {"hz": hz}
     )
 
 
-def _chirp(true: TrueSystem) -> Form:
+def _chirp_form(true: TrueSystem) -> Form:
     begin, end = float(true.table.t.min()), float(true.table.t.max())
 
     def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         z = (rows.t - begin) / (end - begin)
         return np.asarray(np.sin(2 * np.pi * (3 * z + 8 * z**2)))
 
-    return _added_to_reading(
+    return _form_added_to_reading(
         true,
         "chirp",
         "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time",
@@ -163,14 +163,14 @@ def _chirp(true: TrueSystem) -> Form:
     )
 
 
-def _two_settlings(true: TrueSystem) -> Form:
+def _two_settlings_form(true: TrueSystem) -> Form:
     longest = float(true.table.time_since_start.max())
 
     def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         since = Instants.at_rows(rows).since[0]
         return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
 
-    return _added_to_reading(
+    return _form_added_to_reading(
         true,
         "two_settlings",
         "y + a (exp(-t / tau) - 1.5 exp(-t / (7 tau)))",
@@ -179,7 +179,7 @@ def _two_settlings(true: TrueSystem) -> Form:
     )
 
 
-def _one_sided_spring(true: TrueSystem, state: str) -> Form:
+def _one_sided_spring_form(true: TrueSystem, state: str) -> Form:
     at = float(np.quantile(true.states[state], 0.6))
     size = float(np.ptp(true.states[state]))
     return rate_term_form(
@@ -193,24 +193,24 @@ def _one_sided_spring(true: TrueSystem, state: str) -> Form:
     )
 
 
-def _leak(true: TrueSystem, state: str) -> Form:
+def _leak_form(true: TrueSystem, state: str) -> Form:
     scale = 0.3 * float(np.abs(true.states[state]).max())
 
-    def push(s: dict[str, FloatArray], now: object, v: Numbers) -> FloatArray:
+    def leak_rate(s: dict[str, FloatArray], now: object, v: Numbers) -> FloatArray:
         return np.asarray(-np.expm1(np.clip(s[state] / scale, -30, 12)))
 
     return rate_term_form(
         true,
         f"strange_leak:{state}",
         state,
-        push,
+        leak_rate,
         20.0,
         (f"state:{state}", "level", "time"),
         shape="-a (exp(S / s) - 1) in the rate of S",
     )
 
 
-def _column_times_state(true: TrueSystem, state: str, column: str) -> Form:
+def _column_times_state_form(true: TrueSystem, state: str, column: str) -> Form:
     middle, spread, most = true.mean_of(column), true.sd_of(column), float(np.abs(true.states[state]).max())
     return rate_term_form(
         true,

@@ -21,11 +21,11 @@ _N_WAVES = 240
 def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
     """Yield every form of the reading."""
     yield from _modulated_forms(true)
-    yield from _nonlinear_forms(true)
+    yield from _hysteresis_bend_and_saturation_forms(true)
     yield from _lag_and_delay_forms(true)
 
 
-def modulated_reading(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
+def modulated_reading_form(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
     """Return the form by which an offset, or with `gain` a factor 1 + modulation, varies the reading."""
 
     def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
@@ -59,13 +59,13 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
     if true.kind.run is not None and len(true.table.rows_by_run) > 1:
         both["per_run"] = modulations.value_per_run(true)
     for kind, how in both.items():
-        yield modulated_reading(true, f"offset_{kind}", how)
-        yield modulated_reading(true, f"gain_{kind}", how, gain=True)
+        yield modulated_reading_form(true, f"offset_{kind}", how)
+        yield modulated_reading_form(true, f"gain_{kind}", how, gain=True)
     for column in true.varying_columns:
-        yield modulated_reading(true, f"sensitivity:{column}", modulations.proportional_to_column(true, column))
+        yield modulated_reading_form(true, f"sensitivity:{column}", modulations.proportional_to_column(true, column))
     if timed:
-        yield modulated_reading(true, "interference", modulations.sinusoid_in_time(true, _N_WAVES))
-        yield modulated_reading(true, "settling", modulations.settling(true))
+        yield modulated_reading_form(true, "interference", modulations.sinusoid_in_time(true, _N_WAVES))
+        yield modulated_reading_form(true, "settling", modulations.settling(true))
 
 
 def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
@@ -82,7 +82,7 @@ def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
     return out
 
 
-def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
+def _hysteresis_bend_and_saturation_forms(true: TrueSystem) -> Iterator[Form]:
     low, high, sd = float(true.readings.min()), float(true.readings.max()), true.noise_sd
     yield Form(
         "hysteresis",
@@ -91,7 +91,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": sd}]],
-        modulations.scale_only_member,
+        modulations.start_values_of_single_member,
         {"a": sd},
         sd,
         1e3 * sd,
@@ -113,7 +113,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))},
         [[{"a": first, "power": p}] for p in (0.5, 0.7, 1.4, 2.0, 3.0, 4.5)],
-        modulations.scale_only_member,
+        modulations.start_values_of_single_member,
         {"a": first, "power": 0.05},
         first,
         0.5,
@@ -128,7 +128,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
             "saturation" if upper else "saturation (floor)",
             "reading",
             _make_clip(upper),
-            _make_clip_level(end, sign),
+            _make_clip_level_of_amplitude(end, sign),
             lambda rng: {},
             [[{"level": float(level)}] for level in levels],
             lambda group, amounts: dict(group[0]),
@@ -147,7 +147,7 @@ def _make_clip(upper: bool) -> Callable[[FloatArray, SystemTable, Numbers], Floa
     return lambda y, rows, v: np.asarray(bound(y, v["level"]))
 
 
-def _make_clip_level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
+def _make_clip_level_of_amplitude(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
     """Return the `Form.of_amplitude` that clips by an amplitude inwards from `end`."""
     return lambda a, drawn: {"level": end + sign * a}
 

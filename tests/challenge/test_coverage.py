@@ -9,7 +9,7 @@ from probewise.challenge.coverage import effect_truths_and_intervals, place_over
 from probewise.diagnosis import EffectFound, ModelSamples, ParameterFound, Place
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
-from probewise.world.challenge import HiddenEffect, Region
+from probewise.world.challenge import CovariateRegion, HiddenEffect
 from probewise.world.concealed import Flicker, Saturation
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -24,17 +24,17 @@ def place(covariate, start=None, end=None, scan=None):
     ("start", "end", "overlap"), [(0.0, 10.0, 1.0), (5.0, 15.0, 1 / 3), (2.0, 6.0, 0.4), (11.0, 15.0, 0.0)]
 )
 def test_intersection_over_union(start, end, overlap):
-    assert place_overlap(Region("time", 0.0, 10.0), [place("time", start, end)]) == pytest.approx(overlap)
+    assert place_overlap(CovariateRegion("time", 0.0, 10.0), [place("time", start, end)]) == pytest.approx(overlap)
 
 
 def test_only_the_strongest_place_of_that_covariate_counts():
     places = [place("level", 0.0, 1.0), place("time", 0.0, 5.0), place("time", 0.0, 10.0)]
-    assert place_overlap(Region("time", 0.0, 10.0), places) == 0.5
-    assert place_overlap(Region("slope", 0.0, 10.0), places) == 0.0
+    assert place_overlap(CovariateRegion("time", 0.0, 10.0), places) == 0.5
+    assert place_overlap(CovariateRegion("slope", 0.0, 10.0), places) == 0.0
 
 
 def test_a_scan_overlaps_with_the_scans_of_its_mounting():
-    region = Region("scan", scans=("a", "b"))
+    region = CovariateRegion("scan", scans=("a", "b"))
     assert place_overlap(region, [place("scan", scan="a")]) == 0.5
     assert place_overlap(region, [place("scan", scan="c")]) == 0.0
     both = [place("scan", scan="a"), place("scan", scan="b"), place("time", 0.0, 1.0)]

@@ -33,7 +33,7 @@ def clean(world, plan):
 @pytest.fixture(scope="module")
 def refit(clean):
     refit = NullRefit()
-    refit.null(clean)
+    refit.null_fit(clean)
     return refit
 
 
@@ -42,7 +42,7 @@ def changed(clean, change):
 
 
 def test_a_sensor_of_one_gaussian_is_taken_for_one(refit, clean):
-    null = refit.null(clean)
+    null = refit.null_fit(clean)
     assert null.model.sensor.n_gaussians == 1
     assert np.abs(null.residuals).max() < 0.05
 
@@ -54,7 +54,7 @@ def test_levels_take_up_an_offset_and_a_gain(refit, clean):
 
 def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
     """Two routes: the refit, and least squares on slopes by differences."""
-    null = refit.null(clean)
+    null = refit.null_fit(clean)
     wave = 0.2 * np.sin(np.arange(len(clean)) / 7.0)
     _, slopes = null.model.predict_and_differentiate(null.z)
     left = wave - slopes @ np.linalg.lstsq(slopes, wave)[0]
@@ -62,7 +62,7 @@ def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
 
 
 def test_the_null_is_fitted_once_for_each_clean_recording(refit, clean):
-    assert refit.null(clean) is refit.null(clean)
+    assert refit.null_fit(clean) is refit.null_fit(clean)
 
 
 def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):

@@ -7,8 +7,8 @@ import pytest
 
 from probewise.challenge.oracle_baseline import (
     oracle_covariate_rate,
+    oracle_credible_set_size,
     oracle_name_rate,
-    oracle_set_size,
     readings_to_separate_alias,
 )
 
@@ -45,10 +45,10 @@ def test_a_rival_that_shows_in_the_same_is_no_other_place():
 
 
 def test_the_set_holds_one_where_nothing_is_alike_and_aliases_count_once():
-    assert oracle_set_size(hidden(8.0)) == 1.0
-    assert oracle_set_size(hidden(8.0, backlash=1.0)) == 1.0
-    assert 1.0 < oracle_set_size(hidden(8.0, halo=0.92)) < 2.0
-    assert oracle_set_size(hidden(8.0, halo=0.5)) == pytest.approx(1.0, abs=0.01)
+    assert oracle_credible_set_size(hidden(8.0)) == 1.0
+    assert oracle_credible_set_size(hidden(8.0, backlash=1.0)) == 1.0
+    assert 1.0 < oracle_credible_set_size(hidden(8.0, halo=0.92)) < 2.0
+    assert oracle_credible_set_size(hidden(8.0, halo=0.5)) == pytest.approx(1.0, abs=0.01)
 
 
 def test_two_names_three_nats_apart_are_held_together_as_often_as_the_normal_law_says():
@@ -59,7 +59,7 @@ def test_two_names_three_nats_apart_are_held_together_as_often_as_the_normal_law
     log_odds = d**2 / 2 + d * rng.standard_normal(400_000)
     alone = np.abs(log_odds) > math.log(19)
     like = {**hidden(size, halo=rho)}
-    assert oracle_set_size(like) == pytest.approx(2 - alone.mean(), abs=0.06)
+    assert oracle_credible_set_size(like) == pytest.approx(2 - alone.mean(), abs=0.06)
 
 
 def test_no_number_of_repeated_plans_parts_two_that_agree(make):

@@ -9,8 +9,8 @@ from probewise.challenge.scoring import (
     is_out_of_vocabulary,
     leading_probability_and_correctness,
     names_match,
-    right_name_sets,
     right_names,
+    right_names_of_each_effect,
 )
 
 
@@ -28,14 +28,17 @@ def test_a_larger_effect_has_fewer_aliases(make):
 def test_what_has_no_name_is_unknown_unless_it_is_like_one(make):
     chirp = make.outside(cosines={"flicker": 0.89})
     assert is_out_of_vocabulary(chirp)
-    assert right_name_sets(chirp, merged=True) == [{"unknown"}]
+    assert right_names_of_each_effect(chirp, merged=True) == [{"unknown"}]
     like = make.outside(cosines={"flicker": 0.9})
     assert not is_out_of_vocabulary(like)
-    assert right_name_sets(like, merged=False) == [{"flicker"}]
+    assert right_names_of_each_effect(like, merged=False) == [{"flicker"}]
 
 
 def test_one_gaussian_more_is_nothing_to_name(make):
-    assert right_name_sets(make.case("ssf_order", 12.0, hides=[make.hidden("ssf_order", 12.0)]), merged=True) == []
+    assert (
+        right_names_of_each_effect(make.case("ssf_order", 12.0, hides=[make.hidden("ssf_order", 12.0)]), merged=True)
+        == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,9 +83,9 @@ def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
     for hide, free in ((like, True), (unlike, False)):
         found = make.single("halo", hide=hide)
         assert is_distinguishable_from_ssf(found) != free
-        assert names_match((), right_name_sets(found, merged=True)) == free
-        assert names_match(("halo",), right_name_sets(found, merged=True))
-        assert not names_match((), right_name_sets(found, merged=False))
+        assert names_match((), right_names_of_each_effect(found, merged=True)) == free
+        assert names_match(("halo",), right_names_of_each_effect(found, merged=True))
+        assert not names_match((), right_names_of_each_effect(found, merged=False))
     # A hundredth for a name behind a clean verdict is no name that comes first, unless a name is due.
     hypotheses = [[[], 0.9], [["lag"], 0.07], [["halo"], 0.03]]
     assert is_leading_name_right(make.single("halo", hide=like, said=[], hypotheses=hypotheses))
@@ -93,5 +96,5 @@ def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
     both = make.case("pair", 12.0, truth=["halo", "lag"], hides=[like, make.hidden("lag", 12.0)], said=["lag"])
     assert is_leading_name_right(both)
     assert is_distinguishable_from_ssf(both)
-    assert not names_match(("halo",), right_name_sets(both, merged=True))
-    assert not names_match(("lag", "glint"), right_name_sets(both, merged=True))
+    assert not names_match(("halo",), right_names_of_each_effect(both, merged=True))
+    assert not names_match(("lag", "glint"), right_names_of_each_effect(both, merged=True))

@@ -7,14 +7,14 @@ import pytest
 
 from probewise.challenge import (
     Estimate,
-    Row,
+    ScoreRow,
     calibration_error,
     confusion_counts,
     detected_and_named_by_effect,
     reliability_bins,
     score,
 )
-from probewise.challenge.estimates import bootstrapped, estimated_share, mean
+from probewise.challenge.estimates import estimated_by_bootstrap, estimated_mean, estimated_share
 
 
 def row(results, name):
@@ -32,14 +32,14 @@ def test_wilson_s_interval():
 
 
 def test_a_mean_has_student_s_interval():
-    found = mean([1.0, 2.0, 3.0])
+    found = estimated_mean([1.0, 2.0, 3.0])
     assert (found.value, found.high - 2.0) == pytest.approx((2.0, 4.302652730 / math.sqrt(3)))
-    assert math.isinf(mean([1.0]).high)
+    assert math.isinf(estimated_mean([1.0]).high)
 
 
 def test_a_bootstrap_of_the_mean_agrees_with_its_standard_error():
     values = np.random.default_rng(1).standard_normal(400)
-    found = bootstrapped(values, lambda v: float(v.mean()))
+    found = estimated_by_bootstrap(values, lambda v: float(v.mean()))
     assert (found.high - found.low) / 2 == pytest.approx(1.96 * values.std() / 20, rel=0.1)
 
 
@@ -48,12 +48,12 @@ def test_a_bootstrap_of_the_mean_agrees_with_its_standard_error():
     [(0.95, 0.99, "met"), (0.8, 0.85, "missed"), (0.85, 0.95, "open"), (0.9, 1.0, "met")],
 )
 def test_a_row_is_decided_only_by_its_whole_interval(low, high, decision):
-    assert Row("x", Estimate(0.9, low, high, 10), least=0.9).decision == decision
+    assert ScoreRow("x", Estimate(0.9, low, high, 10), least=0.9).decision == decision
 
 
 def test_no_case_decides_nothing():
-    assert Row("x", estimated_share([]), least=0.9).decision == "open"
-    assert Row("x", estimated_share([])).decision is None
+    assert ScoreRow("x", estimated_share([]), least=0.9).decision == "open"
+    assert ScoreRow("x", estimated_share([])).decision is None
 
 
 def test_false_alarms_are_counted_at_both_levels(make):

@@ -11,15 +11,15 @@ from probewise.challenge.null_refit import NullRefit
 from probewise.challenge.reliability import Bin, calibration_error, reliability_bins
 from probewise.challenge.rounds import score_rounds
 from probewise.challenge.run import run_challenge
-from probewise.challenge.table import Decision, Row, detected_and_named_by_effect, score
+from probewise.challenge.table import Decision, ScoreRow, detected_and_named_by_effect, score
 
 __all__ = [
     "Bin",
     "Decision",
     "Estimate",
     "NullRefit",
-    "Row",
     "RunCaseInRounds",
+    "ScoreRow",
     "Task",
     "calibration_error",
     "confusion_counts",
@@ -42,3 +42,6 @@ Investigated = RunCaseInRounds
 
 reliability = reliability_bins
 """The old name of `reliability_bins`."""
+
+Row = ScoreRow
+"""The old name of `ScoreRow`."""

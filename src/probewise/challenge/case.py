@@ -109,8 +109,8 @@ def _effect_results(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: N
     """Describe the effects; for a pair also "size_beside", the size of each effect when the other is in the model."""
     each = [_effect_result(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
-        both = sizer.recording(*(one.effect for one in hidden))
-        left = residual_norms_with_one_named(refit, sizer.clean, both, [one.name for one in hidden])
+        both = sizer.recording_with_effects(*(one.effect for one in hidden))
+        left = residual_norms_with_one_named(refit, sizer.clean_recording, both, [one.name for one in hidden])
         for own, other in zip(each, reversed(each), strict=True):
             own["size_beside"] = left[other["name"]] / sizer.setup.world.noise_sd
     return each
@@ -120,7 +120,11 @@ def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -
     """Describe one effect; "cosines" holds similar effects in this plan, by name, with their cosines."""
     # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
     on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
-    like = {} if on_noise else cosines_with_vocabulary(refit, sizer.clean, sizer.recording(hidden.effect))
+    like = (
+        {}
+        if on_noise
+        else cosines_with_vocabulary(refit, sizer.clean_recording, sizer.recording_with_effects(hidden.effect))
+    )
     return {
         "name": hidden.name,
         "size_lambda": hidden.size_lambda,
@@ -154,13 +158,13 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
 def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
     thinking, reading = task.generators(2)
 
-    def record(number: int, plan: Plan, _: str) -> Recording:
+    def recording_of_round(number: int, plan: Plan, _: str) -> Recording:
         return case.recording if number == 1 else case.world.simulate(plan, rng=reading)
 
     begun_s = time.process_time()
     told = [
         {**statements_to_score(each.diagnosis), "readings": len(each.recording), "settled": each.settled}
-        for each in investigate(record, case.recording.plan, rounds=rounds, rng=thinking)
+        for each in investigate(recording_of_round, case.recording.plan, rounds=rounds, rng=thinking)
     ]
     return {**told[-1], "readings": len(case.recording), "rounds": told, "cpu_s": time.process_time() - begun_s}
 

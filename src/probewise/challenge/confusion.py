@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.challenge.scoring import NOISE, acts_on_mean, leading_hypothesis, names_match, right_name_sets
+from probewise.challenge.scoring import NOISE, acts_on_mean, leading_hypothesis, names_match, right_names_of_each_effect
 from probewise.world.challenge import SINGLES
 
 OUTSIDE, SEVERAL = "outside", "several"
@@ -47,7 +47,7 @@ def _stated_name(result: Mapping[str, Any], truth: str) -> str:
     if acts_on_mean(result):
         names = tuple(name for name in names if name not in NOISE)
     if truth not in ("clean", OUTSIDE) and names_match(
-        names, right_name_sets(result, merged=True, noise=not acts_on_mean(result))
+        names, right_names_of_each_effect(result, merged=True, noise=not acts_on_mean(result))
     ):
         return truth
     return SEVERAL if len(names) > 1 else "".join(names) or "clean"

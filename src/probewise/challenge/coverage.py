@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis import EffectFound, ModelSamples, Place
 from probewise.sensor import footprint_of
-from probewise.world.challenge import Region
+from probewise.world.challenge import CovariateRegion
 from probewise.world.world import World
 
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
@@ -76,7 +76,7 @@ def _footprint_moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def place_overlap(region: Region, places: Sequence[Place]) -> float:
+def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
     """Return intersection over union of an effect's region and the strongest place in its covariate; 0 if none."""
     place = next((p for p in places if p.covariate == region.covariate), None)
     if place is None:

@@ -35,7 +35,7 @@ def estimated_share(hits: list[bool]) -> Estimate:
     return Estimate(sum(hits) / len(hits), float(found.low), float(found.high), len(hits))
 
 
-def mean(values: list[float]) -> Estimate:
+def estimated_mean(values: list[float]) -> Estimate:
     """Estimate a mean, with Student's interval."""
     if not values:
         return _NOTHING
@@ -46,7 +46,7 @@ def mean(values: list[float]) -> Estimate:
     return Estimate(center, center - half, center + half, n)
 
 
-def bootstrapped(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
+def estimated_by_bootstrap(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
     """Estimate a statistic of rows (n, ...), with the basic bootstrap interval from fixed random draws.
 
     The basic interval reflects the draws about the estimate, which corrects the bias of small samples (Davison and

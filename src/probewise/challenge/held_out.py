@@ -47,7 +47,7 @@ def log_densities_of_scans(
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
         scores[name] = {scan: _total_log_density(sensor, recording) for scan, recording in scans.items()}
     scores["true"] = {
-        scan: _true_log_density(case.world.expected(recording.plan), case.world.noise_sd, recording)
+        scan: _true_log_density(case.world.expected_readings(recording.plan), case.world.noise_sd, recording)
         for scan, recording in scans.items()
     }
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}

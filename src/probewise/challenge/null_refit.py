@@ -36,7 +36,7 @@ class NullRefit:
 
     def refit(self, clean: Recording, changed: Recording) -> Fit:
         """Refit the null to an effect's readings, as if the null fitted the clean sensor exactly."""
-        null = self.null(clean)
+        null = self.null_fit(clean)
         return _white_noise_fit(null.model, self.without_null_residuals(clean, changed), null.z)
 
     def with_one_more_gaussian(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
@@ -47,14 +47,16 @@ class NullRefit:
     def without_null_residuals(self, clean: Recording, changed: Recording) -> Recording:
         """Subtract the null's residuals on `clean` from `changed`."""
         readings = changed.readings.copy()
-        readings[clean.usable] -= self.null(clean).residuals
+        readings[clean.usable] -= self.null_fit(clean).residuals
         return Recording(changed.plan, readings)
 
-    def null(self, clean: Recording) -> Fit:
+    def null_fit(self, clean: Recording) -> Fit:
         """Fit the null to the clean readings; the result is cached."""
         if self._clean is not clean:
             self._clean, self._null = clean, _fit_of_best_order(clean)
         return self._null
+
+    null = null_fit  # its old name
 
 
 def _fit_of_best_order(clean: Recording) -> Fit:

@@ -38,7 +38,7 @@ def oracle_covariate_rate(hidden: Hidden) -> float:
     return _rate_against_closest_rival(hidden, {name for name, own in covariates.items() if shown & set(own)})
 
 
-def oracle_set_size(hidden: Hidden) -> float:
+def oracle_credible_set_size(hidden: Hidden) -> float:
     """Return the expected size of a 95 % credible set, with the truth and its aliases counted as one.
 
     The log Bayes factors against the rivals are taken as independent; the random draws are fixed.

@@ -7,51 +7,57 @@ from typing import Any
 
 import numpy as np
 
-from probewise.challenge.estimates import Estimate, estimated_share, mean
+from probewise.challenge.estimates import Estimate, estimated_mean, estimated_share
 from probewise.challenge.scoring import (
     Result,
     acts_on_mean,
-    credible_set_covers,
-    has_false_extra,
+    credible_set_holds_truth,
+    has_false_extra_effect,
     is_leading_name_right,
 )
-from probewise.challenge.table import Row, cases_with_one_effect, names_effect_on_mean, rejection_rate
+from probewise.challenge.table import ScoreRow, cases_with_one_effect, names_effect_on_mean, rejection_rate
 
 _BOOTSTRAPS = 2000
 
 
-def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
+def score_rounds(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
     """Score the results of `RunCaseInRounds`: a row per target after the last round and, below it, after the first."""
     last = [r for r in results if "failed" not in r]
     first = [r | r["rounds"][0] for r in last]
     return (
-        *_rows_before_and_after(
-            last, first, "right name first, lambda 8", lambda rs: _share_named(rs, 8.0), least=0.985
+        *_rows_after_last_and_first_round(
+            last, first, "right name first, lambda 8", lambda rs: _share_with_right_name_first(rs, 8.0), least=0.985
         ),
-        *_rows_before_and_after(
-            last, first, "right name first, lambda 12", lambda rs: _share_named(rs, 12.0), least=0.995
+        *_rows_after_last_and_first_round(
+            last, first, "right name first, lambda 12", lambda rs: _share_with_right_name_first(rs, 12.0), least=0.995
         ),
-        *_rows_before_and_after(
+        *_rows_after_last_and_first_round(
             last, first, "size of the credible set, lambda 8", lambda rs: _mean_set_size(rs, 8.0), most=1.15
         ),
-        *_rows_before_and_after(
+        *_rows_after_last_and_first_round(
             last, first, "size of the credible set, lambda 12", lambda rs: _mean_set_size(rs, 12.0), most=1.05
         ),
-        *_rows_before_and_after(
+        *_rows_after_last_and_first_round(
             last, first, "95 % credible set holds the truth", _share_of_sets_with_truth, least=0.95
         ),
-        *_rows_before_and_after(last, first, "detection, alpha .01, lambda 8", _share_detected, least=0.995),
-        *_rows_before_and_after(last, first, "two effects: both named", _share_of_pairs_named, least=0.96),
-        *_rows_before_and_after(last, first, "two effects: a false extra", _share_of_pairs_with_false_extra, most=0.03),
-        *_rows_before_and_after(last, first, "physics named, clean", _share_of_clean_with_effect_named, most=0.005),
-        Row("extra readings, median of those not settled at once", _median_further_readings(last), most=80.0),
-        Row("settled at last", estimated_share([r["rounds"][-1]["settled"] for r in last])),
-        Row("processor time of an investigation (s)", mean([r["cpu_s"] for r in last])),
-        Row("cases that failed", estimated_share(["failed" in r for r in results])),
+        *_rows_after_last_and_first_round(last, first, "detection, alpha .01, lambda 8", _share_detected, least=0.995),
+        *_rows_after_last_and_first_round(
+            last, first, "two effects: both named", _share_of_pairs_with_both_named, least=0.96
+        ),
+        *_rows_after_last_and_first_round(
+            last, first, "two effects: a false extra", _share_of_pairs_with_false_extra, most=0.03
+        ),
+        *_rows_after_last_and_first_round(
+            last, first, "physics named, clean", _share_of_clean_with_effect_named, most=0.005
+        ),
+        ScoreRow("extra readings, median of those not settled at once", _median_further_readings(last), most=80.0),
+        ScoreRow("settled at last", estimated_share([r["rounds"][-1]["settled"] for r in last])),
+        ScoreRow("processor time of an investigation (s)", estimated_mean([r["cpu_s"] for r in last])),
+        ScoreRow("cases that failed", estimated_share(["failed" in r for r in results])),
     )
 
 
-def _rows_before_and_after(
+def _rows_after_last_and_first_round(
     last: list[Result],
     first: list[Result],
     name: str,
@@ -59,20 +65,20 @@ def _rows_before_and_after(
     *,
     least: float = -np.inf,
     most: float = np.inf,
-) -> tuple[Row, Row]:
-    return Row(name, scored(last), least, most), Row(f"  after one round: {name}", scored(first))
+) -> tuple[ScoreRow, ScoreRow]:
+    return ScoreRow(name, scored(last), least, most), ScoreRow(f"  after one round: {name}", scored(first))
 
 
-def _share_named(results: list[Result], size: float) -> Estimate:
+def _share_with_right_name_first(results: list[Result], size: float) -> Estimate:
     return estimated_share([is_leading_name_right(r) for r in cases_with_one_effect(results, size)])
 
 
 def _mean_set_size(results: list[Result], size: float) -> Estimate:
-    return mean([float(len(r["credible_set"])) for r in cases_with_one_effect(results, size)])
+    return estimated_mean([float(len(r["credible_set"])) for r in cases_with_one_effect(results, size)])
 
 
 def _share_of_sets_with_truth(results: list[Result]) -> Estimate:
-    return estimated_share([credible_set_covers(r, merged=False) for r in results])
+    return estimated_share([credible_set_holds_truth(r, merged=False) for r in results])
 
 
 def _share_detected(results: list[Result]) -> Estimate:
@@ -83,12 +89,12 @@ def _pair_results(results: list[Result]) -> list[Result]:
     return [r for r in results if r["kind"] == "pair"]
 
 
-def _share_of_pairs_named(results: list[Result]) -> Estimate:
+def _share_of_pairs_with_both_named(results: list[Result]) -> Estimate:
     return estimated_share([is_leading_name_right(r) for r in _pair_results(results)])
 
 
 def _share_of_pairs_with_false_extra(results: list[Result]) -> Estimate:
-    return estimated_share([has_false_extra(r) for r in _pair_results(results)])
+    return estimated_share([has_false_extra_effect(r) for r in _pair_results(results)])
 
 
 def _share_of_clean_with_effect_named(results: list[Result]) -> Estimate:
@@ -100,7 +106,7 @@ def _median_further_readings(results: list[Result]) -> Estimate:
     extra = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in results], dtype=np.float64)
     extra = extra[extra > 0]
     if not extra.size:
-        return mean([])
+        return estimated_mean([])
     drawn = np.random.default_rng(0).choice(extra, (_BOOTSTRAPS, extra.size))
     low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
     return Estimate(float(np.median(extra)), float(low), float(high), int(extra.size))

@@ -32,7 +32,7 @@ def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(n for n, rho in cosines.items() if rho >= _LIKE) or frozenset({"unknown"})
 
 
-def right_name_sets(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
+def right_names_of_each_effect(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
     """List the effects that have to be named, as one set of right names each.
 
     Parameters
@@ -61,16 +61,16 @@ def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
     )
 
 
-def credible_set_covers(result: Result, *, merged: bool) -> bool:
+def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
     """Return whether the credible set holds the truth; `merged`: whether an alias of an effect will do."""
-    wanted = right_name_sets(result, merged=merged)
+    wanted = right_names_of_each_effect(result, merged=merged)
     return any(names_match(names_in_label(label), wanted) for label in result["credible_set"])
 
 
-def has_false_extra(result: Result) -> bool:
+def has_false_extra_effect(result: Result) -> bool:
     """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
     named = [name for name in leading_hypothesis(result, clean=True)[0] if name not in NOISE]
-    return count_extra_names(named, right_name_sets(result, merged=True, noise=False)) > 0
+    return count_extra_names(named, right_names_of_each_effect(result, merged=True, noise=False)) > 0
 
 
 def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
@@ -84,12 +84,12 @@ def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) ->
 
 def is_distinguishable_from_ssf(result: Result) -> bool:
     """Return whether a concealed effect can be told from one more Gaussian in the SSF with this many readings."""
-    return any(not right & NO_PHYSICS for right in right_name_sets(result, merged=True))
+    return any(not right & NO_PHYSICS for right in right_names_of_each_effect(result, merged=True))
 
 
 def is_out_of_vocabulary(result: Result) -> bool:
     """Return whether a concealed effect is outside the vocabulary and has no alias in it."""
-    return frozenset({"unknown"}) in right_name_sets(result, merged=True)
+    return frozenset({"unknown"}) in right_names_of_each_effect(result, merged=True)
 
 
 def acts_on_mean(result: Result) -> bool:
@@ -110,7 +110,7 @@ def is_leading_name_right(result: Result) -> bool:
     clean is right too.
     """
     if not acts_on_mean(result):
-        return names_match(leading_hypothesis(result, clean=False)[0], right_name_sets(result, merged=True))
+        return names_match(leading_hypothesis(result, clean=False)[0], right_names_of_each_effect(result, merged=True))
     due = is_distinguishable_from_ssf(result)
     joined: dict[Names, float] = {}
     for names, p in result["hypotheses"]:
@@ -118,13 +118,13 @@ def is_leading_name_right(result: Result) -> bool:
         if key or not due:
             joined[key] = joined.get(key, 0.0) + p
     first = max(joined, key=lambda key: joined[key], default=())
-    return names_match(first, right_name_sets(result, merged=True, noise=False))
+    return names_match(first, right_names_of_each_effect(result, merged=True, noise=False))
 
 
 def leading_probability_and_correctness(result: Result) -> tuple[float, bool]:
     """Return the probability of the leading hypothesis, which may be clean, and whether it is exactly the truth."""
     names, probability = leading_hypothesis(result, clean=True)
-    return probability, names_match(names, right_name_sets(result, merged=False))
+    return probability, names_match(names, right_names_of_each_effect(result, merged=False))
 
 
 def names_in_label(label: str) -> Names:

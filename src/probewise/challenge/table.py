@@ -11,11 +11,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import Estimate, bootstrapped, estimated_share, mean
+from probewise.challenge.estimates import Estimate, estimated_by_bootstrap, estimated_mean, estimated_share
 from probewise.challenge.oracle_baseline import (
     oracle_covariate_rate,
+    oracle_credible_set_size,
     oracle_name_rate,
-    oracle_set_size,
     readings_to_separate_alias,
 )
 from probewise.challenge.reliability import calibration_error
@@ -23,8 +23,8 @@ from probewise.challenge.scoring import (
     NOISE,
     Result,
     acts_on_mean,
-    credible_set_covers,
-    has_false_extra,
+    credible_set_holds_truth,
+    has_false_extra_effect,
     is_distinguishable_from_ssf,
     is_leading_name_right,
     is_out_of_vocabulary,
@@ -32,7 +32,7 @@ from probewise.challenge.scoring import (
     leading_probability_and_correctness,
     names_in_label,
     names_match,
-    right_name_sets,
+    right_names_of_each_effect,
 )
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
@@ -43,7 +43,7 @@ _SCANS = ("angle", "pattern", "direction")
 
 
 @dataclass(frozen=True)
-class Row:
+class ScoreRow:
     """One row of the table.
 
     Parameters
@@ -71,22 +71,22 @@ class Row:
         return "missed" if self.found.low > self.most or self.found.high < self.least else "open"
 
 
-def score(results: Sequence[Result]) -> tuple[Row, ...]:
+def score(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
     """Score the results of `run_case`; a case that failed counts in the last row alone."""
     done = [r for r in results if "failed" not in r]
     return (
-        *_clean_rows(done),
-        *_detection_rows(done),
-        *_naming_rows(done),
-        *_probability_rows(done),
-        *_place_rows(done),
-        *_interval_rows(done),
-        *_held_out_rows(done),
-        *_pair_rows(done),
-        *_out_of_vocabulary_rows(done),
-        *_alias_rows(done),
-        *_time_rows(done),
-        Row("cases that failed", estimated_share(["failed" in r for r in results])),
+        *_rows_on_clean_cases(done),
+        *_rows_on_detection(done),
+        *_rows_on_naming(done),
+        *_rows_on_stated_probabilities(done),
+        *_rows_on_location(done),
+        *_rows_on_intervals(done),
+        *_rows_on_held_out_gains(done),
+        *_rows_on_pairs(done),
+        *_rows_on_out_of_vocabulary(done),
+        *_rows_on_aliased_pairs(done),
+        *_rows_on_processor_time(done),
+        ScoreRow("cases that failed", estimated_share(["failed" in r for r in results])),
     )
 
 
@@ -101,17 +101,20 @@ def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -
     }
 
 
-def _clean_rows(done: list[Result]) -> list[Row]:
+def _rows_on_clean_cases(done: list[Result]) -> list[ScoreRow]:
     clean = [r for r in done if r["kind"] == "clean"]
     white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
     models = sorted({r["noise_model"] for r in other})
     return [
-        Row("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.04, 0.06),
-        Row("false alarms, clean, alpha .01", rejection_rate(white, 0.01), 0.006, 0.015),
-        Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
-        *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
-        Row("physics named, clean", estimated_share([names_effect_on_mean(r) for r in clean]), most=0.005),
-        Row(
+        ScoreRow("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.04, 0.06),
+        ScoreRow("false alarms, clean, alpha .01", rejection_rate(white, 0.01), 0.006, 0.015),
+        ScoreRow("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
+        *(
+            ScoreRow(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05), most=0.06)
+            for m in models
+        ),
+        ScoreRow("physics named, clean", estimated_share([names_effect_on_mean(r) for r in clean]), most=0.005),
+        ScoreRow(
             "physics named, one Gaussian more",
             estimated_share([names_effect_on_mean(r) for r in done if r["kind"] == "ssf_order"]),
             most=0.01,
@@ -119,10 +122,10 @@ def _clean_rows(done: list[Result]) -> list[Row]:
     ]
 
 
-def _detection_rows(done: list[Result]) -> list[Row]:
+def _rows_on_detection(done: list[Result]) -> list[ScoreRow]:
     targets = {5.0: 0.8, 6.0: 0.93, 8.0: 0.995}
     rows = [
-        Row(
+        ScoreRow(
             f"detection, alpha .01, lambda {size:g}",
             rejection_rate(_cases_distinguishable_from_ssf(cases_with_one_effect(done, size)), 0.01),
             least,
@@ -131,10 +134,10 @@ def _detection_rows(done: list[Result]) -> list[Row]:
     ]
     each = [detected for detected, _ in detected_and_named_by_effect(_cases_distinguishable_from_ssf(done)).values()]
     worst = min(each, key=lambda e: (e.value, e.high), default=estimated_share([]))
-    return [*rows, Row("detection, lambda 8, least of all effects", worst, 0.9)]
+    return [*rows, ScoreRow("detection, lambda 8, least of all effects", worst, 0.9)]
 
 
-def _naming_rows(done: list[Result]) -> list[Row]:
+def _rows_on_naming(done: list[Result]) -> list[ScoreRow]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
     found = {
         size: estimated_share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]) for size in targets
@@ -144,11 +147,11 @@ def _naming_rows(done: list[Result]) -> list[Row]:
     rows = []
     for size, least in targets.items():
         like = [oracle_name_rate(r["hidden"][0]) for r in cases_with_one_effect(done, size)]
-        rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
-        rows.append(Row(f"  oracle against the hardest rival, lambda {size:g}", mean(like)))
+        rows.append(ScoreRow(f"right name first, lambda {size:g}", found[size], least))
+        rows.append(ScoreRow(f"  oracle against the hardest rival, lambda {size:g}", estimated_mean(like)))
     return [
         *rows,
-        Row("right name first, largest fall as lambda grows", worst, most=0.0),
+        ScoreRow("right name first, largest fall as lambda grows", worst, most=0.0),
     ]
 
 
@@ -160,44 +163,45 @@ def _difference_of_shares(before: Estimate, after: Estimate) -> Estimate:
     return Estimate(fall, fall - down, fall + up, before.n + after.n)
 
 
-def _probability_rows(done: list[Result]) -> list[Row]:
+def _rows_on_stated_probabilities(done: list[Result]) -> list[ScoreRow]:
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
         singles = cases_with_one_effect(done, size)
-        like = [oracle_set_size(r["hidden"][0]) for r in singles]
+        like = [oracle_credible_set_size(r["hidden"][0]) for r in singles]
         rows += [
-            Row(
+            ScoreRow(
                 f"size of the credible set, lambda {size:g}",
-                mean([float(len(r["credible_set"])) for r in singles]),
+                estimated_mean([float(len(r["credible_set"])) for r in singles]),
                 most=most,
             ),
-            Row(
+            ScoreRow(
                 f"  the truth and its aliases as one, lambda {size:g}",
-                mean([set_size_with_aliases_merged(r) for r in singles]),
+                estimated_mean([credible_set_size_with_aliases_merged(r) for r in singles]),
             ),
-            Row(f"  oracle, aliases as one, lambda {size:g}", mean(like)),
+            ScoreRow(f"  oracle, aliases as one, lambda {size:g}", estimated_mean(like)),
         ]
     return [
-        Row(
+        ScoreRow(
             "95 % credible set holds the truth",
-            estimated_share([credible_set_covers(r, merged=False) for r in done]),
+            estimated_share([credible_set_holds_truth(r, merged=False) for r in done]),
             0.95,
         ),
         *rows,
-        Row("expected calibration error", calibration_error(done), most=0.02),
-        Row("wrong name stated above .9", estimated_share([is_confidently_wrong(r) for r in done]), most=0.005),
+        ScoreRow("expected calibration error", calibration_error(done), most=0.02),
+        ScoreRow("wrong name stated above .9", estimated_share([is_confidently_wrong(r) for r in done]), most=0.005),
     ]
 
 
-def set_size_with_aliases_merged(result: Result) -> float:
+def credible_set_size_with_aliases_merged(result: Result) -> float:
     """Count the hypotheses of a credible set; the right one and its aliases count as one."""
     right = sum(
-        names_match(names_in_label(label), right_name_sets(result, merged=True)) for label in result["credible_set"]
+        names_match(names_in_label(label), right_names_of_each_effect(result, merged=True))
+        for label in result["credible_set"]
     )
     return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
-def _place_rows(done: list[Result]) -> list[Row]:
+def _rows_on_location(done: list[Result]) -> list[ScoreRow]:
     targets = {12.0: 0.8, 20.0: 0.9}
     local = {
         size: [r["overlap"] for r in cases_with_one_effect(done, size) if r["overlap"] is not None] for size in targets
@@ -205,24 +209,29 @@ def _place_rows(done: list[Result]) -> list[Row]:
     shown = [r for r in cases_with_one_effect(done, 8.0) if acts_on_mean(r)]
     first = [bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]
     return [
-        *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
-        Row("right covariate first, lambda 8", estimated_share(first), 0.98),
-        Row("  oracle against the hardest rival", mean([oracle_covariate_rate(r["hidden"][0]) for r in shown])),
+        *(
+            ScoreRow(f"overlap of the place, lambda {size:g}", estimated_mean(local[size]), least)
+            for size, least in targets.items()
+        ),
+        ScoreRow("right covariate first, lambda 8", estimated_share(first), 0.98),
+        ScoreRow(
+            "  oracle against the hardest rival", estimated_mean([oracle_covariate_rate(r["hidden"][0]) for r in shown])
+        ),
     ]
 
 
-def _interval_rows(done: list[Result]) -> list[Row]:
+def _rows_on_intervals(done: list[Result]) -> list[ScoreRow]:
     right = [
         r
         for r in done
-        if names_match(r["combination"], right_name_sets(r, merged=False)) and not is_out_of_vocabulary(r)
+        if names_match(r["combination"], right_names_of_each_effect(r, merged=False)) and not is_out_of_vocabulary(r)
     ]
     stated_of = [interval for r in right for own in r["parameters"].values() for interval in own.values()]
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
     sensors = [interval for r in gaussian for interval in r["sensor"].values()]
     return [
-        Row("95 % intervals of effect parameters cover", share_of_intervals_with_truth(stated_of), 0.93, 0.97),
-        Row("95 % intervals of SSF and levels cover", share_of_intervals_with_truth(sensors), 0.93),
+        ScoreRow("95 % intervals of effect parameters cover", share_of_intervals_with_truth(stated_of), 0.93, 0.97),
+        ScoreRow("95 % intervals of SSF and levels cover", share_of_intervals_with_truth(sensors), 0.93),
     ]
 
 
@@ -231,29 +240,38 @@ def share_of_intervals_with_truth(intervals: list[list[float]]) -> Estimate:
     return estimated_share([low <= truth <= high for truth, low, high in intervals])
 
 
-def _held_out_rows(done: list[Result]) -> list[Row]:
+def _rows_on_held_out_gains(done: list[Result]) -> list[ScoreRow]:
     inside = [r for r in done if r["kind"] in ("single", "pair") and acts_on_mean(r)]
-    gains = _gains_by_scan([r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right")
+    gains = _held_out_gains_by_scan(
+        [r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right"
+    )
     white = [r for r in inside if r["noise_model"] == "white"]
     outside = [r for r in done if r["kind"] == "outside" and r["noise_model"] == "white"]
     worse = [_summed_gains_over_null(r, _SCANS, "true")[0] < -1.0 for r in done]
     return [
-        Row("held-out gain, share of the right model's", bootstrapped(gains, _ratio_of_gains), 0.98),
-        *(Row(f"  a new {scan}", bootstrapped(gains[:, k], _ratio_of_gains)) for k, scan in enumerate(_SCANS)),
-        Row(
-            "  share of what the truth itself would gain", bootstrapped(_gains_by_scan(white, "true"), _ratio_of_gains)
+        ScoreRow("held-out gain, share of the right model's", estimated_by_bootstrap(gains, _ratio_of_gains), 0.98),
+        *(
+            ScoreRow(f"  a new {scan}", estimated_by_bootstrap(gains[:, k], _ratio_of_gains))
+            for k, scan in enumerate(_SCANS)
         ),
-        Row("  the same, outside the vocabulary", bootstrapped(_gains_by_scan(outside, "true"), _ratio_of_gains)),
-        Row("held-out worse than the null by over 1 nat", estimated_share(worse), most=0.01),
+        ScoreRow(
+            "  share of what the truth itself would gain",
+            estimated_by_bootstrap(_held_out_gains_by_scan(white, "true"), _ratio_of_gains),
+        ),
+        ScoreRow(
+            "  the same, outside the vocabulary",
+            estimated_by_bootstrap(_held_out_gains_by_scan(outside, "true"), _ratio_of_gains),
+        ),
+        ScoreRow("held-out worse than the null by over 1 nat", estimated_share(worse), most=0.01),
         # The scatter that noise alone causes in the best gain possible with these readings.
-        Row(
+        ScoreRow(
             "  of the right model, fitted to the same",
             estimated_share([bool(own < -1.0) for own in gains[:, :, 1].sum(axis=1)]),
         ),
     ]
 
 
-def _gains_by_scan(results: Sequence[Result], best: str) -> FloatArray:
+def _held_out_gains_by_scan(results: Sequence[Result], best: str) -> FloatArray:
     """Return the gains over the null of the repaired model and of model `best`, (n_cases, n_scans, 2)."""
     gains = [[_summed_gains_over_null(r, [scan], best) for scan in _SCANS] for r in results]
     return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
@@ -269,14 +287,14 @@ def _ratio_of_gains(gains: FloatArray) -> float:
     return float(repaired / true)
 
 
-def _pair_rows(done: list[Result]) -> list[Row]:
+def _rows_on_pairs(done: list[Result]) -> list[ScoreRow]:
     pairs = [r for r in done if r["kind"] == "pair"]
     both = [is_leading_name_right(r) for r in pairs]
     shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_size_beside_other(r)]
     return [
-        Row("two effects: both named", estimated_share(both), 0.95),
-        Row("  where neither hides the other", estimated_share(shown)),
-        Row("two effects: a false extra", estimated_share([has_false_extra(r) for r in pairs]), most=0.03),
+        ScoreRow("two effects: both named", estimated_share(both), 0.95),
+        ScoreRow("  where neither hides the other", estimated_share(shown)),
+        ScoreRow("two effects: a false extra", estimated_share([has_false_extra_effect(r) for r in pairs]), most=0.03),
     ]
 
 
@@ -285,52 +303,52 @@ def _each_keeps_size_beside_other(result: Result) -> bool:
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
-def _out_of_vocabulary_rows(done: list[Result]) -> list[Row]:
+def _rows_on_out_of_vocabulary(done: list[Result]) -> list[ScoreRow]:
     targets = {12.0: 0.9, 20.0: 0.97}
     outside = [r for r in done if is_out_of_vocabulary(r)]
     inside = [r for r in done if r["kind"] != "outside"]
     return [
         *(
-            Row(
+            ScoreRow(
                 f"outside the vocabulary: unknown, lambda {size:g}",
                 estimated_share([r["verdict"] == "unknown" for r in outside if r["size"] == size]),
                 least,
             )
             for size, least in targets.items()
         ),
-        Row("false unknown", estimated_share([r["verdict"] == "unknown" for r in inside]), most=0.02),
+        ScoreRow("false unknown", estimated_share([r["verdict"] == "unknown" for r in inside]), most=0.02),
     ]
 
 
-def _alias_rows(done: list[Result]) -> list[Row]:
+def _rows_on_aliased_pairs(done: list[Result]) -> list[ScoreRow]:
     aliased = [r for r in done if r["kind"] == "alias"]
     settled = [r | r["settled"] if r["settled"] else r for r in aliased]
     return [
-        Row("aliased pair: cannot tell", estimated_share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
-        Row(
+        ScoreRow("aliased pair: cannot tell", estimated_share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
+        ScoreRow(
             "aliased pair: sure of the wrong name",
             estimated_share([is_confidently_wrong(r) for r in aliased]),
             most=0.01,
         ),
-        Row(
+        ScoreRow(
             "right name after the advised readings",
             estimated_share([leading_probability_and_correctness(r)[1] for r in settled]),
             0.95,
         ),
-        Row(
+        ScoreRow(
             "  readings advised, of those that repeating the plan needs",
-            mean([r["settled"]["readings"] / readings_to_separate_alias(r) for r in aliased if r["settled"]]),
+            estimated_mean([r["settled"]["readings"] / readings_to_separate_alias(r) for r in aliased if r["settled"]]),
             most=0.25,
         ),
     ]
 
 
-def _time_rows(done: list[Result]) -> list[Row]:
+def _rows_on_processor_time(done: list[Result]) -> list[ScoreRow]:
     plans = {"paper": 5.0, "two_way": math.inf}
     return [
-        Row(
+        ScoreRow(
             f"processor time of a diagnosis, {plan} plan (s)",
-            mean([r["cpu_s"] for r in done if r["plan"] == plan]),
+            estimated_mean([r["cpu_s"] for r in done if r["plan"] == plan]),
             most=most,
         )
         for plan, most in plans.items()

@@ -6,8 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from probewise.challenge import Estimate, Row, confusion_counts, detected_and_named_by_effect, reliability_bins
-from probewise.challenge.scoring import is_leading_name_right, leading_hypothesis, names_match, right_name_sets
+from probewise.challenge import Estimate, ScoreRow, confusion_counts, detected_and_named_by_effect, reliability_bins
+from probewise.challenge.scoring import (
+    is_leading_name_right,
+    leading_hypothesis,
+    names_match,
+    right_names_of_each_effect,
+)
 from probewise.challenge.systems import name_without_target
 from probewise.challenge.systems.table import gains_on_held_out_runs
 from probewise.recordings.table import csv_text_of_rows
@@ -21,7 +26,7 @@ Results = Sequence[Mapping[str, Any]]
 _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
 
 
-def summary_sentence(rows: Sequence[Row], n_cases: int) -> str:
+def summary_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
     """Summarise in one sentence how many targets are met, missed and undecided."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
@@ -30,7 +35,7 @@ def summary_sentence(rows: Sequence[Row], n_cases: int) -> str:
     )
 
 
-def target_table(rows: Sequence[Row]) -> Markup:
+def target_table(rows: Sequence[ScoreRow]) -> Markup:
     """Build the table of all quantities: what was found, its 95 % interval, the target, and whether it is met."""
     header = ("what", "found", "95 % interval", "of", "target", "decision")
     return table(
@@ -55,7 +60,7 @@ def _indented_row_name(name: str) -> str:
     return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
-def target_table_csv(rows: Sequence[Row]) -> str:
+def target_table_csv(rows: Sequence[ScoreRow]) -> str:
     """Return the table as the text of a CSV file; missing values are empty."""
     cells = []
     for row in rows:
@@ -66,7 +71,7 @@ def target_table_csv(rows: Sequence[Row]) -> str:
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
-def page_html(results: Results, rows: Sequence[Row], *, command: str, systems: bool = False) -> str:
+def page_html(results: Results, rows: Sequence[ScoreRow], *, command: str, systems: bool = False) -> str:
     """Return the page's HTML from the cases' results and their table; `systems`: cases are simulators, not sensors."""
     done = [r for r in results if "failed" not in r]
     sections = [Section("The table", (target_table(rows), _table_legend()))]
@@ -132,7 +137,9 @@ def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
         return (*begun, f"failed: {result['failed']}", "", "no", "")
     names, probability = leading_hypothesis(result, clean=True)
     right = (
-        is_leading_name_right(result) if result["hidden"] else names_match(names, right_name_sets(result, merged=True))
+        is_leading_name_right(result)
+        if result["hidden"]
+        else names_match(names, right_names_of_each_effect(result, merged=True))
     )
     gains = gains_on_held_out_runs(result, "right")
     said = " and ".join(names) or "clean"
@@ -163,7 +170,7 @@ def _interval_text(found: Estimate) -> str:
     return f"{found.low:.3g} to {found.high:.3g}" if math.isfinite(found.high - found.low) else ""
 
 
-def _target_text(row: Row) -> str:
+def _target_text(row: ScoreRow) -> str:
     if row.decision is None:
         return ""
     if math.isinf(row.least):

@@ -8,24 +8,24 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import bootstrapped, estimated_share, mean
+from probewise.challenge.estimates import estimated_by_bootstrap, estimated_mean, estimated_share
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     Result,
-    credible_set_covers,
+    credible_set_holds_truth,
     is_leading_name_right,
     is_out_of_vocabulary,
     leading_hypothesis,
     names_match,
-    right_name_sets,
+    right_names_of_each_effect,
 )
 from probewise.challenge.table import (
-    Row,
+    ScoreRow,
     cases_with_one_effect,
+    credible_set_size_with_aliases_merged,
     is_confidently_wrong,
     names_effect_on_mean,
     rejection_rate,
-    set_size_with_aliases_merged,
     share_of_intervals_with_truth,
 )
 
@@ -40,88 +40,90 @@ def name_without_target(name: str) -> str:
     return "+".join(part.split(":")[0] for part in name.split("+"))
 
 
-def score_systems(results: Sequence[Result]) -> tuple[Row, ...]:
+def score_systems(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
     """Score the results of `run_system_case`; a case that failed counts in the last row alone."""
     done = [r for r in results if "failed" not in r]
     return (
-        *_clean_rows(done),
-        *_naming_rows(done),
-        *_probability_rows(done),
-        *_interval_rows(done),
-        *_held_out_rows(done),
-        *_unlisted_law_rows(done),
-        *_time_rows(done),
-        Row("cases that failed", estimated_share(["failed" in r for r in results])),
+        *_rows_on_clean_cases(done),
+        *_rows_on_naming(done),
+        *_rows_on_stated_probabilities(done),
+        *_rows_on_intervals(done),
+        *_rows_on_held_out_gains(done),
+        *_rows_on_unlisted_laws(done),
+        *_rows_on_processor_time(done),
+        ScoreRow("cases that failed", estimated_share(["failed" in r for r in results])),
     )
 
 
-def _clean_rows(done: list[Result]) -> list[Row]:
+def _rows_on_clean_cases(done: list[Result]) -> list[ScoreRow]:
     clean = [r for r in done if r["kind"] == "clean"]
     white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
     models = sorted({r["noise_model"] for r in other})
     return [
-        Row("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.03, 0.06),
-        Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
-        *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05)) for m in models),
-        Row("physics named, clean", estimated_share([names_effect_on_mean(r) for r in white]), most=0.005),
-        Row("physics named, other noise", estimated_share([names_effect_on_mean(r) for r in other]), most=0.005),
-        Row(
+        ScoreRow("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.03, 0.06),
+        ScoreRow("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
+        *(ScoreRow(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05)) for m in models),
+        ScoreRow("physics named, clean", estimated_share([names_effect_on_mean(r) for r in white]), most=0.005),
+        ScoreRow("physics named, other noise", estimated_share([names_effect_on_mean(r) for r in other]), most=0.005),
+        ScoreRow(
             "noise told as it is, other noise",
             estimated_share([leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]),
         ),
     ]
 
 
-def _naming_rows(done: list[Result]) -> list[Row]:
+def _rows_on_naming(done: list[Result]) -> list[ScoreRow]:
     targets = {6.0: -math.inf, 8.0: 0.9, 12.0: 0.95, 20.0: 0.98}
     shown = cases_with_one_effect(done, 12.0)
     pairs = [r for r in done if r["kind"] == "pair"]
     return [
         *(
-            Row(
+            ScoreRow(
                 f"right name and target first, lambda {size:g}",
                 estimated_share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]),
                 least,
             )
             for size, least in targets.items()
         ),
-        Row(
+        ScoreRow(
             "right covariate first, lambda 12",
             estimated_share([bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]),
             0.95,
         ),
-        Row(
+        ScoreRow(
             "two effects, lambda 12 each: both named", estimated_share([is_leading_name_right(r) for r in pairs]), 0.85
         ),
     ]
 
 
-def _probability_rows(done: list[Result]) -> list[Row]:
+def _rows_on_stated_probabilities(done: list[Result]) -> list[ScoreRow]:
     own = cases_with_one_effect(done, 12.0)
-    covered, covered_of_all = (estimated_share([credible_set_covers(r, merged=True) for r in rs]) for rs in (own, done))
+    covered, covered_of_all = (
+        estimated_share([credible_set_holds_truth(r, merged=True) for r in rs]) for rs in (own, done)
+    )
     return [
-        Row("95 % credible set holds the truth or its alias, lambda 12", covered, 0.95),
-        Row("  the same, all cases", covered_of_all),
-        Row(
+        ScoreRow("95 % credible set holds the truth or its alias, lambda 12", covered, 0.95),
+        ScoreRow("  the same, all cases", covered_of_all),
+        ScoreRow(
             "size of the credible set, the truth and its aliases as one, lambda 12",
-            mean([set_size_with_aliases_merged(r) for r in own]),
+            estimated_mean([credible_set_size_with_aliases_merged(r) for r in own]),
             most=1.4,
         ),
-        Row("wrong name stated above .9", estimated_share([_is_confidently_wrong(r) for r in done]), most=0.01),
-        Row("expected calibration error", calibration_error(done)),
+        ScoreRow("wrong name stated above .9", estimated_share([_is_confidently_wrong(r) for r in done]), most=0.01),
+        ScoreRow("expected calibration error", calibration_error(done)),
     ]
 
 
 def _is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong name, not an alias of the truth, is stated above .9."""
     return is_confidently_wrong(result) and not names_match(
-        leading_hypothesis(result, clean=True)[0], right_name_sets(result, merged=True)
+        leading_hypothesis(result, clean=True)[0], right_names_of_each_effect(result, merged=True)
     )
 
 
-def _interval_rows(done: list[Result]) -> list[Row]:
+def _rows_on_intervals(done: list[Result]) -> list[ScoreRow]:
     stated = [interval for r in done for own in r["parameters"].values() for interval in own.values()]
-    return [Row("95 % intervals of effect parameters cover", share_of_intervals_with_truth(stated), 0.92, 0.98)]
+    return [ScoreRow("95 % intervals of effect parameters cover", share_of_intervals_with_truth(stated), 0.92, 0.98)]
 
 
 def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | None:
@@ -136,33 +138,33 @@ def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | N
     return min(repaired, _MOST_NATS), min(most, _MOST_NATS)
 
 
-def _shares_of_right_gain(results: Sequence[Result]) -> FloatArray:
+def _shares_of_right_models_gain(results: Sequence[Result]) -> FloatArray:
     gains = [g for g in (gains_on_held_out_runs(r, "right") for r in results) if g is not None and g[1] >= _LEAST_NATS]
     return np.array([[repaired / right] for repaired, right in gains]).reshape(-1, 1)
 
 
-def _held_out_rows(done: list[Result]) -> list[Row]:
+def _rows_on_held_out_gains(done: list[Result]) -> list[ScoreRow]:
     named = [r for r in done if r["kind"] in ("single", "pair")]
     clean = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done if r["kind"] == "clean") if g is not None]
-    shares = bootstrapped(_shares_of_right_gain(named), lambda rows: float(np.median(rows)))
+    shares = estimated_by_bootstrap(_shares_of_right_models_gain(named), lambda rows: float(np.median(rows)))
     every = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done) if g is not None]
     return [
-        Row("held-out runs: median share of the right model's gain", shares, 0.95),
-        Row("held-out worse than the null by over 3 nats", estimated_share([bool(g < -3.0) for g in every])),
-        Row("  of clean ones", estimated_share([bool(g < -3.0) for g in clean])),
+        ScoreRow("held-out runs: median share of the right model's gain", shares, 0.95),
+        ScoreRow("held-out worse than the null by over 3 nats", estimated_share([bool(g < -3.0) for g in every])),
+        ScoreRow("  of clean ones", estimated_share([bool(g < -3.0) for g in clean])),
     ]
 
 
-def _unlisted_law_rows(done: list[Result]) -> list[Row]:
+def _rows_on_unlisted_laws(done: list[Result]) -> list[ScoreRow]:
     outside = [r for r in done if r["kind"] == "outside"]
     inside = [r for r in done if r["kind"] != "outside"]
     good = [_gains_as_much_as_true_law(r) for r in outside]
     told = [g or r["verdict"] == "unknown" for g, r in zip(good, outside, strict=True)]
     return [
-        Row("not on the list, lambda 20: unknown, or as good as the true law", estimated_share(told), 0.9),
-        Row("  by a formula or a name", estimated_share(good), 0.6),
-        Row("  a formula found", estimated_share([bool(r["formula"]) for r in outside])),
-        Row(
+        ScoreRow("not on the list, lambda 20: unknown, or as good as the true law", estimated_share(told), 0.9),
+        ScoreRow("  by a formula or a name", estimated_share(good), 0.6),
+        ScoreRow("  a formula found", estimated_share([bool(r["formula"]) for r in outside])),
+        ScoreRow(
             "false unknown", estimated_share([r["verdict"] == "unknown" for r in inside if not is_out_of_vocabulary(r)])
         ),
     ]
@@ -171,7 +173,7 @@ def _unlisted_law_rows(done: list[Result]) -> list[Row]:
 def _gains_as_much_as_true_law(result: Result) -> bool:
     """Return whether a name or formula gains most of what the true law does; aliases count too."""
     if (
-        names_match(leading_hypothesis(result, clean=True)[0], right_name_sets(result, merged=True))
+        names_match(leading_hypothesis(result, clean=True)[0], right_names_of_each_effect(result, merged=True))
         and result["verdict"] != "unknown"
     ):
         return True
@@ -179,8 +181,14 @@ def _gains_as_much_as_true_law(result: Result) -> bool:
     return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
 
 
-def _time_rows(done: list[Result]) -> list[Row]:
+def _rows_on_processor_time(done: list[Result]) -> list[ScoreRow]:
     return [
-        Row("processor time of a diagnosis, formula (s)", mean([r["cpu_s"] for r in done if not r["law"]]), most=5.0),
-        Row("processor time of a diagnosis, law (s)", mean([r["cpu_s"] for r in done if r["law"]]), most=20.0),
+        ScoreRow(
+            "processor time of a diagnosis, formula (s)",
+            estimated_mean([r["cpu_s"] for r in done if not r["law"]]),
+            most=5.0,
+        ),
+        ScoreRow(
+            "processor time of a diagnosis, law (s)", estimated_mean([r["cpu_s"] for r in done if r["law"]]), most=20.0
+        ),
     ]

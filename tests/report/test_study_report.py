@@ -9,9 +9,9 @@ import pytest
 from probewise.experiment import CLEAN, least_readings
 from probewise.report import concealed, plots
 from probewise.report import study as report
-from probewise.study import REFERENCE, ConcealedTrial, Row, Study, concealed_rows, experiment_of
+from probewise.study import REFERENCE, ConcealedTrial, SearchConfiguration, Study, concealed_rows, experiment_of
 
-ROWS = [REFERENCE, Row(model="naive")]
+ROWS = [REFERENCE, SearchConfiguration(model="naive")]
 
 
 def trial(rng, mean):

@@ -7,10 +7,18 @@ import pytest
 
 from probewise.campaign import run_campaign
 from probewise.errors import FileError, ParameterError
-from probewise.study import REFERENCE, Row, Trial, paper_rows, read_study, run_study, run_trial
+from probewise.study import (
+    REFERENCE,
+    SearchConfiguration,
+    Trial,
+    paper_comparison_rows,
+    read_study,
+    run_study,
+    run_trial,
+)
 from probewise.study.trial import experiment_of_trial
 
-ROWS = [REFERENCE, Row(model="naive")]
+ROWS = [REFERENCE, SearchConfiguration(model="naive")]
 BRIEF = {"n_circles": 2, "max_readings": 3}
 
 
@@ -51,7 +59,7 @@ def test_a_run_that_may_not_go_on_is_a_miss(study):
 @pytest.mark.slow
 def test_the_papers_method_stands_beside_ours_on_the_same_circle():
     """The first place is drawn by the same rule from other samples; levels come from readings before the run."""
-    ours, paper, _, naive = rows = paper_rows(nested_stop="remaining")
+    ours, paper, _, naive = rows = paper_comparison_rows(nested_stop="remaining")
     assert [row.method for row in rows] == ["particles", "paper"] * 2
     assert paper.name == "inside, SSF, the paper's method to remaining evidence"
     assert ours == REFERENCE
@@ -76,13 +84,15 @@ def test_the_papers_method_stands_beside_ours_on_the_same_circle():
 )
 def test_rows_that_cannot_be_are_refused(changes, named):
     with pytest.raises(ParameterError) as caught:
-        Row(**changes)
+        SearchConfiguration(**changes)
     assert caught.value.name == named
 
 
 def test_rows_that_differ_have_names_that_differ():
     rows = [
-        Row(**{name: value}) for name in ("width", "noise_sd") for value in (1.254, 1.25, 1.3, 1.3000001, 0.996, 0.7)
+        SearchConfiguration(**{name: value})
+        for name in ("width", "noise_sd")
+        for value in (1.254, 1.25, 1.3, 1.3000001, 0.996, 0.7)
     ]
     assert len({row.name for row in rows}) == len(rows)
     assert [rows[k].name.split(", ")[-1] for k in (0, 1, 2, 5, 9)] == [

@@ -7,7 +7,14 @@ import pytest
 from scipy.stats import chi2, poisson
 
 from probewise.errors import ParameterError
-from probewise.study import POPULATIONS, Row, share_with_interval, standard_noise_of_run, standard_rows, summarise
+from probewise.study import (
+    POPULATIONS,
+    SearchConfiguration,
+    noise_of_run_in_sds,
+    share_with_interval,
+    standard_rows,
+    summarise,
+)
 
 
 def trial(readings: int, *, reached: bool = True, first_white: int | None = 3, error_mm: float = 1.0) -> dict:
@@ -86,8 +93,8 @@ def test_circles_and_noise_are_always_the_same():
     r = 50 + 100 * u[:, 2]
     np.testing.assert_allclose(inside, np.c_[r + (1048 - 2 * r) * u[:, 0], r + (520 - 2 * r) * u[:, 1], r])
     np.testing.assert_array_equal(POPULATIONS["inside"].circles(7), inside[:7])
-    np.testing.assert_array_equal(standard_noise_of_run(5, 10), standard_noise_of_run(5, 100)[:10])
-    assert not np.allclose(standard_noise_of_run(5, 10), standard_noise_of_run(6, 10))
+    np.testing.assert_array_equal(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(5, 100)[:10])
+    assert not np.allclose(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(6, 10))
 
 
 def test_every_standard_row_has_a_name_of_its_own():
@@ -100,4 +107,4 @@ def test_every_standard_row_has_a_name_of_its_own():
 )
 def test_rows_that_mean_nothing_are_refused(wrong):
     with pytest.raises(ParameterError, match=next(iter(wrong))):
-        Row(**wrong)
+        SearchConfiguration(**wrong)

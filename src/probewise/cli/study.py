@@ -24,7 +24,7 @@ from probewise.errors import ParameterError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from probewise.study import Row
+    from probewise.study import SearchConfiguration
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
 _SIZES = ("small", "plain", "gross")
@@ -109,7 +109,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run the remaining tasks of the study of concealed effects and write its table."""
     from probewise.recordings.table import csv_text_of_rows
     from probewise.report import concealed as report
-    from probewise.study import concealed_rows, concealed_table, run_concealed
+    from probewise.study import concealed_csv_rows, concealed_rows, run_concealed
 
     others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
     others += ["--beside-paper"] if arguments.beside_paper else []
@@ -128,7 +128,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
             executor=executor,
             progress=progress,
         )
-    table = concealed_table(found)
+    table = concealed_csv_rows(found)
     rows = concealed_rows(found)
     with staged_output(out) as stage:
         stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
@@ -138,22 +138,22 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     return 0
 
 
-def _configuration_rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
-    from probewise.study import Row, paper_rows, standard_rows
+def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:
+    from probewise.study import SearchConfiguration, paper_comparison_rows, standard_rows
 
     given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
     if arguments.beside_paper:
         others = [f"--{name.replace('_', '-')}" for name in given if name not in ("population", "nested_stop")]
         if others:
             raise ParameterError(others[0], "given", "none with --beside-paper, which has its own rows")
-        return paper_rows(**given)
+        return paper_comparison_rows(**given)
     if not given:
         return standard_rows()
     if given.get("method") == "paper":
         given.setdefault("utility", "entropy")
     if "noise" in given:
         given["noise_sd"] = given.pop("noise")
-    return (Row(**given),)
+    return (SearchConfiguration(**given),)
 
 
 def _command_line(arguments: argparse.Namespace) -> str:

@@ -12,7 +12,7 @@ from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, posterior_widths_of_runs, readings_needed
 from probewise.report.words import count_with_noun, number_text, value_with_error
-from probewise.study import LEAST_FOR_MEDIAN, REFERENCE, Estimate, Row, Study, Summary, experiment_of
+from probewise.study import LEAST_FOR_MEDIAN, REFERENCE, Estimate, SearchConfiguration, Study, Summary, experiment_of
 
 _COLUMNS: tuple[tuple[str, str], ...] = (
     ("reached", "share that reached the precision, 95 % interval"),
@@ -153,7 +153,7 @@ def _table_legend() -> Markup:
     )
 
 
-def _readings_row(row: Row, found: Summary) -> tuple[str, ...]:
+def _readings_row(row: SearchConfiguration, found: Summary) -> tuple[str, ...]:
     reached = found.reached
     return (
         row.name,
@@ -173,7 +173,7 @@ def _value_with_interval(estimate: Estimate) -> str:
     )
 
 
-def _information_row(row: Row, found: Summary) -> tuple[str, ...]:
+def _information_row(row: SearchConfiguration, found: Summary) -> tuple[str, ...]:
     return (
         row.name,
         _estimate_with_error_text(found.bits_each),

@@ -4,17 +4,17 @@ A study is a campaign of autonomous runs: every row of its table has the same ci
 from a reference row in one factor.
 """
 
-from probewise.study.circles import POPULATIONS, Population, standard_noise_of_run
+from probewise.study.circles import POPULATIONS, Population, noise_of_run_in_sds
 from probewise.study.concealed import (
     CONCEALED,
     ConcealedRow,
     ConcealedTrial,
+    concealed_csv_rows,
     concealed_rows,
-    concealed_table,
     run_concealed,
     run_concealed_trial,
 )
-from probewise.study.rows import REFERENCE, Row, paper_rows, standard_rows
+from probewise.study.rows import REFERENCE, SearchConfiguration, paper_comparison_rows, standard_rows
 from probewise.study.run import Study, read_study, run_study
 from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_with_interval, summarise
 from probewise.study.trial import Trial, arm_of, experiment_of, run_trial
@@ -28,28 +28,37 @@ __all__ = [
     "ConcealedTrial",
     "Estimate",
     "Population",
-    "Row",
+    "SearchConfiguration",
     "Study",
     "Summary",
     "Trial",
     "arm_of",
+    "concealed_csv_rows",
     "concealed_rows",
-    "concealed_table",
     "experiment_of",
-    "paper_rows",
+    "noise_of_run_in_sds",
+    "paper_comparison_rows",
     "read_study",
     "run_concealed",
     "run_concealed_trial",
     "run_study",
     "run_trial",
     "share_with_interval",
-    "standard_noise_of_run",
     "standard_rows",
     "summarise",
 ]
 
-noise_of = standard_noise_of_run
-"""The old name of `standard_noise_of_run`."""
+noise_of = standard_noise_of_run = noise_of_run_in_sds
+"""The old names of `noise_of_run_in_sds`."""
 
 share_within = share_with_interval
 """The old name of `share_with_interval`."""
+
+concealed_table = concealed_csv_rows
+"""The old name of `concealed_csv_rows`."""
+
+paper_rows = paper_comparison_rows
+"""The old name of `paper_comparison_rows`."""
+
+Row = SearchConfiguration
+"""The old name of `SearchConfiguration`."""

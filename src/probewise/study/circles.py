@@ -38,6 +38,6 @@ POPULATIONS: Mapping[str, Population] = {
 }
 
 
-def standard_noise_of_run(circle: int, n: int) -> FloatArray:
+def noise_of_run_in_sds(circle: int, n: int) -> FloatArray:
     """Return the noise of a run's first `n` readings in units of its sd, (n,); the same for every strategy compared."""
     return np.random.default_rng([circle, 99]).standard_normal(n)

@@ -138,10 +138,12 @@ class ConcealedTrial:
         return np.asarray(POPULATIONS[REFERENCE.population].circles(self.circle + 1, seed=self.seed)[self.circle])
 
     @property
-    def truth(self) -> FloatArray:
+    def true_circle_in_arm_frame(self) -> FloatArray:
         """The true circle in the arm's own frame, (3,)."""
         frame = _IN_ARM_FRAME.get(self.effect)
         return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
+
+    truth = true_circle_in_arm_frame  # its old name
 
     @property
     def right_answer(self) -> str:
@@ -180,7 +182,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     return {
         "known": has_reached_target(last, experiment),
         "readings": last.number,
-        **accuracy_measures(last, experiment, trial.truth),
+        **accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
         "p_truth": round(left_out.probability.get(trial.right_answer, 0.0), 4),
         "credible": list(left_out.credible_set),
         "noticed": bool(last.p_value < experiment.doubt_p or left_out.leading != CLEAN),
@@ -199,7 +201,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     disc = Disc((x_mm, y_mm), radius_mm)
     came: list[tuple[Pose, float, tuple[float, float]]] = []
 
-    def light(pose: Pose, time_s: float, height_mm: float) -> float:
+    def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
         direction = came[-1][2] if came else (0.0, 0.0)
         if came and (away := math.hypot(pose.x_mm - came[-1][0].x_mm, pose.y_mm - came[-1][0].y_mm)) > 0:
             direction = ((pose.x_mm - came[-1][0].x_mm) / away, (pose.y_mm - came[-1][0].y_mm) / away)
@@ -211,7 +213,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
         return world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng, direction=direction)
 
     everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
-    return SimulatedArm(light, reach=everywhere, speed=_SPEED, scale=None)
+    return SimulatedArm(light_reading, reach=everywhere, speed=_SPEED, scale=None)
 
 
 def run_concealed(
@@ -300,7 +302,7 @@ def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[
     return [_summary_row(key, runs) for key, runs in rows.items()]
 
 
-def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
+def concealed_csv_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Summarise each row for a CSV file: shares with their intervals as text."""
     return [{name: _csv_value(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
 

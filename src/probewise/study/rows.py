@@ -16,7 +16,7 @@ _IN_BATCHES = ("finishing", "information")
 
 
 @dataclass(frozen=True)
-class Row:
+class SearchConfiguration:
     """One configuration of the search.
 
     Parameters
@@ -93,9 +93,9 @@ class Row:
         elif self.utility != REFERENCE.utility:
             words.append(self.utility)
         if self.noise_sd != REFERENCE.noise_sd:
-            words.append(f"noise {_exact_text(self.noise_sd)}")
+            words.append(f"noise {_exact_number_text(self.noise_sd)}")
         if self.width != REFERENCE.width:
-            words.append(_width_in_words(self.width))
+            words.append(_ssf_width_in_words(self.width))
         if self.learn_sensor:
             words.append("learning it")
         if self.batch != REFERENCE.batch:
@@ -107,22 +107,24 @@ class Row:
         return asdict(self)
 
 
-def _exact_text(value: float) -> str:
+def _exact_number_text(value: float) -> str:
     """Return a number as text, in six digits if these are all."""
     return text if float(text := f"{value:g}") == value else repr(float(value))
 
 
-def _width_in_words(width: float) -> str:
+def _ssf_width_in_words(width: float) -> str:
     """Describe a wrong width: in whole percent if it is one, otherwise as a factor."""
     if width != round(width, 2):
         return f"believed {float(width)!r} times as wide"
     return f"believed {abs(width - 1):.0%} too {'wide' if width > 1 else 'narrow'}"
 
 
-REFERENCE = Row()
+REFERENCE = SearchConfiguration()
 
 
-def paper_rows(*, population: str = REFERENCE.population, nested_stop: NestedStop = "change") -> tuple[Row, ...]:
+def paper_comparison_rows(
+    *, population: str = REFERENCE.population, nested_stop: NestedStop = "change"
+) -> tuple[SearchConfiguration, ...]:
     """Return rows with the reference's and the paper's method for each sensor model."""
     paper = {"method": "paper", "utility": "entropy", "nested_stop": nested_stop}
     ways: tuple[dict[str, Any], ...] = ({}, paper)
@@ -131,7 +133,7 @@ def paper_rows(*, population: str = REFERENCE.population, nested_stop: NestedSto
     )
 
 
-def standard_rows() -> tuple[Row, ...]:
+def standard_rows() -> tuple[SearchConfiguration, ...]:
     """Return the rows of the published table, the reference first."""
     changes: tuple[dict[str, Any], ...] = (
         {},

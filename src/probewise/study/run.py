@@ -13,7 +13,7 @@ from probewise._version import __version__
 from probewise.campaign import read_campaign, run_campaign
 from probewise.errors import FileError, ParameterError
 from probewise.progress import Progress, silent
-from probewise.study.rows import Row
+from probewise.study.rows import SearchConfiguration
 from probewise.study.table import Summary, summarise
 from probewise.study.trial import Trial, run_trial
 
@@ -22,16 +22,16 @@ from probewise.study.trial import Trial, run_trial
 class Study:
     """Results of each row in the order of the circles, and the limit of readings."""
 
-    trials: Mapping[Row, tuple[Mapping[str, Any], ...]]
+    trials: Mapping[SearchConfiguration, tuple[Mapping[str, Any], ...]]
     max_readings: int
 
-    def table(self) -> dict[Row, Summary]:
+    def table(self) -> dict[SearchConfiguration, Summary]:
         """Summarise every row with two or more runs."""
         return {row: summarise(t, max_readings=self.max_readings) for row, t in self.trials.items() if len(t) > 1}
 
 
 def run_study(
-    rows: Mapping[Row, int] | Sequence[Row],
+    rows: Mapping[SearchConfiguration, int] | Sequence[SearchConfiguration],
     n_circles: int | None = None,
     *,
     path: str | os.PathLike[str],
@@ -82,7 +82,7 @@ def run_study(
     return Study(own, max_readings)
 
 
-def read_study(path: str | os.PathLike[str], rows: Sequence[Row]) -> Study:
+def read_study(path: str | os.PathLike[str], rows: Sequence[SearchConfiguration]) -> Study:
     """Read the results of these rows from a study's file, finished or not.
 
     Raises

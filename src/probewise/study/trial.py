@@ -32,8 +32,8 @@ from probewise.priors import Normal, Product
 from probewise.recordings import Disc
 from probewise.scene import HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
-from probewise.study.circles import FIELD, POPULATIONS, standard_noise_of_run
-from probewise.study.rows import Row
+from probewise.study.circles import FIELD, POPULATIONS, noise_of_run_in_sds
+from probewise.study.rows import SearchConfiguration
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, Spot, World, gaussian_spot
 
@@ -50,7 +50,7 @@ _UNROUNDED = ReadingScale(-math.inf, math.inf, None)
 class Trial:
     """A task of a study: the row, the number of the circle, and the limit of readings."""
 
-    row: Row
+    row: SearchConfiguration
     circle: int
     max_readings: int = 100
 
@@ -66,7 +66,7 @@ class Trial:
 
 
 @lru_cache(maxsize=16)
-def experiment_of(row: Row) -> Experiment:
+def experiment_of(row: SearchConfiguration) -> Experiment:
     """Build the experiment of a row, cached per process with its tables."""
     scene = HypothesisScene(POPULATIONS[row.population].shape)
     common: dict[str, Any] = {
@@ -180,14 +180,14 @@ def arm_of(trial: Trial) -> SimulatedArm:
     world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
-    noise, number = standard_noise_of_run(trial.circle, trial.max_readings), itertools.count()
+    noise, number = noise_of_run_in_sds(trial.circle, trial.max_readings), itertools.count()
 
-    def light(pose: Pose, time_s: float, height_mm: float) -> float:
+    def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
         clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)
         return clean + trial.row.noise_sd * float(noise[next(number)])
 
     everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
-    return SimulatedArm(light, reach=everywhere, scale=None)
+    return SimulatedArm(light_reading, reach=everywhere, scale=None)
 
 
 @lru_cache(maxsize=1)

@@ -141,7 +141,7 @@ def run(arguments: argparse.Namespace) -> int:
             take = SimulatedRecorder(world, noise)
         progress = stack.enter_context(progress_shown(quiet=arguments.quiet))
         for each in investigate(
-            partial(folder.record, take=take, progress=progress),
+            partial(folder.record_round, take=take, progress=progress),
             plan,
             sensor=sensor,
             budget=Budget(arguments.readings, arguments.minutes),
@@ -234,7 +234,7 @@ def _shipped_world_with_effects(truth: str | None, rng: np.random.Generator) -> 
 
     from probewise.investigation import parse_concealed
     from probewise.world.shipped import CANDIDATES
-    from probewise.world.shipped import truth as world_behind
+    from probewise.world.shipped import true_world as world_behind
 
     concealed = (CANDIDATES[int(rng.integers(len(CANDIDATES)))],) if truth is None else parse_concealed(truth)
     return replace(world_behind("paper"), concealed=concealed)

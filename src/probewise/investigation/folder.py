@@ -65,7 +65,9 @@ class RoundsFolder:
             raise FileError(file, "an investigation is in this folder", "--resume to continue it, or another --out")
         self._settings = wanted
 
-    def record(self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent) -> Recording:
+    def record_round(
+        self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent
+    ) -> Recording:
         """Take the readings of a round, or those still missing, write them to the folder, and return them.
 
         A plan of the round that is in the folder already is used in place of `plan`; `asked` is the plan in words.
@@ -93,6 +95,8 @@ class RoundsFolder:
             if readings:
                 write_recording(recorded(plan, readings), readings_file)
         return read_recording(readings_file)
+
+    record = record_round  # its old name
 
     @property
     def n_readings(self) -> int:

@@ -47,7 +47,7 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
 def _parse_one_effect(text: str) -> Concealed:
     """Parse one effect, NAME:VALUE,VALUE."""
     name, _, numbers = text.partition(":")
-    kinds = _kinds_with_numeric_parameters()
+    kinds = _effect_classes_with_numeric_parameters()
     if name not in kinds:
         meant = did_you_mean(name, kinds)
         raise ParameterError(
@@ -66,7 +66,7 @@ def _parse_one_effect(text: str) -> Concealed:
     return effect  # type: ignore[no-any-return]
 
 
-def _kinds_with_numeric_parameters() -> dict[str, Any]:
+def _effect_classes_with_numeric_parameters() -> dict[str, Any]:
     """Return the classes of concealed effects whose parameters are all numbers, by name."""
     every: list[Any] = [getattr(concealed, name) for name in concealed.__all__]
     named = [kind for kind in every if isinstance(getattr(kind, "name", None), str)]

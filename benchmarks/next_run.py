@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise.calibration import FittedSensor, mean_field
+from probewise.calibration import FittedSensor, posterior_mean_ssf_field
 from probewise.experiment import TRUST, experiment_for, explore, left_out_after_step, repaired_sensor
 from probewise.recordings import Instrumentation
 from probewise.scene import Field
@@ -45,7 +45,7 @@ def calibrated() -> FittedSensor:
         samples=samples,
         n_gaussians=1,
         noise_sd=np.full(500, REFERENCE.noise_sd),
-        field=mean_field(samples, 1, pixel_mm=0.5),
+        field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
         instrumentation=Instrumentation(),
     )
 

@@ -25,9 +25,14 @@ from tqdm import tqdm
 
 from probewise import __version__
 from probewise.calibration import Calibration, calibrate, default_prior
-from probewise.calibration.coverage import TrueSensor, draw_truth, interval_holds_truth_by_quantity, simulate_truth
-from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.order_search import search_order
+from probewise.calibration.coverage import (
+    TrueSensor,
+    draw_true_sensor,
+    interval_holds_truth_by_quantity,
+    simulate_paper_recording,
+)
+from probewise.calibration.order_problems import ProblemsByOrder
+from probewise.calibration.order_search import search_prior_of_order
 from probewise.errors import DoubtfulResultWarning
 from probewise.recordings import Recording, paper_plan, read_recording, shipped, two_way_plan, write_text_atomically
 from probewise.world import Blob, World, gaussian_spot
@@ -69,14 +74,14 @@ def reference_runs(
     recording: Recording, orders: tuple[int, ...], *, n_runs: int, n_live: int, seed: int, out: Path
 ) -> None:
     """Search each order so many times, order after order, and write every run."""
-    problems = OrderProblems(recording, default_prior)
+    problems = ProblemsByOrder(recording, default_prior)
     streams = {n: np.random.default_rng([seed, n]).spawn(n_runs) for n in orders}
     document: dict[str, object] = {"n_live": n_live, "seed": seed, "date": datetime.date.today().isoformat()}
     rows: list[dict[str, object]] = json.loads(out.read_text())["runs"] if out.exists() else []
     done = {(row["run"], row["order"]) for row in rows}
     for run, n in tqdm([(run, n) for run in range(n_runs) for n in orders if (run, n) not in done], desc="reference"):
         began = time.process_time()
-        found = search_order(problems, n, streams[n][run], n_live=n_live)
+        found = search_prior_of_order(problems, n, streams[n][run], n_live=n_live)
         result, refined = found.result, found.refined
         row: dict[str, object] = {"run": run, "order": n, "log_z": result.log_z, "log_z_error": result.log_z_error}
         if refined is not None:
@@ -136,8 +141,8 @@ def main() -> None:
     done = {pair["sensor"] for pair in pairs}
     left = [(k, stream) for k, stream in enumerate(rng.spawn(asked.sensors)) if k not in done]
     for k, stream in tqdm(left, desc="sensors"):
-        truth = draw_truth(rng=stream)
-        for recording, known in ((simulate_truth(truth, rng=stream), truth), (two_lobes(stream), None)):
+        truth = draw_true_sensor(rng=stream)
+        for recording, known in ((simulate_paper_recording(truth, rng=stream), truth), (two_lobes(stream), None)):
             quick, full = (timed(recording, stream, quick=way, orders=orders, truth=known) for way in (True, False))
             apart = np.subtract(quick["log_z"], full["log_z"])  # type: ignore[arg-type]
             error = np.hypot(quick["log_z_error"], full["log_z_error"])  # type: ignore[call-overload]

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from probewise._arrays import FloatArray
-from probewise.calibration import Calibration, FittedSensor, calibrate, choose_pixel_mm, default_prior, mean_field
+from probewise.calibration import (
+    Calibration,
+    FittedSensor,
+    calibrate,
+    choose_pixel_mm,
+    default_prior,
+    posterior_mean_ssf_field,
+)
 from probewise.calibration.compensation import CompensatedShapeProposal
-from probewise.calibration.order_problems import OrderProblems
+from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture, mixture_names
@@ -31,7 +38,7 @@ def _sensor(
         samples=np.concatenate([samples, columns], axis=1),
         n_gaussians=1,
         noise_sd=NOISE_SD * np.exp(0.05 * spread * rng.standard_normal(n_samples)),
-        field=mean_field(samples, 1, pixel_mm=choose_pixel_mm(samples, 1, step_mm=1.0)),
+        field=posterior_mean_ssf_field(samples, 1, pixel_mm=choose_pixel_mm(samples, 1, step_mm=1.0)),
         instrumentation=Instrumentation(unit="LEGO", min=0.0, max=100.0),
         effects=effects,
     )
@@ -82,7 +89,7 @@ def make_compensation(recording: Recording) -> Callable[..., CompensatedShapePro
         theta = np.concatenate([shapes, np.tile([11.0, 58.0], (300, 1))], axis=1)
         theta *= 1.0 + spread * rng.standard_normal(theta.shape)
         rest = below.coordinates.leave(below.coordinates.enter(theta))[0]
-        problems = OrderProblems(recording, default_prior)
+        problems = ProblemsByOrder(recording, default_prior)
         return CompensatedShapeProposal.from_samples(
             problems.problem(n - 1), below.coordinates, problems.problem(1), rest, rng=rng, n_pool=n_pool
         )

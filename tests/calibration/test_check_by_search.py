@@ -8,8 +8,8 @@ import pytest
 
 from probewise.calibration import Calibration, OrderPosterior, SMCResult, calibrate, default_prior, quick_fit
 from probewise.calibration.check_by_search import missed_part_in_words, share_far_from_known
-from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.order_search import search_order
+from probewise.calibration.order_problems import ProblemsByOrder
+from probewise.calibration.order_search import search_prior_of_order
 from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.recordings import Disc, HalfPlane, Plan, Recording
 from probewise.world import Blob, World, gaussian_spot
@@ -48,10 +48,12 @@ def test_samples_of_a_part_that_is_not_known_lie_apart() -> None:
 
 @pytest.mark.slow
 def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording) -> None:
-    problems, rng = OrderProblems(mirrored, default_prior), np.random.default_rng(3)
+    problems, rng = ProblemsByOrder(mirrored, default_prior), np.random.default_rng(3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(quick_fit, "missed_part_in_words", lambda *_, **__: "")
-        found, why = fit_orders_quickly(problems, (1,), search=partial(search_order, problems, n_live=50), rng=rng)
+        found, why = fit_orders_quickly(
+            problems, (1,), search=partial(search_prior_of_order, problems, n_live=50), rng=rng
+        )
     made = found[1].result
     assert not why
     assert isinstance(made, SMCResult)
@@ -62,8 +64,8 @@ def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording
 
 @pytest.fixture(scope="module")
 def vouched(recording: Recording) -> OrderPosterior:
-    problems = OrderProblems(recording, default_prior)
-    search = partial(search_order, problems, n_live=50)
+    problems = ProblemsByOrder(recording, default_prior)
+    search = partial(search_prior_of_order, problems, n_live=50)
     return fit_orders_quickly(problems, (1,), search=search, rng=np.random.default_rng(4))[0][1]
 
 
@@ -87,7 +89,7 @@ def test_the_order_that_missed_a_peak_and_those_above_are_searched(
     low = OrderPosterior(replace(made, log_z_of_clouds=made.log_z_of_clouds - 90.0), None)
     monkeypatch.setattr(quick_fit, "missed_part_in_words", lambda *_, **__: "it lies elsewhere")
     found = quick_fit._check_chosen_order_or_search_in_full(
-        OrderProblems(recording, default_prior),
+        ProblemsByOrder(recording, default_prior),
         {1: low, 2: vouched, 3: low},
         np.random.default_rng(0),
         search=search,

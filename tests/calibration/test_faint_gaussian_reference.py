@@ -9,12 +9,12 @@ import pytest
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration import SSFPrior, default_prior
 from probewise.calibration.compensation import CompensatedShapeProposal
-from probewise.calibration.faint_gaussian_reference import FaintGaussianReference, has_uniform_light
+from probewise.calibration.faint_gaussian_reference import FaintGaussianReferenceDensity, has_uniform_prior_of_light
 from probewise.calibration.label_symmetric_coordinates import LabelSymmetricCoordinates
-from probewise.calibration.mixed_reference import MixedReference
-from probewise.calibration.order_problems import OrderProblems
+from probewise.calibration.mixed_reference import MixedReferenceDensity
+from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.calibration.peak_density import PeakDensity, StudentTDensity
-from probewise.calibration.whole_coordinates import FAINT, count_bright
+from probewise.calibration.whole_coordinates import FAINT, count_bright_gaussians
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective
@@ -33,7 +33,7 @@ def _sorted_draws(prior: SSFPrior, n: int, n_bright: int, rng: np.random.Generat
     """Draw from the prior, sort the Gaussians by mass, keep those of which so many are bright; and their share."""
     space = prior.coordinates
     theta = space.leave(space.enter(prior.from_unit_cube(rng.random((40 * n, len(prior.names))))))[0]
-    kept = theta[count_bright(theta) == n_bright]
+    kept = theta[count_bright_gaussians(theta) == n_bright]
     return kept[rng.integers(len(kept), size=n)], len(kept) / len(theta)
 
 
@@ -43,10 +43,10 @@ PARTS = [(2, 1), (3, 1), (3, 2)]
 @pytest.fixture
 def references(
     recording: Recording, make_compensation: Callable[..., CompensatedShapeProposal]
-) -> dict[tuple[int, int], FaintGaussianReference]:
+) -> dict[tuple[int, int], FaintGaussianReferenceDensity]:
     silent, rng = cast("SensorProblem", _Silent()), np.random.default_rng(30)
     return {
-        (n, m): FaintGaussianReference(default_prior(recording, n), silent, make_compensation(n, rng), m)
+        (n, m): FaintGaussianReferenceDensity(default_prior(recording, n), silent, make_compensation(n, rng), m)
         for n, m in PARTS
     }
 
@@ -54,12 +54,12 @@ def references(
 def _possible_rows(prior: SSFPrior, drawn: FloatArray, n_bright: int) -> IntArray:
     """Return the rows of draws that the prior allows, with this number of bright Gaussians."""
     alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
-    return alive[np.isfinite(prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == n_bright)]
+    return alive[np.isfinite(prior.log_prob(drawn[alive])) & (count_bright_gaussians(drawn[alive]) == n_bright)]
 
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
-    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording, n: int, m: int
 ) -> None:
     """Mean weight the prior's share, and moments of its own draws; four standard errors: one false alarm in 16 000."""
     rng = np.random.default_rng(31)
@@ -86,7 +86,7 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
 
 
 def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
-    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording
 ) -> None:
     """Where the recording says nothing: mean weight the share of the prior with one bright Gaussian, four errors."""
     rng, space = np.random.default_rng(36), LabelSymmetricCoordinates(references[2, 1].prior)
@@ -95,7 +95,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
         PeakDensity(space, StudentTDensity(y.mean(axis=0), width * np.linalg.cholesky(np.cov(y, rowvar=False))))
         for width in (0.4, 0.9)
     )
-    seeded = MixedReference(references[2, 1], peaks, 0.0)
+    seeded = MixedReferenceDensity(references[2, 1], peaks, 0.0)
     drawn = seeded.draw(_sorted_draws(default_prior(recording, 1), 10_000, 1, rng)[0], rng=rng)
     weight = np.zeros(len(drawn))
     alive = _possible_rows(seeded.prior, drawn, 1)
@@ -111,7 +111,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_undoing_a_compensated_gaussian_gives_the_others_back(
-    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(33)
     reference = references[n, m]
@@ -129,7 +129,7 @@ def test_undoing_a_compensated_gaussian_gives_the_others_back(
 def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth: FloatArray, noise_sd: float) -> None:
     """Two routes: covariances over posterior samples, and the normal equations with a numerical derivative."""
     rng = np.random.default_rng(34)
-    problems = OrderProblems(recording, default_prior)
+    problems = ProblemsByOrder(recording, default_prior)
     problem, space = problems.problem(1), default_prior(recording, 1).coordinates
     truth = truth.copy()
     truth[0] = 0.5  # changes no reading; below the prior's bound
@@ -170,7 +170,7 @@ def test_the_pool_grows_until_enough_of_its_shapes_are_effective(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_a_split_keeps_light_centre_and_covariance(
-    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(32)
     rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
@@ -184,14 +184,14 @@ def test_a_split_keeps_light_centre_and_covariance(
 
 
 def test_only_a_uniform_prior_of_light_has_a_reference(
-    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording
 ) -> None:
     usual = default_prior(recording, 2)
     paper = SSFPrior(2, usual.offset_mm, LogUniform(0.001, 1.0), usual.i_min, Uniform(50.0, 60.0))
-    assert has_uniform_light(usual)
-    assert not has_uniform_light(paper)
+    assert has_uniform_prior_of_light(usual)
+    assert not has_uniform_prior_of_light(paper)
     with pytest.raises(ParameterError, match="prior"):
-        FaintGaussianReference(paper, cast("SensorProblem", _Silent()), references[2, 1].compensation, 1)
+        FaintGaussianReferenceDensity(paper, cast("SensorProblem", _Silent()), references[2, 1].compensation, 1)
 
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
@@ -203,7 +203,7 @@ def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
     The last Gaussian is drawn from a pool, which differs from the prior by the scatter of 4,000 shapes.
     """
     rng, prior = np.random.default_rng(35), default_prior(recording, n)
-    reference = FaintGaussianReference(
+    reference = FaintGaussianReferenceDensity(
         prior, cast("SensorProblem", _Silent()), make_compensation(n, rng, spread=2e-3), m
     )
     here, _ = _sorted_draws(prior, 3000, m, rng)
@@ -211,7 +211,7 @@ def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
     for _ in range(12):
         there, log_drawn = reference.propose(here, rng=rng)
         moved = np.isfinite(there).all(axis=1)
-        moved[moved] = np.isfinite(prior.log_prob(there[moved])) & (count_bright(there[moved]) == m)
+        moved[moved] = np.isfinite(prior.log_prob(there[moved])) & (count_bright_gaussians(there[moved]) == m)
         moved &= np.log(rng.random(len(here))) < log_drawn
         here = np.where(moved[:, None], there, here)
         here = prior.coordinates.leave(prior.coordinates.enter(here))[0]

@@ -13,10 +13,10 @@ from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, SSFPrior, calibrate, default_prior, paper_prior, predict, problem_for
 from probewise.calibration.coverage import (
     Coverage,
-    draw_truth,
+    draw_true_sensor,
     simulate_coverage,
     simulate_log_z_lead_of_one_gaussian,
-    simulate_truth,
+    simulate_paper_recording,
 )
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
@@ -49,7 +49,7 @@ def test_the_calibration_says_what_it_rests_on(calibration: Calibration, recordi
     assert [(o.n_gaussians, o.n_parameters) for o in calibration.orders] == [(1, 8)]
     assert calibration.orders[0].log_z == calibration.chosen.log_z
     assert calibration.orders[0].log_z_error == calibration.chosen.log_z_error > 0
-    assert calibration.probabilities() == {1: 1.0}
+    assert calibration.order_probabilities() == {1: 1.0}
     assert len(calibration.priors) == 6
     assert calibration.fields[1].values.sum() == pytest.approx(1.0)
     assert "most probable" in calibration.summary()
@@ -199,7 +199,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 @pytest.mark.slow
 def test_evidence_prefers_one_gaussian_where_there_is_one() -> None:
     rng = np.random.default_rng(20)
-    assert simulate_log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
+    assert simulate_log_z_lead_of_one_gaussian(draw_true_sensor(rng=rng), rng=rng, n_live=100)[0] > 0
 
 
 @pytest.mark.slow
@@ -218,8 +218,8 @@ def test_evidence_prefers_two_gaussians_where_there_are_two() -> None:
 @pytest.mark.slow
 def test_a_simulated_recording_holds_the_readings_of_its_truth() -> None:
     rng = np.random.default_rng(22)
-    truth = draw_truth(rng=rng)
-    recording = simulate_truth(truth, rng=rng)
+    truth = draw_true_sensor(rng=rng)
+    recording = simulate_paper_recording(truth, rng=rng)
     assert abs(recording.readings[:20].mean() - truth.black) < 1.0
 
 

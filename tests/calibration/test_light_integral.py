@@ -6,8 +6,8 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.calibration import default_prior
-from probewise.calibration.light_integral import LightIntegral, bridge_log_z_ratio
-from probewise.calibration.order_problems import OrderProblems
+from probewise.calibration.light_integral import FaintGaussianLikelihoodRatio, bridge_log_z_ratio
+from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.recordings import Recording
 
@@ -22,7 +22,7 @@ def _near_truth(truth: FloatArray, n: int, rng: np.random.Generator) -> FloatArr
 def _by_grid(recording: Recording, theta: FloatArray, k: int) -> float:
     """Integrate the likelihood over the light of Gaussian k, by problems of N and of N - 1 on a fine grid."""
     n = (len(theta) - 2) // 6
-    problems = OrderProblems(recording, default_prior)
+    problems = ProblemsByOrder(recording, default_prior)
     g = theta[:-2].reshape(n, 6)
     light = g[:, 0] / np.sqrt(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
     most = np.delete(light, k).max()
@@ -39,17 +39,21 @@ def _by_grid(recording: Recording, theta: FloatArray, k: int) -> float:
 @pytest.mark.parametrize("n", [2, 3])
 def test_light_is_integrated_as_on_a_fine_grid(recording: Recording, truth: FloatArray, n: int) -> None:
     theta = _near_truth(truth, n, np.random.default_rng(4))
-    removal = LightIntegral(default_prior(recording, n), OrderProblems(recording, default_prior).problem(1), 1)
-    taken = removal.log_ratio_when_taken_away(theta)
+    removal = FaintGaussianLikelihoodRatio(
+        default_prior(recording, n), ProblemsByOrder(recording, default_prior).problem(1), 1
+    )
+    taken = removal.log_likelihood_ratios_of_faint_gaussians(theta)
     for k in range(1, n):
         assert taken[0, k - 1] == pytest.approx(_by_grid(recording, theta[0], k), abs=5e-3)
 
 
 def test_adding_is_taking_away_seen_from_below(recording: Recording, truth: FloatArray) -> None:
     theta = _near_truth(truth, 3, np.random.default_rng(5))
-    removal = LightIntegral(default_prior(recording, 3), OrderProblems(recording, default_prior).problem(1), 1)
-    added = removal.log_ratio_when_added(np.delete(theta, slice(12, 18), axis=1), theta[:, 12:18])
-    np.testing.assert_allclose(added, removal.log_ratio_when_taken_away(theta)[:, 1], atol=1e-9)
+    removal = FaintGaussianLikelihoodRatio(
+        default_prior(recording, 3), ProblemsByOrder(recording, default_prior).problem(1), 1
+    )
+    added = removal.log_likelihood_ratio_of_added_gaussian(np.delete(theta, slice(12, 18), axis=1), theta[:, 12:18])
+    np.testing.assert_allclose(added, removal.log_likelihood_ratios_of_faint_gaussians(theta)[:, 1], atol=1e-9)
 
 
 def test_a_bridge_finds_the_ratio_of_two_normal_densities() -> None:

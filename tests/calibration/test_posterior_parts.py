@@ -9,7 +9,11 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SMCResult
-from probewise.calibration.posterior_parts import evidence_shares, join_smc_results_of_parts, split_by_n_bright
+from probewise.calibration.posterior_parts import (
+    evidence_shares,
+    join_smc_results_of_parts,
+    split_posterior_by_n_bright,
+)
 
 _N = 8 * 4 * 20
 
@@ -45,7 +49,7 @@ def test_parts_are_joined_by_their_evidence() -> None:
 
 def test_a_posterior_is_split_as_it_was_joined() -> None:
     both = join_smc_results_of_parts({1: climbed(0.01, np.log(3.0)), 2: climbed(0.5, 0.0)}, np.random.default_rng(2))
-    parts = split_by_n_bright(both, np.random.default_rng(3))
+    parts = split_posterior_by_n_bright(both, np.random.default_rng(3))
     assert set(parts) == {1, 2}
     shares = evidence_shares(parts)
     assert shares[2] == pytest.approx(_bright_share(both.theta))

@@ -11,9 +11,9 @@ import pytest
 from probewise._arrays import FloatArray
 from probewise.calibration import SMCResult, TemperatureSummary, calibrate, default_prior
 from probewise.calibration.compensation import CompensatedShapeProposal
-from probewise.calibration.faint_gaussian_reference import FaintGaussianReference
-from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.order_search import search_order
+from probewise.calibration.faint_gaussian_reference import FaintGaussianReferenceDensity
+from probewise.calibration.order_problems import ProblemsByOrder
+from probewise.calibration.order_search import search_prior_of_order
 from probewise.calibration.posterior_parts import FootprintPlaceAndSize
 from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.calibration.smc import run_smc
@@ -48,7 +48,7 @@ def _climbed(
     rungs: list[TemperatureSummary] = []
     found = run_smc(
         problem,
-        FaintGaussianReference(prior, problem, compensation, 1),
+        FaintGaussianReferenceDensity(prior, problem, compensation, 1),
         rest,
         log_z_below=np.full(8, -3.0),
         error_below=0.0,
@@ -108,8 +108,8 @@ def test_other_priors_of_light_are_searched_in_full(recording: Recording) -> Non
         return replace(default_prior(given, n), i_min=Uniform(-1.0 * n, 40.0))
 
     for prior, why in ((paper, "not uniform"), (growing, "differs from order to order")):
-        problems = OrderProblems(recording, prior)
-        search = partial(search_order, problems, n_live=50)
+        problems = ProblemsByOrder(recording, prior)
+        search = partial(search_prior_of_order, problems, n_live=50)
         found, notes = fit_orders_quickly(problems, (1, 2), search=search, rng=np.random.default_rng(0))
         assert not found
         assert why in notes[0]
@@ -117,8 +117,8 @@ def test_other_priors_of_light_are_searched_in_full(recording: Recording) -> Non
 
 def test_few_readings_are_searched_in_full(recording: Recording) -> None:
     few = Recording(recording.plan.take(np.arange(0, 135, 2)), recording.readings[::2])
-    problems = OrderProblems(few, default_prior)
-    search = partial(search_order, problems, n_live=50)
+    problems = ProblemsByOrder(few, default_prior)
+    search = partial(search_prior_of_order, problems, n_live=50)
     found, notes = fit_orders_quickly(problems, (1, 2), search=search, rng=np.random.default_rng(0))
     assert not found
     assert "68 usable readings" in notes[0]

@@ -9,8 +9,8 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SSFPrior
-from probewise.calibration.all_bright_density import AllBrightDensity
-from probewise.calibration.whole_coordinates import FAINT, WholeFootprintCoordinates, count_bright
+from probewise.calibration.all_bright_density import AllGaussiansBrightDensity
+from probewise.calibration.whole_coordinates import FAINT, WholeFootprintCoordinates, count_bright_gaussians
 from probewise.priors import LogUniform, Uniform
 
 
@@ -75,11 +75,11 @@ def test_the_whole_of_gaussians_nearby_has_their_mean_and_covariance() -> None:
 
 def test_the_prior_is_restricted_to_so_many_bright_gaussians() -> None:
     theta = drawn(space(3), 2000, 4)
-    bright = count_bright(theta)
+    bright = count_bright_gaussians(theta)
     for n_bright in (1, 2, 3):
         asked = space(3, n_bright=n_bright)
         np.testing.assert_array_equal(np.isfinite(asked.leave(asked.enter(theta))[1]), bright == n_bright)
-    assert count_bright(np.array([[1.0, 0, 0, 1, 1, 0, FAINT, 0, 0, 1, 1, 0, 0, 1]])).tolist() == [1]
+    assert count_bright_gaussians(np.array([[1.0, 0, 0, 1, 1, 0, FAINT, 0, 0, 1, 1, 0, 0, 1]])).tolist() == [1]
 
 
 def test_what_is_not_sorted_by_mass_is_outside_the_prior() -> None:
@@ -97,11 +97,11 @@ def test_a_sharing_density_keeps_the_whole_of_the_gaussians_below() -> None:
     asked, one = space(2, n_bright=2), space(1)
     rng = np.random.default_rng(5)
     below = one.enter(np.array([1.0, 0.5, 1.0, 0.05, 0.06, 0.01, 10.0, 60.0]) * (1 + 0.01 * rng.random((4000, 8))))
-    density = AllBrightDensity.from_samples_below(asked, below)
+    density = AllGaussiansBrightDensity.from_samples_below(asked, below)
     theta = density.draw(np.empty((4000, 0)), rng=rng)
     possible = theta[np.isfinite(theta).all(axis=1)]
     assert len(possible) > 400
-    assert (count_bright(possible) == 2).all()
+    assert (count_bright_gaussians(possible) == 2).all()
     assert np.isfinite(density.log_density_over_prior(possible)).all()
     x = asked.enter(possible)
     for own, other in ((1, 1), (2, 2), (-2, -2), (-1, -1)):

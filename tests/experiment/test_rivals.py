@@ -14,7 +14,7 @@ from probewise import scene
 from probewise.arm import Pose, Reading, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.arm.uncertainty import FITTED
-from probewise.calibration import FittedSensor, mean_field, predict
+from probewise.calibration import FittedSensor, posterior_mean_ssf_field, predict
 from probewise.effects import Origin
 from probewise.errors import ParameterError
 from probewise.experiment import (
@@ -50,7 +50,7 @@ from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
 from probewise.recordings import Instrumentation, Plan, Uniform
 from probewise.sensor import mixture_names
-from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
+from probewise.study import ConcealedTrial, arm_of, concealed_csv_rows, experiment_of, run_concealed_trial
 from probewise.study.concealed import _arm_in_concealed_world
 from probewise.study.rows import REFERENCE
 from probewise.study.trial import Trial, timed_steps
@@ -88,7 +88,7 @@ def sensor():
         samples=samples,
         n_gaussians=1,
         noise_sd=np.full(500, 0.5),
-        field=mean_field(samples, 1, pixel_mm=0.5),
+        field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
         instrumentation=Instrumentation(),
     )
 
@@ -420,7 +420,7 @@ def test_rows_of_the_study_are_summed_up():
         }
         for k in range(2)
     }
-    (row,) = concealed_table(runs)
+    (row,) = concealed_csv_rows(runs)
     assert row["sure_and_wrong"].startswith("0.50")
     assert row["intervals_hold"].startswith("0.50")
     assert row["in_credible_set"].startswith("1.00")

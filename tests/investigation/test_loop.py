@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from probewise.arm import carry_out
-from probewise.calibration import FittedSensor, mean_field
+from probewise.calibration import FittedSensor, posterior_mean_ssf_field
 from probewise.diagnosis import Hypothesis
 from probewise.errors import ParameterError
 from probewise.investigation import Budget, investigate, reason_if_settled
@@ -134,7 +134,7 @@ def test_an_instrument_at_another_height_than_its_sensors_calibration_goes_on_to
         samples=samples,
         n_gaussians=1,
         noise_sd=np.full(500, 0.6),
-        field=mean_field(samples, 1, pixel_mm=0.5),
+        field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
         instrumentation=Instrumentation(unit="LEGO", height_mm=16.0),
     )
     world = World(gaussian_spot([BLOB]), height_mm=16.0, concealed=(Backlash(1.0),))

@@ -4,7 +4,7 @@ Paper, sections "Estimating SSF MoG Model Parameters" and "Light Sensor SSF MoG 
 and "studentT", the table of log evidences, and the weighted mean of sampled SSF fields.
 """
 
-from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments
+from probewise.calibration.fields import choose_pixel_mm, mixture_moments, posterior_mean_ssf_field
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
 from probewise.calibration.noise import ScanNoise, draw_pooled_sd, draw_sd, noise_by_scan, pooled_sd
 from probewise.calibration.order_problems import problem_for
@@ -46,11 +46,11 @@ __all__ = [
     "default_prior",
     "draw_pooled_sd",
     "draw_sd",
-    "mean_field",
     "mixture_moments",
     "noise_by_scan",
     "paper_prior",
     "pooled_sd",
+    "posterior_mean_ssf_field",
     "predict",
     "problem_for",
     "read_sensor",
@@ -58,3 +58,6 @@ __all__ = [
     "ssf_quantities",
     "write_sensor",
 ]
+
+mean_field = posterior_mean_ssf_field
+"""The old name of `posterior_mean_ssf_field`."""

@@ -25,14 +25,14 @@ _WIDENED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class AllBrightDensity:
+class AllGaussiansBrightDensity:
     """A Student-t in `WholeFootprintCoordinates`: a `ReferenceDensity`."""
 
     space: WholeFootprintCoordinates
     one: StudentTDensity
 
     @classmethod
-    def from_samples_below(cls, space: WholeFootprintCoordinates, fewer: FloatArray) -> AllBrightDensity:
+    def from_samples_below(cls, space: WholeFootprintCoordinates, fewer: FloatArray) -> AllGaussiansBrightDensity:
         """Make the density of N Gaussians from samples `fewer` of N - 1 in such coordinates, (n, 6 N - 4)."""
         d = fewer.shape[1] + 6
         own, last = np.r_[: d - 8, d - 2, d - 1], np.arange(d - 8, d - 2)

@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.order_problems import OrderProblems
+from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.calibration.order_search import Progress, round_reporter
 from probewise.calibration.smc import SMCResult
 from probewise.errors import DoubtfulResultWarning
@@ -27,7 +27,7 @@ _N_SAMPLES, _N_OWN, _N_OTHERS = 300, 500, 2000
 
 
 def missed_part_in_words(
-    problems: OrderProblems, n: int, climbed: SMCResult, *, rng: np.random.Generator, progress: Progress | None = None
+    problems: ProblemsByOrder, n: int, climbed: SMCResult, *, rng: np.random.Generator, progress: Progress | None = None
 ) -> str:
     """Search the prior, and describe in words what an SMC run missed; empty if nothing.
 
@@ -55,7 +55,7 @@ def missed_part_in_words(
 
 
 def _missed_part_by_comparison_in_words(
-    problems: OrderProblems, n: int, climbed: SMCResult, found: NestedResult, rng: np.random.Generator
+    problems: ProblemsByOrder, n: int, climbed: SMCResult, found: NestedResult, rng: np.random.Generator
 ) -> str:
     error = float(np.hypot(found.log_z_error, climbed.log_z_error))
     if found.log_z - climbed.log_z > _N_ERRORS * error:

@@ -53,13 +53,13 @@ class CompensatingShift:
         """Concatenate the rows of several."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
 
-    def take(self, rows: IntArray) -> CompensatingShift:
+    def select_rows(self, rows: IntArray) -> CompensatingShift:
         """Select rows."""
         return CompensatingShift(self.shift[rows], self.mean[rows], self.sd[rows])
 
     def with_rows_replaced(self, rows: IntArray, other: CompensatingShift) -> CompensatingShift:
         """Return a copy in which `rows` are those of `other`."""
-        out = self.take(np.arange(len(self.mean)))
+        out = self.select_rows(np.arange(len(self.mean)))
         out.shift[rows], out.mean[rows], out.sd[rows] = other.shift, other.mean, other.sd
         return out
 
@@ -247,7 +247,7 @@ class CompensatedShapeProposal:
         """Draw shapes, (n, 6) with amplitudes to be replaced, and the shifts that compensate for them."""
         log_weight = self.log_density_over_prior(self.answers)
         rows = rng.permutation(resampled_rows(np.exp(log_weight - log_weight.max()), n, rng))
-        return self.pool[rows], self.answers.take(rows)
+        return self.pool[rows], self.answers.select_rows(rows)
 
     def log_density_over_prior(self, answer: CompensatingShift) -> FloatArray:
         """Log of the density from which `draw` draws, over the prior's, (n,)."""

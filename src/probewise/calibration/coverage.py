@@ -32,11 +32,11 @@ from probewise.world import Blob, World, gaussian_spot
 __all__ = [
     "Coverage",
     "TrueSensor",
-    "draw_truth",
+    "draw_true_sensor",
     "interval_holds_truth_by_quantity",
     "simulate_coverage",
     "simulate_log_z_lead_of_one_gaussian",
-    "simulate_truth",
+    "simulate_paper_recording",
 ]
 
 _MASS = 0.95
@@ -78,7 +78,7 @@ class Coverage:
         write_text_atomically(path, self.to_json(**about))
 
 
-def draw_truth(*, rng: np.random.Generator) -> TrueSensor:
+def draw_true_sensor(*, rng: np.random.Generator) -> TrueSensor:
     """Draw a sensor like the paper's: offset by a few mm, anisotropic, with I_max - I_min of 45 to 55 units."""
     black = float(rng.uniform(8, 12))
     return TrueSensor(
@@ -91,11 +91,14 @@ def draw_truth(*, rng: np.random.Generator) -> TrueSensor:
     )
 
 
-def simulate_truth(truth: TrueSensor, *, rng: np.random.Generator) -> Recording:
+def simulate_paper_recording(truth: TrueSensor, *, rng: np.random.Generator) -> Recording:
     """Simulate the paper's plan with this sensor in the pixel world."""
     spot = gaussian_spot([Blob(1.0, truth.center_mm, truth.sd_mm, truth.correlation)])
     world = World(spot, black=truth.black, white=truth.white, noise_sd=truth.noise_sd)
     return world.simulate(paper_plan(), rng=rng)
+
+
+draw_truth, simulate_truth = draw_true_sensor, simulate_paper_recording  # their earlier names
 
 
 def simulate_coverage(
@@ -143,8 +146,8 @@ coverage = simulate_coverage
 
 def _simulate_and_check_intervals(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:
     """Simulate and calibrate one recording; return for each quantity whether its interval holds the truth."""
-    truth = draw_truth(rng=rng)
-    recording = simulate_truth(truth, rng=rng)
+    truth = draw_true_sensor(rng=rng)
+    recording = simulate_paper_recording(truth, rng=rng)
     return interval_holds_truth_by_quantity(
         truth, calibrate(recording, orders=(1,), n_live=n_live, quick=quick, rng=rng).sensor.samples
     )
@@ -164,13 +167,13 @@ def simulate_log_z_lead_of_one_gaussian(
     truth: TrueSensor, *, rng: np.random.Generator, n_live: int = 300, quick: bool = False
 ) -> tuple[float, float]:
     """Simulate a single-Gaussian recording; return log Z of one Gaussian minus that of two, and its error."""
-    recording = simulate_truth(truth, rng=rng)
+    recording = simulate_paper_recording(truth, rng=rng)
     one, two = calibrate(recording, orders=(1, 2), n_live=n_live, quick=quick, rng=rng).orders
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
 
 
 def _simulate_log_z_lead_for_drawn_truth(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
-    return simulate_log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
+    return simulate_log_z_lead_of_one_gaussian(draw_true_sensor(rng=rng), rng=rng, n_live=n_live, quick=quick)
 
 
 def main() -> None:

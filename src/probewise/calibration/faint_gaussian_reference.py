@@ -19,7 +19,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 from probewise._arrays import FloatArray
 from probewise.calibration.compensation import CompensatedShapeProposal, CompensatingShift
 from probewise.calibration.priors import SSFPrior
-from probewise.calibration.whole_coordinates import FAINT, count_bright
+from probewise.calibration.whole_coordinates import FAINT, count_bright_gaussians
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.priors import Uniform
@@ -43,8 +43,8 @@ _TOLD = 0.7
 _TINY = float(np.finfo(float).tiny)
 
 
-def has_uniform_light(prior: SSFPrior) -> bool:
-    """Return whether the prior of a Gaussian's light is uniform from 0, as `FaintGaussianReference` requires."""
+def has_uniform_prior_of_light(prior: SSFPrior) -> bool:
+    """Return whether the prior of a Gaussian's light is uniform from 0, as `FaintGaussianReferenceDensity` requires."""
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
 
 
@@ -75,7 +75,7 @@ class AddedGaussianProposal:
 
 
 @dataclass(frozen=True)
-class FaintGaussianReference:
+class FaintGaussianReferenceDensity:
     """A part of the posterior of N - 1 Gaussians with one more, lighter than each of them, and faint.
 
     Gaussians have no labels, so they are sorted by mass here as in `MomentCoordinates`, the lightest last. With p_N
@@ -96,13 +96,13 @@ class FaintGaussianReference:
     Parameters
     ----------
     prior
-        Prior of N Gaussians, 2 or more, with uniform mass; see `has_uniform_light`.
+        Prior of N Gaussians, 2 or more, with uniform mass; see `has_uniform_prior_of_light`.
     below
         Problem of N - 1 Gaussians.
     compensation
         How the others shift.
     n_bright
-        Number of bright Gaussians, below N; see `count_bright`.
+        Number of bright Gaussians, below N; see `count_bright_gaussians`.
     """
 
     prior: SSFPrior
@@ -111,7 +111,7 @@ class FaintGaussianReference:
     n_bright: int
 
     def __post_init__(self) -> None:
-        if self.prior.n_gaussians < 2 or not has_uniform_light(self.prior):
+        if self.prior.n_gaussians < 2 or not has_uniform_prior_of_light(self.prior):
             raise ParameterError("prior", self.prior, "a prior of 2 Gaussians or more, with masses uniform from 0 to 1")
 
     @cached_property
@@ -163,13 +163,13 @@ class FaintGaussianReference:
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
         split = rng.random(len(here)) < _RESPLIT
         for rows, move in (
-            (np.flatnonzero(split), self._propose_faint_one_split_elsewhere),
-            (np.flatnonzero(~split), self._propose_faint_one_replaced),
+            (np.flatnonzero(split), self._propose_merge_and_split),
+            (np.flatnonzero(~split), self._propose_faint_gaussian_replaced),
         ):
             there[rows], log_drawn[rows] = move(here[rows], rng=rng)
         return there, log_drawn
 
-    def _propose_faint_one_replaced(
+    def _propose_faint_gaussian_replaced(
         self, here: FloatArray, *, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
         """Take away any Gaussian but the first, undo the shift of the others, add another one and shift them for it.
@@ -190,7 +190,7 @@ class FaintGaussianReference:
         if rows.size:
             after, last, answer = self._draw_gaussian_and_compensate(before[rows], False, rng)
             real = np.isfinite(after).all(axis=1)
-            rows, after, last, answer = rows[real], after[real], last[real], answer.take(np.flatnonzero(real))
+            rows, after, last, answer = rows[real], after[real], last[real], answer.select_rows(np.flatnonzero(real))
             there[rows] = _insert_gaussian_before_levels(after, last)
             log_there = self._undo_compensation(after, last, answer, False)[1]
             log_drawn[rows] = np.where(np.isfinite(log_there), log_here[rows] - log_there, -np.inf)
@@ -304,9 +304,7 @@ class FaintGaussianReference:
         most = self._greatest_faint_mass(self._masses(rest), last_of_all=True)
         return rest, self._log_density_of_split(rest, self.without_last_gaussian(theta), label, theta[:, -8:-2], most)
 
-    def _propose_faint_one_split_elsewhere(
-        self, here: FloatArray, *, rng: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray]:
+    def _propose_merge_and_split(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Merge a faint Gaussian into a bright one, and split another off a bright one; returns as `propose`."""
         m, n = len(here), self.prior.n_gaussians
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
@@ -380,7 +378,7 @@ class FaintGaussianReference:
                 - np.log(most)
             )
         possible = (ratio < 1.0) & (ratio > 0.0) & np.isfinite(found)
-        possible[possible] = count_bright(rest[possible]) == self.n_bright
+        possible[possible] = count_bright_gaussians(rest[possible]) == self.n_bright
         return np.where(possible, found, -np.inf)
 
     def _log_prior_of_moments(self, g: FloatArray, levels_of: FloatArray) -> FloatArray:

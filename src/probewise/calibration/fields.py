@@ -52,7 +52,7 @@ def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray
     return {name: values[:, 0] for name, values in found.items()}
 
 
-def sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
+def gaussians_sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
     """Sort the Gaussians of each sample by decreasing mass; field and predictions do not change.
 
     The prior is exchangeable, so the labels of a posterior sample are arbitrary; sorted by mass, means
@@ -91,7 +91,7 @@ def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> f
     return next(s * decade for s in _SERIES if s * decade <= wanted * (1 + 1e-9))
 
 
-def mean_field(
+def posterior_mean_ssf_field(
     theta: FloatArray,
     n_gaussians: int,
     *,

@@ -17,10 +17,15 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_flag, require_like, require_rng
 from probewise._posterior_samples import MIN_SAMPLES
-from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments, sorted_by_mass
+from probewise.calibration.fields import (
+    choose_pixel_mm,
+    gaussians_sorted_by_mass,
+    mixture_moments,
+    posterior_mean_ssf_field,
+)
 from probewise.calibration.noise import draw_pooled_sd, noise_by_scan
-from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.order_search import OrderPosterior, Progress, search_order
+from probewise.calibration.order_problems import ProblemsByOrder
+from probewise.calibration.order_search import OrderPosterior, Progress, search_prior_of_order
 from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
@@ -99,11 +104,13 @@ class Calibration(ShowsItself):
         """The table of priors."""
         return self.chosen.prior.table_rows()
 
-    def probabilities(self) -> dict[int, float]:
+    def order_probabilities(self) -> dict[int, float]:
         """Posterior probability of each order, with equal prior probabilities."""
         log_z = np.array([fit.log_z for fit in self.fits])
         weight = np.exp(log_z - log_z.max())
         return {fit.n_gaussians: float(w) for fit, w in zip(self.fits, weight / weight.sum(), strict=True)}
+
+    probabilities = order_probabilities  # its earlier name
 
     def summary(self) -> str:
         """Describe the calibration in plain text."""
@@ -190,8 +197,8 @@ def calibrate(
     require_flag("quick", quick)
     if quick and not refined:
         raise ParameterError("refined", refined, "True with quick=True, or leave quick out")
-    problems = OrderProblems(recording, prior, data_sets)
-    search = partial(search_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
+    problems = ProblemsByOrder(recording, prior, data_sets)
+    search = partial(search_prior_of_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
     one = partial(_fit_order, problems, search, pixel_mm=pixel_mm, n_samples=n_samples)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
     climbed: dict[int, OrderPosterior] = {}
@@ -228,7 +235,7 @@ def _checked_orders(orders: object) -> tuple[int, ...]:
 
 
 def _fit_order(
-    problems: OrderProblems,
+    problems: ProblemsByOrder,
     search: Callable[[int, np.random.Generator], OrderPosterior],
     n_gaussians: int,
     rng: np.random.Generator,
@@ -279,7 +286,7 @@ def _sensor_from_posterior(
         raise ParameterError("prior", prior, "an SSFPrior")
     n_gaussians = prior.n_gaussians
     plan, usable = recording.plan, recording.usable
-    samples = sorted_by_mass(result.samples(n_samples, rng=rng), n_gaussians)
+    samples = gaussians_sorted_by_mass(result.samples(n_samples, rng=rng), n_gaussians)
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
     pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
@@ -303,7 +310,7 @@ def _sensor_from_posterior(
         samples=samples,
         n_gaussians=n_gaussians,
         noise_sd=draw_pooled_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
-        field=mean_field(theta, n_gaussians, pixel_mm=pixel, weight=weight),
+        field=posterior_mean_ssf_field(theta, n_gaussians, pixel_mm=pixel, weight=weight),
         instrumentation=plan.instrumentation,
         scan_noise=noise_by_scan(
             residuals, plan.scan[usable], plan.scan_names, sd_floor=floor, sd_ceiling=ceiling, rng=rng

@@ -24,7 +24,7 @@ _MOST_LOG = 60.0
 class LabelSymmetricCoordinates:
     """Coordinates of N Gaussians in which a permutation of labels changes no volume.
 
-    `prior`: of N Gaussians with light uniform from 0 to a unit; see `has_uniform_light`.
+    `prior`: of N Gaussians with light uniform from 0 to a unit; see `has_uniform_prior_of_light`.
     """
 
     prior: SSFPrior

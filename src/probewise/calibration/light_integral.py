@@ -35,13 +35,13 @@ _N_ROOT, _ROOT = 60, 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class LightIntegral:
+class FaintGaussianLikelihoodRatio:
     """Mean likelihood over the light of one faint Gaussian, divided by the likelihood without it.
 
     Parameters
     ----------
     prior
-        Prior of N Gaussians, 2 or more, with uniform light; see `has_uniform_light`.
+        Prior of N Gaussians, 2 or more, with uniform light; see `has_uniform_prior_of_light`.
     alone
         Problem of one Gaussian over the same recording.
     n_bright
@@ -52,18 +52,18 @@ class LightIntegral:
     alone: SensorProblem
     n_bright: int
 
-    def log_ratio_when_taken_away(self, theta: FloatArray) -> FloatArray:
+    def log_likelihood_ratios_of_faint_gaussians(self, theta: FloatArray) -> FloatArray:
         """Log of the ratio for each faint Gaussian of sorted samples of N, (n, 6 N + 2) -> (n, N - n_bright)."""
         n = self.prior.n_gaussians
         at_once = max(1, _AT_ONCE // (n * self._usable_readings.size))
         blocks = [theta[at : at + at_once] for at in range(0, len(theta), at_once)]
         return (
-            np.concatenate([self._log_ratio_of_block(block) for block in blocks])
+            np.concatenate([self._log_likelihood_ratios_of_block(block) for block in blocks])
             if blocks
             else np.empty((0, n - self.n_bright))
         )
 
-    def log_ratio_when_added(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
+    def log_likelihood_ratio_of_added_gaussian(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
         """Log of the ratio for a Gaussian `gaussian`, (n, 6), of any light, added to samples of N - 1, (n, 6 N - 4)."""
         if not len(rest):
             return np.empty(0)
@@ -73,16 +73,18 @@ class LightIntegral:
             part = rest[at : at + at_once]
             seen, light = self._responses_and_light_by_gaussian(part)
             one = self._response_model.responses_to_gaussians(gaussian[at : at + at_once])
-            found.append(self._log_ratio_for_one_gaussian(_mixture_response(seen, light), one, light, part[:, -2:]))
+            found.append(
+                self._log_likelihood_ratio_of_gaussian(_mixture_response(seen, light), one, light, part[:, -2:])
+            )
         return np.concatenate(found)
 
-    def _log_ratio_of_block(self, theta: FloatArray) -> FloatArray:
+    def _log_likelihood_ratios_of_block(self, theta: FloatArray) -> FloatArray:
         seen, light = self._responses_and_light_by_gaussian(theta)
         out = np.empty((len(light), light.shape[1] - self.n_bright))
         for at in range(out.shape[1]):
             k = self.n_bright + at
             others = np.delete(light, k, axis=1)
-            out[:, at] = self._log_ratio_for_one_gaussian(
+            out[:, at] = self._log_likelihood_ratio_of_gaussian(
                 _mixture_response(np.delete(seen, k, axis=1), others), seen[:, k], others, theta[:, -2:]
             )
         return out
@@ -91,7 +93,7 @@ class LightIntegral:
         """Responses of the readings to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
         return self._response_model.responses_by_gaussian(theta), total_light_by_gaussian(theta)
 
-    def _log_ratio_for_one_gaussian(
+    def _log_likelihood_ratio_of_gaussian(
         self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray
     ) -> FloatArray:
         """Log of the ratio for one Gaussian with responses `one` beside `others`, which have `light`.
@@ -218,9 +220,9 @@ def bridge_log_z_ratio(added: FloatArray, taken: FloatArray) -> tuple[float, flo
     Parameters
     ----------
     added
-        `LightIntegral.log_ratio_when_added` at samples of N - 1, (n_below,).
+        `FaintGaussianLikelihoodRatio.log_likelihood_ratio_of_added_gaussian` at samples of N - 1, (n_below,).
     taken
-        `LightIntegral.log_ratio_when_taken_away` at samples of N, (n, N - n_bright).
+        `FaintGaussianLikelihoodRatio.log_likelihood_ratios_of_faint_gaussians` at samples of N, (n, N - n_bright).
     """
     each, added = taken.ravel(), np.where(added > -np.inf, added, -1e300)
     real = np.concatenate([added[added > -1e300], each])

@@ -21,7 +21,7 @@ _SHARE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class MixedReference:
+class MixedReferenceDensity:
     """A reference mixed with densities about peaks: a `ReferenceDensity`.
 
     Parameters

@@ -18,7 +18,7 @@ from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
 
 @dataclass(frozen=True, eq=False)
-class OrderProblems:
+class ProblemsByOrder:
     """A recording, the prior of each order, and which readings share a noise sd."""
 
     recording: Recording

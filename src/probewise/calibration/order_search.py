@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise.calibration.order_problems import OrderProblems
+from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.calibration.smc import SMCResult, TemperatureSummary
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 
@@ -45,8 +45,8 @@ Search = Callable[[int, np.random.Generator], OrderPosterior]
 """Function that searches the whole prior of an order."""
 
 
-def search_order(
-    problems: OrderProblems,
+def search_prior_of_order(
+    problems: ProblemsByOrder,
     n_gaussians: int,
     rng: np.random.Generator,
     *,

@@ -14,10 +14,10 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.calibration.fields import sorted_by_mass
+from probewise.calibration.fields import gaussians_sorted_by_mass
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.smc import N_CLOUDS, N_SNAPSHOTS, SMCResult
-from probewise.calibration.whole_coordinates import WholeFootprintCoordinates, count_bright
+from probewise.calibration.whole_coordinates import WholeFootprintCoordinates, count_bright_gaussians
 from probewise.nested import NestedResult, Weighted
 
 _N_SAMPLES = 4000
@@ -78,14 +78,16 @@ def _normalised_evidences(each: Iterable[PosteriorPart | SMCResult]) -> FloatArr
     return np.asarray(np.exp(log_z - logsumexp(log_z)))
 
 
-def split_by_n_bright(found: SMCResult | NestedResult | Weighted, rng: np.random.Generator) -> dict[int, PosteriorPart]:
+def split_posterior_by_n_bright(
+    found: SMCResult | NestedResult | Weighted, rng: np.random.Generator
+) -> dict[int, PosteriorPart]:
     """Split a posterior's samples by their number of bright Gaussians, and its evidence by the samples' shares."""
     if isinstance(found, SMCResult):
         theta, log_z, error = found.theta, found.log_z_of_clouds, found.start_error
     else:
         theta, log_z, error = found.samples(_N_SAMPLES, rng=rng), np.full(N_CLOUDS, found.log_z), found.log_z_error
-        theta = sorted_by_mass(theta, theta.shape[1] // 6)
-    bright = count_bright(theta)
+        theta = gaussians_sorted_by_mass(theta, theta.shape[1] // 6)
+    bright = count_bright_gaussians(theta)
     parts = {}
     for m in np.unique(bright).tolist():
         rows = np.flatnonzero(bright == m)

@@ -18,13 +18,13 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.all_bright_density import AllBrightDensity
+from probewise.calibration.all_bright_density import AllGaussiansBrightDensity
 from probewise.calibration.check_by_search import missed_part_in_words
 from probewise.calibration.compensation import CompensatedShapeProposal
-from probewise.calibration.faint_gaussian_reference import FaintGaussianReference, has_uniform_light
-from probewise.calibration.light_integral import LightIntegral, bridge_log_z_ratio
-from probewise.calibration.mixed_reference import MixedReference
-from probewise.calibration.order_problems import OrderProblems
+from probewise.calibration.faint_gaussian_reference import FaintGaussianReferenceDensity, has_uniform_prior_of_light
+from probewise.calibration.light_integral import FaintGaussianLikelihoodRatio, bridge_log_z_ratio
+from probewise.calibration.mixed_reference import MixedReferenceDensity
+from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.calibration.order_search import OrderPosterior, Progress, Search
 from probewise.calibration.peak_density import PeakDensity, fit_density_about_peak, share_missed_about_peak
 from probewise.calibration.peaks import HighestPeak, find_highest_peak_by_order
@@ -33,11 +33,11 @@ from probewise.calibration.posterior_parts import (
     PosteriorPart,
     evidence_shares,
     join_smc_results_of_parts,
-    split_by_n_bright,
+    split_posterior_by_n_bright,
 )
 from probewise.calibration.reference_density import ReferenceDensity
 from probewise.calibration.smc import N_CLOUDS, N_SNAPSHOTS, SMCResult, TemperatureSummary, run_smc
-from probewise.calibration.whole_coordinates import count_bright
+from probewise.calibration.whole_coordinates import count_bright_gaussians
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
@@ -71,7 +71,7 @@ _TWO_BRIGHT, _MORE_BRIGHT = (15, 0.6), (6, 0.4)
 
 
 def fit_orders_quickly(
-    problems: OrderProblems,
+    problems: ProblemsByOrder,
     orders: Sequence[int],
     *,
     search: Search,
@@ -99,7 +99,7 @@ def fit_orders_quickly(
     parts: dict[int, PosteriorPart] = {}
     for n in range(1, highest + 1):
         needed = n == 1 or peaks[n].log_likelihood - peaks[n - 1].log_likelihood > _NEEDED
-        found[n], parts = fit_one_more_gaussian(
+        found[n], parts = fit_next_order(
             problems, n, parts, peaks[n], climbing, whole=whole, needed=needed, search=search, progress=progress
         )
     return _check_chosen_order_or_search_in_full(
@@ -108,7 +108,7 @@ def fit_orders_quickly(
 
 
 def _check_chosen_order_or_search_in_full(
-    problems: OrderProblems,
+    problems: ProblemsByOrder,
     found: dict[int, OrderPosterior],
     rng: np.random.Generator,
     *,
@@ -134,18 +134,18 @@ def _check_chosen_order_or_search_in_full(
                 found[n] = replace(full, notes=(*full.notes, f"order {n} was {note}"))
 
 
-def _why_smc_does_not_apply(problems: OrderProblems, highest: int) -> str:
+def _why_smc_does_not_apply(problems: ProblemsByOrder, highest: int) -> str:
     """Return in words why SMC does not apply to this prior; empty if it does."""
     priors = [problems.prior_of(n) for n in range(1, highest + 1)]
-    if not all(has_uniform_light(prior) for prior in priors):
+    if not all(has_uniform_prior_of_light(prior) for prior in priors):
         return "searched in full: the prior of a Gaussian's light is not uniform from 0"
     if any(replace(prior, n_gaussians=1) != priors[0] for prior in priors):
         return "searched in full: the prior of a Gaussian differs from order to order"
     return ""
 
 
-def fit_one_more_gaussian(
-    problems: OrderProblems,
+def fit_next_order(
+    problems: ProblemsByOrder,
     n: int,
     below: dict[int, PosteriorPart],
     peak: HighestPeak,
@@ -194,16 +194,16 @@ def fit_one_more_gaussian(
         made, parts = way()
         made = _with_doubt_of_missed_peaks(problems, n, made, peak, rng)
         if not made.warnings:
-            return OrderPosterior(made, None), parts or split_by_n_bright(made, rng)
+            return OrderPosterior(made, None), parts or split_posterior_by_n_bright(made, rng)
         notes.extend(made.warnings)
     full = search(n, rng)
     note = f"order {n} was searched in full, since the climb to it is doubtful: {'; '.join(dict.fromkeys(notes))}"
     found = replace(full, notes=(*full.notes, note))
-    return found, split_by_n_bright(found.evidence_result, rng)
+    return found, split_posterior_by_n_bright(found.evidence_result, rng)
 
 
 def _smc_from_peak(
-    problems: OrderProblems,
+    problems: ProblemsByOrder,
     n: int,
     peak: HighestPeak,
     rng: np.random.Generator,
@@ -242,7 +242,7 @@ def _smc_from_peak(
 
 
 def _smc_from_order_below(
-    problems: OrderProblems,
+    problems: ProblemsByOrder,
     n: int,
     below: dict[int, PosteriorPart],
     peak: HighestPeak,
@@ -256,7 +256,7 @@ def _smc_from_order_below(
     """
     tops = [peak.theta, *peak.others]
     about = [fit_density_about_peak(problems.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in tops]
-    bright = count_bright(np.array(tops))
+    bright = count_bright_gaussians(np.array(tops))
     held = evidence_shares(below)
     made: dict[int, SMCResult] = {}
     for m, part in below.items():
@@ -273,7 +273,7 @@ def _smc_from_order_below(
 
 
 def _smc_with_faint_gaussian_added(
-    problems: OrderProblems,
+    problems: ProblemsByOrder,
     n: int,
     n_bright: int,
     below: PosteriorPart,
@@ -301,9 +301,11 @@ def _smc_with_faint_gaussian_added(
         rng=rng,
         n_pool=_POOL if many else _SMALL_POOL,
     )
-    reference: ReferenceDensity = FaintGaussianReference(problems.prior_of(n), problem_below, compensation, n_bright)
+    reference: ReferenceDensity = FaintGaussianReferenceDensity(
+        problems.prior_of(n), problem_below, compensation, n_bright
+    )
     if about:
-        reference = MixedReference(reference, about, below.log_z)
+        reference = MixedReferenceDensity(reference, about, below.log_z)
     made = run_smc(
         problems.problem(n),
         reference,
@@ -315,18 +317,21 @@ def _smc_with_faint_gaussian_added(
         at_once_from=_AT_ONCE_FROM,
         progress=report,
     )
-    integral = LightIntegral(problems.prior_of(n), problems.problem(1), n_bright)
+    integral = FaintGaussianLikelihoodRatio(problems.prior_of(n), problems.problem(1), n_bright)
     gaussian = problems.prior_of(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
     # Any of the n - n_bright faint Gaussians may be the one that is added.
     labels = math.log(n / (n - n_bright))
     log_z = below.log_z_of_clouds + labels
     return _with_bridged_evidence(
-        made, log_z, integral.log_ratio_when_added(rest, gaussian), integral.log_ratio_when_taken_away(made.theta)
+        made,
+        log_z,
+        integral.log_likelihood_ratio_of_added_gaussian(rest, gaussian),
+        integral.log_likelihood_ratios_of_faint_gaussians(made.theta),
     )
 
 
 def _smc_with_all_gaussians_bright(
-    problems: OrderProblems,
+    problems: ProblemsByOrder,
     n: int,
     below: PosteriorPart,
     about: tuple[PeakDensity, ...],
@@ -338,9 +343,9 @@ def _smc_with_all_gaussians_bright(
     """Sample the part of the posterior of `n` where all Gaussians are bright, from a wide density."""
     space = whole.whole_footprint_coordinates(problems.prior_of(n), n)
     fewer = whole.whole_footprint_coordinates(problems.prior_of(n - 1), n - 1).enter(below.theta)
-    reference: ReferenceDensity = AllBrightDensity.from_samples_below(space, fewer)
+    reference: ReferenceDensity = AllGaussiansBrightDensity.from_samples_below(space, fewer)
     if about:
-        reference = MixedReference(reference, about, 0.0)
+        reference = MixedReferenceDensity(reference, about, 0.0)
     n_steps, least_effective = _TWO_BRIGHT if n == 2 else _MORE_BRIGHT
     return run_smc(
         problems.problem(n),
@@ -390,7 +395,7 @@ def _with_bridged_evidence(made: SMCResult, log_z: FloatArray, added: FloatArray
 
 
 def _with_doubt_of_missed_peaks(
-    problems: OrderProblems, n: int, made: SMCResult, peak: HighestPeak, rng: np.random.Generator
+    problems: ProblemsByOrder, n: int, made: SMCResult, peak: HighestPeak, rng: np.random.Generator
 ) -> SMCResult:
     """Add a doubt to an SMC run that missed a peak which holds a part of the evidence."""
     if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:

@@ -22,7 +22,7 @@ from probewise._posterior_samples import (
     require_masks_of_absent_effects,
 )
 from probewise._version import __version__
-from probewise.calibration.fields import mean_field
+from probewise.calibration.fields import posterior_mean_ssf_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
@@ -162,7 +162,7 @@ class FittedSensor(NamedSamples):
             raise ParameterError(
                 "names", self.names, f"after I_max the columns of the effects {self.effects}: {sorted(columns)}"
             )
-        det = _determinants(samples, self.n_gaussians)
+        det = _precision_determinants(samples, self.n_gaussians)
         if not (det > 0).all():
             raise ParameterError("A B - C^2 of a Gaussian", float(det.min()), "greater than 0 in every sample")
         object.__setattr__(self, "samples", samples)
@@ -171,9 +171,9 @@ class FittedSensor(NamedSamples):
     @property
     def effects_on_new_scans(self) -> tuple[AnyEffect, ...]:
         """The effects that also apply to new scans."""
-        return tuple(self._effect(name) for name in self.effects if name not in BOUND_TO_SCANS)
+        return tuple(self._build_effect(name) for name in self.effects if name not in BOUND_TO_SCANS)
 
-    def _effect(self, name: str) -> AnyEffect:
+    def _build_effect(self, name: str) -> AnyEffect:
         kind: type[AnyEffect] = EFFECTS[name]
         if name in self.origins:
             return cast(AnyEffect, cast(type[CountsFromOrigin], kind)(origin=self.origins[name]))
@@ -200,12 +200,14 @@ class FittedSensor(NamedSamples):
 
     free_form = is_free_form  # its earlier name
 
-    def mixture(self) -> FixedMixture:
+    def mean_mixture(self) -> FixedMixture:
         """Return the mean SSF as a mixture of `n_gaussians` positive Gaussians; four for a free form."""
         if self.is_free_form:
             return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
         n = self.n_gaussians
         return merged_mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
+
+    mixture = mean_mixture  # its earlier name
 
     def with_leading_effects(self) -> FittedSensor:
         """Return the sensor with the most probable combination of effects, where a diagnosis left several possible.
@@ -225,7 +227,7 @@ class FittedSensor(NamedSamples):
             names=tuple(self.names[k] for k in kept),
             samples=samples,
             noise_sd=self.noise_sd[rows],
-            field=mean_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
+            field=posterior_mean_ssf_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
             effects=tuple(name for name in self.effects if name not in left_out),
             patterns={name: own for name, own in self.patterns.items() if name not in left_out},
             origins={name: own for name, own in self.origins.items() if name not in left_out},
@@ -435,7 +437,7 @@ def _counts_from_origin(name: str) -> bool:
     return issubclass(EFFECTS[name], CountsFromOrigin)
 
 
-def _determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:
+def _precision_determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:
     """Compute A B - C^2 of each Gaussian, (n_samples, N); -inf where A is not positive."""
     a, b, c = (samples[:, k : 6 * n_gaussians : 6] for k in (3, 4, 5))
     return np.where(a > 0, a * b - c * c, -np.inf)

@@ -154,11 +154,11 @@ class _Particles:
     log_likelihood: FloatArray
     log_reference: FloatArray
 
-    def take(self, rows: IntArray) -> _Particles:
+    def select_rows(self, rows: IntArray) -> _Particles:
         return _Particles(self.x[rows], self.log_prior[rows], self.log_likelihood[rows], self.log_reference[rows])
 
     def with_rows_replaced(self, rows: IntArray, other: _Particles) -> _Particles:
-        out = self.take(np.arange(len(self.x)))
+        out = self.select_rows(np.arange(len(self.x)))
         out.x[rows], out.log_prior[rows] = other.x, other.log_prior
         out.log_likelihood[rows], out.log_reference[rows] = other.log_likelihood, other.log_reference
         return out
@@ -225,7 +225,8 @@ def run_smc(
     least_effective
         Least share of the particles that a change of temperature leaves effective.
     at_once_from
-        Number of temperatures, 0 included, after which the next one is 1; where a `LightIntegral` gives the evidence.
+        Number of temperatures, 0 included, after which the next one is 1; where a `FaintGaussianLikelihoodRatio` gives
+        the evidence.
     progress
         Called after every temperature.
     """
@@ -276,7 +277,7 @@ def run_smc(
         # Cut off (truncated importance sampling, Ionides 2008): a single particle must not take over its cloud.
         mean = logsumexp(log_weight, axis=1, keepdims=True) - math.log(here)
         weight = np.exp(np.minimum(log_weight - mean, 0.5 * math.log(here)))
-        now = now.take(np.concatenate([k * here + resampled_rows(own, n, rng) for k, own in enumerate(weight)]))
+        now = now.select_rows(np.concatenate([k * here + resampled_rows(own, n, rng) for k, own in enumerate(weight)]))
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):
@@ -383,7 +384,7 @@ def _moved_by_differential_evolution(
     for half in (0, 1):
         own, other = order[half::2], order[1 - half :: 2]
         m = len(own)
-        old = now.take(own)
+        old = now.select_rows(own)
         in_block = block_of == rng.integers(n_gaussians + 1, size=m)[:, None]
         by_block = rng.random(m) < _BY_BLOCK
         scale = 2.38 / math.sqrt(2 * d) * np.exp(0.4 * rng.standard_normal(m))
@@ -394,7 +395,7 @@ def _moved_by_differential_evolution(
         new = evaluate_particles(old.x + np.where(by_block[:, None] & ~in_block, 0.0, step))
         better = np.log(rng.random(m)) < new.log_tempered_density(beta) - old.log_tempered_density(beta)
         n_accepted += int(better.sum())
-        now = now.with_rows_replaced(own[better], new.take(np.flatnonzero(better)))
+        now = now.with_rows_replaced(own[better], new.select_rows(np.flatnonzero(better)))
     return now, n_accepted / n
 
 
@@ -414,4 +415,4 @@ def _moved_by_independent_proposals(
             new.log_tempered_density(beta) - now.log_tempered_density(beta) + log_drawn + now.log_prior - new.log_prior
         )
         better = np.flatnonzero(np.log(rng.random(len(there))) < log_accept)
-    return now.with_rows_replaced(better, new.take(better))
+    return now.with_rows_replaced(better, new.select_rows(better))

@@ -39,7 +39,7 @@ class WholeFootprintCoordinates:
     size_mm2
         Approximate trace of its covariance.
     n_bright
-        Number of bright Gaussians to which the prior is restricted; see `count_bright`. None: any.
+        Number of bright Gaussians to which the prior is restricted; see `count_bright_gaussians`. None: any.
     """
 
     prior: SSFPrior
@@ -53,11 +53,13 @@ class WholeFootprintCoordinates:
         g = view_by_kind_and_gaussian(x)
         ratio = np.exp(g[0, 1:])
         g[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
-        mean, first = self._centre_from_others_and_first_share(g)
+        mean, first = self._centre_contribution_of_others_and_first_share(g)
         covariance = _covariance_from_logs(g[3:6, 0])
         whole_mean = mean + first * g[1:3, 0]
         off = g[1:3, 0] - whole_mean
-        whole = first * (covariance + _second_moment_products(off)) + self._covariance_from_others(g, whole_mean)
+        whole = first * (covariance + _squares_and_product(off)) + self._covariance_contribution_of_others(
+            g, whole_mean
+        )
         g[1:3, 0] = whole_mean
         g[3:6, 0] = _logs_from_covariance(whole)
         return x
@@ -74,14 +76,14 @@ class WholeFootprintCoordinates:
         g[0, 1:] = g[0, 1:].clip(-100.0, 0.0)
         g[3:5] = g[3:5].clip(-100.0, 100.0)
         ratio = np.exp(g[0, 1:])
-        mean, first = self._centre_from_others_and_first_share(g)
+        mean, first = self._centre_contribution_of_others_and_first_share(g)
         whole_mean, whole = g[1:3, 0].copy(), _covariance_from_logs(g[3:6, 0])
         # An extreme correlation is one in its last digit.
         real = _positive_definite_mask(whole)
         whole[:, ~real] = _UNIT
         g[1:3, 0] = (whole_mean - mean) / first
         off = g[1:3, 0] - whole_mean
-        own = (whole - self._covariance_from_others(g, whole_mean)) / first - _second_moment_products(off)
+        own = (whole - self._covariance_contribution_of_others(g, whole_mean)) / first - _squares_and_product(off)
         real &= _positive_definite_mask(own)
         own[:, ~real] = _UNIT
         g[3:6, 0] = _logs_from_covariance(own)
@@ -98,7 +100,7 @@ class WholeFootprintCoordinates:
     def _moment_coordinates(self) -> MomentCoordinates:
         return MomentCoordinates(self.prior)
 
-    def _tapered_shares(self, g: FloatArray) -> FloatArray:
+    def _tapered_light_shares(self, g: FloatArray) -> FloatArray:
         """Tapered share of the light of each Gaussian but the first, (N - 1, n)."""
         x, y = self.centre_mm
         variance = np.exp(g[3:5, 1:].clip(-100.0, 100.0))
@@ -106,20 +108,22 @@ class WholeFootprintCoordinates:
         light = np.exp(g[0, 1:]) / (1.0 + (reach / _TAPER**2) ** 2)
         return np.asarray(light / (1.0 + light.sum(axis=0)))
 
-    def _centre_from_others_and_first_share(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _centre_contribution_of_others_and_first_share(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sum the centres of all but the first times their tapered shares, (2, n); and the first one's share, (n,)."""
-        light = self._tapered_shares(g)
+        light = self._tapered_light_shares(g)
         return (light * g[1:3, 1:]).sum(axis=1), 1.0 - light.sum(axis=0)
 
-    def _covariance_from_others(self, g: FloatArray, mean: FloatArray) -> FloatArray:
+    def _covariance_contribution_of_others(self, g: FloatArray, mean: FloatArray) -> FloatArray:
         """Sum the contributions of all but the first to the covariance of the whole, (3, n)."""
         off = g[1:3, 1:] - mean[:, None]
         return np.asarray(
-            (self._tapered_shares(g) * (_covariance_from_logs(g[3:6, 1:]) + _second_moment_products(off))).sum(axis=1)
+            (self._tapered_light_shares(g) * (_covariance_from_logs(g[3:6, 1:]) + _squares_and_product(off))).sum(
+                axis=1
+            )
         )
 
 
-def count_bright(theta: FloatArray) -> IntArray:
+def count_bright_gaussians(theta: FloatArray) -> IntArray:
     """Count the Gaussians that hold more than `FAINT` of the heaviest one's light, (n, 6 N + 2) -> (n,)."""
     light = total_light_by_gaussian(theta)
     return np.asarray((light > FAINT * light.max(axis=1, keepdims=True)).sum(axis=1))
@@ -143,7 +147,7 @@ def _logs_from_covariance(covariance: FloatArray) -> FloatArray:
     return np.stack([np.log(xx), np.log(yy), np.arctanh(xy / np.sqrt(xx * yy))])
 
 
-def _second_moment_products(off: FloatArray) -> FloatArray:
+def _squares_and_product(off: FloatArray) -> FloatArray:
     """Compute x^2, y^2 and x y, (2, ...) -> (3, ...)."""
     return np.stack([off[0] ** 2, off[1] ** 2, off[0] * off[1]])
 

@@ -238,7 +238,7 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
     require_recording(recording)
     require_sensor(sensor)
     require_described(recording.plan)
-    mixture, patterns = sensor.with_leading_effects().mixture(), KnownScene(recording.plan.patterns)
+    mixture, patterns = sensor.with_leading_effects().mean_mixture(), KnownScene(recording.plan.patterns)
     share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)
     seen = share.predict(np.empty((1, 0)), recording.plan)[0]
     black, white = (

@@ -195,7 +195,7 @@ def experiment_for(
     step = scale.step or noise_sd / _CELLS_PER_SD
     likelihood = Rounded(noise_sd, step, scale.low, scale.high, whole_steps=scale.step is not None)
     if learn_sensor:
-        free = replace(chain, ssf=AdjustedMixture(sensor.mixture()), levels=FreeLevels())
+        free = replace(chain, ssf=AdjustedMixture(sensor.mean_mixture()), levels=FreeLevels())
         return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
     return pose(chain, likelihood)
 
@@ -255,7 +255,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
             effects.append(Estimated(acting, values, tuple(map(_marginal_prior_from_samples, samples))))
         else:
             effects.append(Known(effect, values))
-    return Chain(sensor.mixture(), levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)
+    return Chain(sensor.mean_mixture(), levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)
 
 
 def _marginal_prior_from_samples(samples: FloatArray) -> Marginal:

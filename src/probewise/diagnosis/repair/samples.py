@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
-from probewise.calibration.fields import choose_pixel_mm, mean_field, sorted_by_mass
+from probewise.calibration.fields import choose_pixel_mm, gaussians_sorted_by_mass, posterior_mean_ssf_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
@@ -81,9 +81,9 @@ class ModelSamples:
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Convert to a FittedSensor, for predictions, the robot, and sensor.json; `recording` is what was fitted."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
-        from_chain = sorted_by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
+        from_chain = gaussians_sorted_by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_median_step_mm(recording))
-        field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
+        field = posterior_mean_ssf_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable
         residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
         scan_noise = noise_by_scan(

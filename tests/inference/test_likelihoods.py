@@ -194,4 +194,4 @@ def test_weights_tell_the_gradient_by_the_predictions() -> None:
         up, down = (likelihood.log_prob(readings, predicted + side * shift) for side in (1, -1))
         gradient[:, k] = (up - down) / 2e-5
     off = readings - predicted
-    np.testing.assert_allclose(off * likelihood.weights(off), gradient, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(off * likelihood.inverse_noise_variance(off), gradient, rtol=1e-5, atol=1e-7)

@@ -152,7 +152,7 @@ class FaintGaussianLikelihoodRatio:
             q = share[..., None]
             left = np.maximum(square - 2.0 * q * both + q * q * own, 1e-300)
             per_variance = np.minimum(
-                self._student_t_likelihood.sizes / left, 1.0 / self._student_t_likelihood.sd_floor**2
+                self._student_t_likelihood.group_sizes / left, 1.0 / self._student_t_likelihood.sd_floor**2
             )
             told = (per_variance * own).sum(axis=-1) + 1e-12
             best = (per_variance * both).sum(axis=-1) / told
@@ -187,7 +187,7 @@ class FaintGaussianLikelihoodRatio:
         suffices.
         """
         likelihood = self._student_t_likelihood
-        sizes, of = np.unique(likelihood.sizes, return_inverse=True)
+        sizes, of = np.unique(likelihood.group_sizes, return_inverse=True)
         low, high = np.log(likelihood.sd_floor**2 * sizes * 1e-3), np.log(likelihood.sd_ceiling**2 * sizes * 1e3)
         grid = np.linspace(low, high, _N_TABLE, axis=1)
         values = log_sigma_integral(np.exp(grid), sizes[:, None], likelihood.sd_floor, likelihood.sd_ceiling)

@@ -216,7 +216,7 @@ def _laplace_density(problem: SensorProblem, space: LabelSymmetricCoordinates, p
     theta, _ = space.leave(at + _DIFFERENCE * np.concatenate([np.zeros((1, d)), np.eye(d)]))
     predicted = problem.model.predict(theta, recording.plan)[:, recording.usable]
     slope = (predicted[1:] - predicted[0]) / _DIFFERENCE
-    weight = likelihood.weights(recording.readings[recording.usable] - predicted[:1])[0]
+    weight = likelihood.inverse_noise_variance(recording.readings[recording.usable] - predicted[:1])[0]
     covariance = np.linalg.inv((slope * weight) @ slope.T + np.diag(1.0 / wide))
     return StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance), dtype=np.float64))
 

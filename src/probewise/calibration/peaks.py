@@ -152,7 +152,7 @@ def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianRespons
             break
         here, own = z[rows], off[rows]
         slope = _prediction_slopes(prior, responses, here)
-        weighted = slope * likelihood.weights(own)[:, None, :]
+        weighted = slope * likelihood.inverse_noise_variance(own)[:, None, :]
         curvature = weighted @ slope.transpose(0, 2, 1)
         gradient = np.einsum("ndp,np->nd", weighted, own)
         # Without information in the readings, about the curvature of the logistic prior limits the step.

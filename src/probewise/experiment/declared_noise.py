@@ -40,7 +40,7 @@ class DeclaredNoise:
         """Return which readings, (n_points,), lie between the ends of the scale."""
         if self.ends is None:
             return np.ones(len(readings), dtype=np.bool_)
-        return ~(self.ends.at_low(readings) | self.ends.at_high(readings))
+        return ~(self.ends.lowest_reading_mask(readings) | self.ends.highest_reading_mask(readings))
 
     def log_density(
         self,
@@ -74,8 +74,8 @@ class DeclaredNoise:
         """Return the log density of readings, (n_points,), that are uniform from `low` to `high`; -inf beyond."""
         width = np.full(len(readings), self.step or 1.0)
         if self.ends is not None:
-            width = np.where(self.ends.at_low(readings), self.ends.lowest_cell + 0.5 * self.step - low, width)
-            width = np.where(self.ends.at_high(readings), high - self.ends.highest_cell + 0.5 * self.step, width)
+            width = np.where(self.ends.lowest_reading_mask(readings), self.ends.lowest_cell + 0.5 * self.step - low, width)
+            width = np.where(self.ends.highest_reading_mask(readings), high - self.ends.highest_cell + 0.5 * self.step, width)
         possible = (readings >= low) & (readings <= high) & (width > 0)
         return np.log(np.where(possible, width, 1.0) / (high - low)) + np.where(possible, 0.0, -np.inf)
 
@@ -86,4 +86,4 @@ class DeclaredNoise:
         inside = self.is_inside(readings)
         if self.ends is None or inside.all():
             return within
-        return np.where(inside, within, self.ends.log_probability_beyond(readings, predicted, sd))
+        return np.where(inside, within, self.ends.log_prob_at_ends(readings, predicted, sd))

@@ -34,28 +34,30 @@ class ScaleEnds:
     step: float
 
     @classmethod
-    def of(cls, low: float, high: float, step: float, *, whole_steps: bool = True) -> Self:
+    def from_range(cls, low: float, high: float, step: float, *, whole_steps: bool = True) -> Self:
         """Return the ends of a scale from `low` to `high`, rounded to multiples of `step` if `whole_steps`."""
         lowest, highest = (
             round(end / step) * step if whole_steps and math.isfinite(end) else end for end in (low, high)
         )
         return cls(max(lowest, low), min(highest, high), lowest, highest, step)
 
-    def at_low(self, readings: FloatArray) -> BoolArray:
+    def lowest_reading_mask(self, readings: FloatArray) -> BoolArray:
         """Return which readings are the lowest possible one."""
-        return np.asarray(readings <= self.low + self._slack)
+        return np.asarray(readings <= self.low + self._tolerance)
 
-    def at_high(self, readings: FloatArray) -> BoolArray:
+    def highest_reading_mask(self, readings: FloatArray) -> BoolArray:
         """Return which readings are the highest possible one."""
-        return np.asarray(readings >= self.high - self._slack)
+        return np.asarray(readings >= self.high - self._tolerance)
 
-    def log_probability_beyond(self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray) -> FloatArray:
+    def log_prob_at_ends(self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray) -> FloatArray:
         """Return the log probability of readings at an end, (n_points,), given predictions, (n_samples, n_points)."""
-        inward = np.where(self.at_high(readings), predicted - self.highest_cell, self.lowest_cell - predicted)
+        inward = np.where(
+            self.highest_reading_mask(readings), predicted - self.highest_cell, self.lowest_cell - predicted
+        )
         return np.asarray(log_ndtr((inward + 0.5 * self.step) / sd))
 
     @property
-    def _slack(self) -> float:
+    def _tolerance(self) -> float:
         return 1e-9 * self.step  # a multiple of a step such as 0.1 is not exact
 
 
@@ -97,31 +99,31 @@ class Rounded:
         """Return the log probability of the readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
-        at_end = self.ends.at_low(readings) | self.ends.at_high(readings)
+        at_end = self.ends.lowest_reading_mask(readings) | self.ends.highest_reading_mask(readings)
         if at_end.any():
             within = self._log_cell_probability(away[:, ~at_end]).sum(axis=1)
-            beyond = self.ends.log_probability_beyond(readings[at_end], predicted[:, at_end], self.sd)
+            beyond = self.ends.log_prob_at_ends(readings[at_end], predicted[:, at_end], self.sd)
             return np.asarray(within + beyond.sum(axis=1))
         return np.asarray(self._log_cell_probability(away).sum(axis=1))
 
     @cached_property
     def ends(self) -> ScaleEnds:
         """The outermost readings of the scale."""
-        return ScaleEnds.of(self.low, self.high, self.step, whole_steps=self.whole_steps)
+        return ScaleEnds.from_range(self.low, self.high, self.step, whole_steps=self.whole_steps)
 
     def _log_cell_probability(self, away: FloatArray) -> FloatArray:
         """Interpolate the log probability of readings' cells from a table, by distance from the prediction in sds."""
         position = np.minimum(away, _FAR - 1.0) * _PER_SD
         entry = position.astype(np.int64)
-        below = self._log_probability_table[entry]
-        out = below + (position - entry) * (self._log_probability_table[entry + 1] - below)
+        below = self._log_cell_probability_table[entry]
+        out = below + (position - entry) * (self._log_cell_probability_table[entry + 1] - below)
         far = away > _FAR - 1.0
         if far.any():
             out[far] = self._exact_log_cell_probability(away[far])
         return np.asarray(out)
 
     @cached_property
-    def _log_probability_table(self) -> FloatArray:
+    def _log_cell_probability_table(self) -> FloatArray:
         return self._exact_log_cell_probability(np.arange(0.0, _FAR + 1.0 / _PER_SD, 1.0 / _PER_SD))
 
     def _exact_log_cell_probability(self, away: FloatArray) -> FloatArray:

@@ -57,13 +57,13 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
     out = np.empty(s.shape)
     if fits.any():
         b = a[fits]
-        out[fits] = _log_difference(
+        out[fits] = _log_diff_exp(
             _log_lower_gamma_scaled(b, t_low[fits]) - 2.0 * b * math.log(low),
             _log_lower_gamma_scaled(b, t_high[fits]) - 2.0 * b * math.log(high),
         )
     if huge.any():
         b = a[huge]
-        difference = _log_difference(_log_upper_gamma(b, t_high[huge]), _log_upper_gamma(b, t_low[huge]))
+        difference = _log_diff_exp(_log_upper_gamma(b, t_high[huge]), _log_upper_gamma(b, t_low[huge]))
         out[huge] = difference + b * (math.log(2.0) - np.log(s[huge]))
     usual = ~(fits | huge)
     if usual.any():
@@ -77,7 +77,7 @@ def _log_twice_integral_over_peak(s: FloatArray, a: FloatArray, t_low: FloatArra
     return np.asarray(gammaln(a) + np.log(share) + a * (math.log(2.0) - np.log(s)))
 
 
-def _log_difference(large: FloatArray, small: FloatArray) -> FloatArray:
+def _log_diff_exp(large: FloatArray, small: FloatArray) -> FloatArray:
     return np.asarray(large + np.log(-np.expm1(np.minimum(small - large, -1e-300))))
 
 
@@ -141,7 +141,7 @@ class StudentT:
         object.__setattr__(self, "groups", groups)
 
     @cached_property
-    def _membership(self) -> FloatArray:
+    def _group_indicator(self) -> FloatArray:
         """Indicator matrix, (n_points, n_groups): 1 where reading i belongs to data set j."""
         return np.asarray(self.groups[:, None] == np.unique(self.groups)[None, :], dtype=np.float64)
 
@@ -149,19 +149,24 @@ class StudentT:
     def _group_starts(self) -> IntArray | None:
         """Index of each data set's first reading, if there are over 16, each contiguous and in order; else None."""
         starts = np.flatnonzero(np.diff(self.groups, prepend=self.groups[:1] - 1))
-        in_one_piece = starts.size == self.sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
+        in_one_piece = starts.size == self.group_sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
         return starts if in_one_piece and starts.size > _MANY_GROUPS else None
 
     def sums_by_group(self, square: FloatArray) -> FloatArray:
         """Return sums over the readings of each data set, (n_samples, n_points) -> (n_samples, n_groups)."""
         if self._group_starts is None:
-            return square @ self._membership
+            return square @ self._group_indicator
         return np.asarray(np.add.reduceat(square, self._group_starts, axis=1))
 
     @cached_property
-    def sizes(self) -> FloatArray:
+    def group_sizes(self) -> FloatArray:
         """Number of readings of each data set, in the order of their labels, (n_groups,)."""
-        return np.asarray(self._membership.sum(axis=0))
+        return np.asarray(self._group_indicator.sum(axis=0))
+
+    @property
+    def sizes(self) -> FloatArray:
+        """The old name of `group_sizes`."""
+        return self.group_sizes
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
@@ -171,22 +176,24 @@ class StudentT:
                 f"groups has {self.groups.size} values for {residual.shape[1]} readings; allowed: one per reading"
             )
         square = self.sums_by_group(np.square(residual, out=residual))
-        integral = log_sigma_integral(square, self.sizes, self.sd_floor, self.sd_ceiling)
-        constant = 0.5 * self.groups.size * _LOG_2PI + self.sizes.size * math.log(
+        integral = log_sigma_integral(square, self.group_sizes, self.sd_floor, self.sd_ceiling)
+        constant = 0.5 * self.groups.size * _LOG_2PI + self.group_sizes.size * math.log(
             math.log(self.sd_ceiling / self.sd_floor)
         )
         return np.asarray(integral.sum(axis=1) - constant)
 
-    def weights(self, residual: FloatArray) -> FloatArray:
+    def inverse_noise_variance(self, residual: FloatArray) -> FloatArray:
         """Return one over the noise variance of each reading's data set, as its residuals estimate it.
 
         (n_samples, n_points) -> the same shape.
 
         The gradient of `log_prob` by the predictions is the residual times this, except near the bounds of the sd.
         """
-        variance = self.sums_by_group(np.square(residual)) / self.sizes
+        variance = self.sums_by_group(np.square(residual)) / self.group_sizes
         per_set = 1.0 / variance.clip(self.sd_floor**2, self.sd_ceiling**2)
         return np.asarray(per_set[:, np.unique(self.groups, return_inverse=True)[1]])
+
+    weights = inverse_noise_variance  # its earlier name
 
 
 def _require_ordered_bounds(sd_floor: float, sd_ceiling: float) -> None:

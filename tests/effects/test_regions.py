@@ -11,10 +11,10 @@ from probewise.scene import edge_distance
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
-    MixtureOfRegions,
     PolygonRegion,
     QuadrantRegion,
     RampRegion,
+    RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
     disc_region,
@@ -111,5 +111,5 @@ def test_where_there_is_no_edge_it_is_infinitely_far():
 
 
 def test_each_hypothesis_of_a_mixture_has_its_own_edge():
-    mixture = MixtureOfRegions([1, 0, 1], (HalfPlaneRegion([0.0], [3.0]), disc_region([[0.0, 0.0]] * 2, [5.0, 7.0])))
+    mixture = RegionsOfMixedKinds([1, 0, 1], (HalfPlaneRegion([0.0], [3.0]), disc_region([[0.0, 0.0]] * 2, [5.0, 7.0])))
     np.testing.assert_allclose(edge_distance(mixture, np.zeros((1, 1)), np.zeros((1, 1))), [[5.0], [3.0], [7.0]])

@@ -424,7 +424,7 @@ def test_of_a_set_of_shapes_the_robot_finds_which_and_where(small):
     assert result.last.likely_shape == "rectangle"
     assert result.last.shapes["rectangle"] > 0.95
     assert "rectangle (p = " in result.last.summary()
-    columns = shape.prior.columns[1]
+    columns = shape.prior.columns_by_shape[1]
     assert np.isnan(np.delete(result.last.mean, columns)).all()
     error = result.last.mean[columns][:2] - [210.0, 140.0]
     assert (np.abs(error) < 5 * result.last.sd[columns][:2]).all()
@@ -438,7 +438,7 @@ def test_a_set_of_shapes_stops_on_the_lengths_of_the_most_probable(small):
     arm = ChainArm(real_experiment(small, Circle(field)).model, (210.0, 140.0, 70.0))
     info = next(iter(explore(arm, experiment, rng=rng())))
     likely = list(shape.shapes).index(info.likely_shape)
-    assert np.isfinite(info.mean).nonzero()[0].tolist() == sorted(shape.prior.columns[likely].tolist())
+    assert np.isfinite(info.mean).nonzero()[0].tolist() == sorted(shape.prior.columns_by_shape[likely].tolist())
     assert sum(info.shapes.values()) == pytest.approx(1.0)
     known = np.where(np.isfinite(info.sd), 1.0, np.nan)
     assert experiment.may_stop(known, {"circle": 0.99, "rectangle": 0.01})

@@ -9,10 +9,10 @@ from probewise.scene import (
     EllipseRegion,
     HalfPlaneRegion,
     ImageRegion,
-    MixtureOfRegions,
     PolygonRegion,
     QuadrantRegion,
     RampRegion,
+    RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
     disc_region,
@@ -153,16 +153,16 @@ def test_a_batch_equals_its_members_one_by_one():
 def test_a_mixture_takes_each_hypothesis_from_its_own_kind():
     disc = disc_region(np.zeros((2, 2)), np.array([1.0, 5.0]))
     half = HalfPlaneRegion(np.zeros(1), np.zeros(1))
-    mixed = MixtureOfRegions(np.array([0, 1, 0]), (disc, half))
+    mixed = RegionsOfMixedKinds(np.array([0, 1, 0]), (disc, half))
     assert mixed.albedo(np.array([[3.0, 0.0], [-0.5, 0.0]])).tolist() == [[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
     with pytest.raises(ShapeError, match="part 0 holds 2"):
-        MixtureOfRegions(np.array([0, 1]), (disc, half))
+        RegionsOfMixedKinds(np.array([0, 1]), (disc, half))
 
 
 def test_outlines_lie_on_the_edge():
     ellipse = EllipseRegion(np.array([[1.0, 2.0]]), np.array([[5.0, 3.0]]), np.array([0.4]))
     square = PolygonRegion.from_vertices(np.array([[[0.0, 0], [4, 0], [4, 4], [0, 4]]]))
-    mixed = MixtureOfRegions(np.array([1, 0]), (ellipse, square))
+    mixed = RegionsOfMixedKinds(np.array([1, 0]), (ellipse, square))
     traces = outlines(mixed)
     assert len(traces[0]) == 5
     assert np.array_equal(traces[0][0], traces[0][-1])

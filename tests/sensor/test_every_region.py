@@ -8,10 +8,10 @@ from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
     ImageRegion,
-    MixtureOfRegions,
     PolygonRegion,
     QuadrantRegion,
     RampRegion,
+    RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
 )
@@ -29,7 +29,7 @@ KINDS = {
     "StripesRegion": StripesRegion([0.3], [11.0], [0.35], [1.0]),
     "RampRegion": RampRegion([0.7], [0.02]),
     "ImageRegion": ImageRegion(np.random.default_rng(5).random((12, 16)), 2.0, (-15.0, -11.0)),
-    "MixtureOfRegions": MixtureOfRegions([0, 1], (ELLIPSE, POLYGON)),
+    "RegionsOfMixedKinds": RegionsOfMixedKinds([0, 1], (ELLIPSE, POLYGON)),
 }
 PLACES = np.random.default_rng(1).uniform(-18, 22, (200, 2))
 
@@ -39,7 +39,7 @@ def registered(function):
 
 
 def test_every_kind_of_region_is_here():
-    assert {name for name in regions.__all__ if name.endswith("Region") or name.startswith("MixtureOf")} == set(KINDS)
+    assert {name for name in regions.__all__ if name.endswith("Region") or name.startswith("RegionsOf")} == set(KINDS)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -15,9 +15,9 @@ from probewise.recordings import patterns as kinds
 from probewise.scene import (
     EllipseRegion,
     HalfPlaneRegion,
-    MixtureOfRegions,
     PolygonRegion,
     QuadrantRegion,
+    RegionsOfMixedKinds,
     UniformRegion,
     disc_region,
     region_of,
@@ -285,7 +285,7 @@ def test_a_batch_of_regions_equals_one_by_one():
         for i in range(6):
             assert np.allclose(whole[i], mean_albedo_under_gaussians(make(slice(i, i + 1)), x, y, *cov)[0], atol=1e-10)
     which = np.array([3, 0, 1, 3, 2, 0])
-    mixed = MixtureOfRegions(
+    mixed = RegionsOfMixedKinds(
         which, tuple(make(np.flatnonzero(which == k)) if (which == k).any() else None for k, make in enumerate(makers))
     )
     found = mean_albedo_under_gaussians(mixed, x, y, *cov)

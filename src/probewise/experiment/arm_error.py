@@ -140,7 +140,10 @@ def _posterior_mean_shifts(
     shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
     likely, columns = shape, np.arange(len(mean))
     if isinstance(shape, AnyOf):
-        likely, columns = shape.shapes[likely_shape], shape.prior.columns[shape.shape_names.index(likely_shape)]
+        likely, columns = (
+            shape.shapes[likely_shape],
+            shape.prior.columns_by_shape[shape.shape_names.index(likely_shape)],
+        )
     own = np.arange(n_sensor, n_sensor + len(columns))
     thetas, weights, by_error, by_shape = [], [], [], []
     kinds = zip(posterior.kinds, posterior.particles, posterior.probability.tolist(), strict=True)

@@ -103,7 +103,7 @@ def samples_csv(run: Exploration) -> str:
         label, held = [], set(columns)
         if isinstance(shape, AnyOf):
             label = [shape.shape_names[which[row]]]
-            held = set(shape.prior.columns[which[row]])
+            held = set(shape.prior.columns_by_shape[which[row]])
         values = (f"{theta[row, k]:.7g}" if k in held else "" for k in columns)
         rows.append([f"{weight[row]:.7g}", *label, *values])
     return csv_text_of_rows(["weight", *(["shape"] if several else []), *(names[k] for k in columns)], rows)

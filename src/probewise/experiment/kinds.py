@@ -186,7 +186,7 @@ def _member_shapes(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> li
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
     parts = []
     for k, (name, member) in enumerate(shape.shapes.items()):
-        columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns[k]])
+        columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns_by_shape[k]])
         own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
         parts.append(_MemberShape(name, shape.weights[k], own, prior, columns, k, n_sensor))
     return parts

@@ -41,7 +41,7 @@ def shape_moments_and_probabilities(
     which = experiment.shape.shape_index(theta)
     share = np.bincount(which, weights=weight, minlength=len(experiment.shape.shape_names))
     likely = int(share.argmax())
-    columns = experiment.shape.prior.columns[likely]
+    columns = experiment.shape.prior.columns_by_shape[likely]
     own = theta[np.ix_(which == likely, columns)]
     given = weight[which == likely] / share[likely]
     mean, sd = np.full((2, theta.shape[1]), np.nan)

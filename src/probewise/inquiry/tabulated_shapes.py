@@ -15,7 +15,7 @@ from probewise.inquiry.grid import Grid
 from probewise.inquiry.polygons import EdgesInFootprintSds
 from probewise.inquiry.scanlines import ROWS, Interval, ScanlineIntervals, to_int32, to_single_precision
 from probewise.inquiry.unit_gaussian import REACH
-from probewise.scene import EllipseRegion, MixtureOfRegions, PolygonRegion, Region
+from probewise.scene import EllipseRegion, PolygonRegion, Region, RegionsOfMixedKinds
 from probewise.sensor import FixedMixture
 
 
@@ -132,7 +132,7 @@ class TabulatedShapes:
 
 def _rows_and_regions_by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
     """Yield the regions of each kind, with the indices of their hypotheses."""
-    if isinstance(region, MixtureOfRegions):
+    if isinstance(region, RegionsOfMixedKinds):
         yield from region.rows_and_regions()
     else:
         yield np.arange(region.n_regions), region

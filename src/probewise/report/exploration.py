@@ -182,7 +182,7 @@ def _truth_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[s
     likely, columns = shape, np.arange(len(step.names))
     if isinstance(shape, AnyOf):
         likely = shape.shapes[step.likely_shape]
-        columns = shape.prior.columns[shape.shape_names.index(step.likely_shape)]
+        columns = shape.prior.columns_by_shape[shape.shape_names.index(step.likely_shape)]
     names = [step.names[k] for k in columns]
     if not all(name in truth for name in names):
         return dict(truth)

@@ -12,10 +12,10 @@ from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
     ImageRegion,
-    MixtureOfRegions,
     PolygonRegion,
     QuadrantRegion,
     RampRegion,
+    RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
     disc_region,
@@ -40,13 +40,13 @@ __all__ = [
     "HypothesisScene",
     "ImageRegion",
     "KnownScene",
-    "MixtureOfRegions",
     "PlacedPrior",
     "PolygonRegion",
     "QuadrantRegion",
     "RampRegion",
     "Rectangle",
     "Region",
+    "RegionsOfMixedKinds",
     "RegularPolygon",
     "Scene",
     "Shape",
@@ -62,3 +62,6 @@ __all__ = [
 
 Placed = PlacedPrior
 """The old name of `PlacedPrior`."""
+
+MixtureOfRegions = RegionsOfMixedKinds
+"""The old name of `RegionsOfMixedKinds`."""

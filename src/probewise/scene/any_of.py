@@ -14,7 +14,7 @@ from probewise._kinds import require_kind
 from probewise.errors import ParameterError
 from probewise.priors import checked_columns
 from probewise.scene.albedo import Region, Shape, require_shape
-from probewise.scene.regions import MixtureOfRegions, UniformRegion
+from probewise.scene.regions import RegionsOfMixedKinds, UniformRegion
 from probewise.scene.shapes import PlacedPrior
 
 
@@ -36,7 +36,7 @@ class _AnyOfPrior:
         return ("shape", *self.shared, *own)
 
     @cached_property
-    def columns(self) -> list[IntArray]:
+    def columns_by_shape(self) -> list[IntArray]:
         """Columns of theta with the parameters of each shape, in the shape's order."""
         return [
             np.array([self.names.index(n if n in self.shared else f"{key}.{n}") for n in shape.prior.names], dtype=int)
@@ -49,7 +49,7 @@ class _AnyOfPrior:
         theta = np.empty_like(u)
         theta[:, 0] = np.interp(u[:, 0], ends, np.arange(len(ends)))
         which = self.shape_index(theta)
-        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
             values = shape.prior.from_unit_cube(u[:, columns])
             # Every shape fills its own columns; the selected shape fills the shared ones.
             own = columns > len(self.shared)
@@ -63,7 +63,7 @@ class _AnyOfPrior:
         u = np.empty_like(theta)
         u[:, 0] = np.interp(theta[:, 0], np.arange(len(ends)), ends)
         which = self.shape_index(theta)
-        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
             values = shape.prior.to_unit_cube(theta[:, columns])
             own = columns > len(self.shared)
             u[:, columns[own]] = values[:, own]
@@ -75,7 +75,7 @@ class _AnyOfPrior:
         which = self.shape_index(theta)
         inside = (theta[:, 0] >= 0) & (theta[:, 0] <= len(self.shapes))
         total = np.where(inside, np.log(np.asarray(self.weights))[which], -np.inf)
-        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
             values = theta[:, columns]
             prior = shape.prior
             taken = prior.log_prob(values)
@@ -131,12 +131,12 @@ class AnyOf:
 
     which = shape_index  # its earlier name
 
-    def region(self, theta: FloatArray) -> MixtureOfRegions:
+    def region(self, theta: FloatArray) -> RegionsOfMixedKinds:
         """Build the region of each hypothesis' shape."""
         which = self.shape_index(theta)
         parts: list[Region] = []
-        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.prior.columns, strict=True)):
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.prior.columns_by_shape, strict=True)):
             rows = np.flatnonzero(which == k)
             # An empty field stands in for a shape that no hypothesis selects.
             parts.append(shape.region(theta[np.ix_(rows, columns)]) if rows.size else UniformRegion(np.zeros(1)))
-        return MixtureOfRegions(which, tuple(parts))
+        return RegionsOfMixedKinds(which, tuple(parts))

@@ -24,7 +24,7 @@ Bounds = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Turn:
+class SymmetryTurn:
     """A symmetry: turned by `by_rad`, parameter number `angle`, a shape is the same with the two sides `swapped`."""
 
     by_rad: float
@@ -33,11 +33,11 @@ class Turn:
 
 
 @runtime_checkable
-class HasTurn(Protocol):
+class HasSymmetryTurn(Protocol):
     """A shape with an angle, which is the same shape after a turn."""
 
     @property
-    def turn(self) -> Turn:
+    def symmetry_turn(self) -> SymmetryTurn:
         """The smallest such turn."""
         ...
 
@@ -193,7 +193,7 @@ class Ellipse:
     semi_axes_mm: Bounds = (20.0, 150.0)
     inside: bool = False
 
-    turn: ClassVar[Turn] = Turn(np.pi, angle=4)
+    symmetry_turn: ClassVar[SymmetryTurn] = SymmetryTurn(np.pi, angle=4)
 
     def __post_init__(self) -> None:
         reach = 1.0 if self.inside else None
@@ -231,7 +231,7 @@ class Rectangle:
     sides_mm: Bounds = (40.0, 300.0)
     inside: bool = False
 
-    turn: ClassVar[Turn] = Turn(np.pi / 2, angle=4, swapped=(2, 3))
+    symmetry_turn: ClassVar[SymmetryTurn] = SymmetryTurn(np.pi / 2, angle=4, swapped=(2, 3))
 
     def __post_init__(self) -> None:
         reach = 1 / math.sqrt(2) if self.inside else None
@@ -275,9 +275,9 @@ class RegularPolygon:
         return PlacedPrior(self.field, own, _half_extent_of_circle if self.inside else None)
 
     @property
-    def turn(self) -> Turn:
+    def symmetry_turn(self) -> SymmetryTurn:
         """One corner to the next."""
-        return Turn(2 * np.pi / self.n_sides, angle=3)
+        return SymmetryTurn(2 * np.pi / self.n_sides, angle=3)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a polygon for each hypothesis, theta (n_samples, 4)."""

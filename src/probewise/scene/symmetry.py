@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.albedo import Shape
 from probewise.scene.any_of import AnyOf
-from probewise.scene.shapes import HasTurn, Turn
+from probewise.scene.shapes import HasSymmetryTurn, SymmetryTurn
 
 
 def mean_angles(shape: Shape, theta: FloatArray, weight: FloatArray) -> FloatArray:
@@ -19,7 +19,7 @@ def mean_angles(shape: Shape, theta: FloatArray, weight: FloatArray) -> FloatArr
     taken over the samples of its own shape.
     """
     out = np.full(theta.shape[1], np.nan)
-    for rows, columns, turn in _turns(shape, theta):
+    for rows, columns, turn in _rows_columns_and_turns(shape, theta):
         phase = np.exp(2j * math.pi * theta[rows, columns[turn.angle]] / turn.by_rad)
         out[columns[turn.angle]] = float(np.angle(weight[rows] @ phase)) % (2 * math.pi) * turn.by_rad / (2 * math.pi)
     return out
@@ -32,7 +32,7 @@ def with_angles_near(shape: Shape, theta: FloatArray, angles_rad: FloatArray) ->
     and one of pi - 0.01 are nearly the same ellipse. `angles_rad` is (n_params,); NaN leaves a column as it is.
     """
     out = theta
-    for rows, columns, turn in _turns(shape, theta):
+    for rows, columns, turn in _rows_columns_and_turns(shape, theta):
         near = angles_rad[columns[turn.angle]]
         turns = np.round((theta[rows, columns[turn.angle]] - near) / turn.by_rad) if np.isfinite(near) else np.zeros(1)
         if not turns.any():
@@ -46,12 +46,16 @@ def with_angles_near(shape: Shape, theta: FloatArray, angles_rad: FloatArray) ->
     return out
 
 
-def _turns(shape: Shape, theta: FloatArray) -> list[tuple[IntArray, IntArray, Turn]]:
+def _rows_columns_and_turns(shape: Shape, theta: FloatArray) -> list[tuple[IntArray, IntArray, SymmetryTurn]]:
     """List rows, columns and symmetry of each shape among the samples that has an angle."""
     if isinstance(shape, AnyOf):
         which = shape.shape_index(theta)
-        parts = zip(shape.shapes.values(), shape.prior.columns, strict=True)
+        parts = zip(shape.shapes.values(), shape.prior.columns_by_shape, strict=True)
         found = [(np.flatnonzero(which == k), columns, part) for k, (part, columns) in enumerate(parts)]
     else:
         found = [(np.arange(len(theta)), np.arange(theta.shape[1]), shape)]
-    return [(rows, columns, part.turn) for rows, columns, part in found if rows.size and isinstance(part, HasTurn)]
+    return [
+        (rows, columns, part.symmetry_turn)
+        for rows, columns, part in found
+        if rows.size and isinstance(part, HasSymmetryTurn)
+    ]

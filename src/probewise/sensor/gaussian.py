@@ -24,10 +24,10 @@ from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
     ImageRegion,
-    MixtureOfRegions,
     PolygonRegion,
     QuadrantRegion,
     RampRegion,
+    RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
 )
@@ -555,7 +555,7 @@ def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 @mean_albedo_under_one.register
-def _mean_albedo_over_mixed_regions(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_mixed_regions(region: RegionsOfMixedKinds, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo, (n_samples, n_points), of regions of several kinds: each by the rule for its kind."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows_and_regions():

@@ -9,7 +9,7 @@ from probewise.scene.regions.ellipse import EllipseRegion, disc_region
 from probewise.scene.regions.geometry import edge_distance, outlines
 from probewise.scene.regions.half_plane import HalfPlaneRegion
 from probewise.scene.regions.image import ImageRegion
-from probewise.scene.regions.mixture import MixtureOfRegions
+from probewise.scene.regions.mixed_kinds import RegionsOfMixedKinds
 from probewise.scene.regions.polygon import PolygonRegion
 from probewise.scene.regions.quadrant import QuadrantRegion
 from probewise.scene.regions.ramp import RampRegion
@@ -20,10 +20,10 @@ __all__ = [
     "EllipseRegion",
     "HalfPlaneRegion",
     "ImageRegion",
-    "MixtureOfRegions",
     "PolygonRegion",
     "QuadrantRegion",
     "RampRegion",
+    "RegionsOfMixedKinds",
     "StripesRegion",
     "UniformRegion",
     "disc_region",

@@ -57,8 +57,10 @@ class ImageRegion:
             right = np.maximum(left, np.minimum(middle_1 + half / steep, middle_2 + half / flat))
             bottom, top = centers_mm[:, 1] + low, centers_mm[:, 1] + high
             near, far = centers_mm[:, 0] + left, centers_mm[:, 0] + right
-            total += self._integral_to_lower_left(far, top) - self._integral_to_lower_left(near, top)
-            total -= self._integral_to_lower_left(far, bottom) - self._integral_to_lower_left(near, bottom)
+            total += self._albedo_integral_to_lower_left(far, top) - self._albedo_integral_to_lower_left(near, top)
+            total -= self._albedo_integral_to_lower_left(far, bottom) - self._albedo_integral_to_lower_left(
+                near, bottom
+            )
             area += (right - left) * (high - low)
         return (total / area)[None]
 
@@ -69,7 +71,7 @@ class ImageRegion:
         padded[1:, 1:] = self.values[::-1].cumsum(axis=0).cumsum(axis=1)
         return padded
 
-    def _integral_to_lower_left(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    def _albedo_integral_to_lower_left(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Return the integral of the albedo over the quadrant to the lower left, mm^2."""
         n_rows, n_columns = self.values.shape
         u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)

@@ -57,7 +57,7 @@ class PolygonRegion(RegionBatch):
         if vertices.ndim != 2 or len(vertices) < 3 or vertices.shape[1] != 2:
             raise ShapeError(f"vertices_mm has shape {vertices.shape}; allowed: (3 or more, 2)")
         edges = np.stack([vertices, np.roll(vertices, -1, axis=0)], axis=1)
-        return cls(_directed_pieces(edges)[None], inside, outside)
+        return cls(_even_odd_boundary_edges(edges)[None], inside, outside)
 
     even_odd = from_even_odd_vertices  # its earlier name
 
@@ -83,7 +83,7 @@ def _count_ray_crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArra
     return count
 
 
-def _directed_pieces(edges: FloatArray) -> FloatArray:
+def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
     """Split edges (n_edges, 2, 2) where they meet and keep the boundary of the even-odd inside."""
     size = float(np.ptp(edges.reshape(-1, 2), axis=0).max())
     if size == 0:

@@ -14,7 +14,7 @@ from probewise.scene.regions.geometry import edge_distance, outlines
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureOfRegions(RegionBatch):
+class RegionsOfMixedKinds(RegionBatch):
     """Regions whose kind may differ between hypotheses, as for a set of shapes.
 
     `which`, shape (n_regions,), is the index of each hypothesis' part; part k holds, in
@@ -53,7 +53,7 @@ class MixtureOfRegions(RegionBatch):
 
 
 @outlines.register
-def _outlines_of_mixture(region: MixtureOfRegions, *, n_vertices: int = 96) -> list[FloatArray]:
+def _outlines_of_mixed_kinds(region: RegionsOfMixedKinds, *, n_vertices: int = 96) -> list[FloatArray]:
     traces: list[FloatArray] = [np.empty((0, 2))] * region.n_regions
     for rows, part in region.rows_and_regions():
         for row, trace in zip(rows, outlines(part, n_vertices=n_vertices), strict=True):
@@ -62,7 +62,7 @@ def _outlines_of_mixture(region: MixtureOfRegions, *, n_vertices: int = 96) -> l
 
 
 @edge_distance.register
-def _edge_distance_of_mixture(region: MixtureOfRegions, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_mixed_kinds(region: RegionsOfMixedKinds, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     shape = (region.n_regions, max(x_mm.shape[1], y_mm.shape[1]))
     x_mm, y_mm = np.broadcast_to(x_mm, shape), np.broadcast_to(y_mm, shape)
     out = np.empty(shape)

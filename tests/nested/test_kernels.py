@@ -58,11 +58,11 @@ def test_the_move_leaves_the_uniform_distribution_above_a_bound(move):
     problem, rng = Crescent(), np.random.default_rng(4)
     evaluate, bound = Evaluator(problem), Bound(-1.0, 0.0)
     exact = evaluate(rng.random((60_000, 2)), rng)
-    exact = exact.take(bound.mask_above(exact.log_likelihood, exact.label))
-    live = exact.take(slice(0, 200))
+    exact = exact.take_rows(bound.mask_above(exact.log_likelihood, exact.label))
+    live = exact.take_rows(slice(0, 200))
     ends = []
     for _ in range(15):
-        start = live.take(rng.permutation(200)[:100])
+        start = live.take_rows(rng.permutation(200)[:100])
         new, tally = move.draw(start, bound, live.u, evaluate, rng)
         move = move.adapted(tally)
         assert bound.mask_above(new.log_likelihood, new.label).all()
@@ -106,7 +106,7 @@ def test_where_kernels_are_wasteful_chains_take_over():
     u = 0.5 + 0.35 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     live = evaluate(u, rng)
     bound = Bound(-1.0, 0.5)
-    new, tally = KernelMove().draw(live.take(slice(0, 50)), bound, live.u, evaluate, rng)
+    new, tally = KernelMove().draw(live.take_rows(slice(0, 50)), bound, live.u, evaluate, rng)
     assert bound.mask_above(new.log_likelihood, new.label).all()
     assert tally.n_evaluated > 50 * 16
     assert (new.u != live.u[:50]).any(axis=1).mean() > 0.9

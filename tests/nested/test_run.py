@@ -135,13 +135,13 @@ def test_slice_chains_leave_the_uniform_distribution_alone(
     evaluate = Evaluator(problems.Known(problems.box(2, 0, 1), function, 0.0))
     bound = Bound(1.0, 0.25)
     points = evaluate(rng.random((12_000, 2)), rng)
-    points = points.take(bound.mask_above(points.log_likelihood, points.label))
+    points = points.take_rows(bound.mask_above(points.log_likelihood, points.label))
     ends = []
     for k in range(10):
-        start = points.take(slice(300 * k, 300 * k + 300))
+        start = points.take_rows(slice(300 * k, 300 * k + 300))
         assert (len(find_clusters(start.u)) > 1) == clustered
         move = SliceMove(steps_per_param=1, differences=0.3)
-        live = start if starts_live else points.take(slice(3000 + 60 * k, 3060 + 60 * k))
+        live = start if starts_live else points.take_rows(slice(3000 + 60 * k, 3060 + 60 * k))
         part, tally = move.draw(start, bound, live.u, evaluate, rng)
         assert tally.n_stuck < 15
         ends.append(part)

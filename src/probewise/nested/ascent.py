@@ -65,8 +65,8 @@ def climb_to_top(
             break
         tried = centre + rng.standard_normal((n_draws, n_params)) @ root_of_covariance(covariance).T
         drawn = evaluate(tried[within_bounds_mask(evaluate.space, tried)], rng)
-        best = drawn.take(drawn.rows_by_rising_likelihood()[::-1][:n_best])
-        best = best.take(best.log_likelihood > known)
+        best = drawn.take_rows(drawn.rows_by_rising_likelihood()[::-1][:n_best])
+        best = best.take_rows(best.log_likelihood > known)
         if len(best) < _FEWEST_BEST:
             covariance = _BEST * covariance
             continue
@@ -74,7 +74,7 @@ def climb_to_top(
         covariance = (1 - _LEARNT) * covariance + _LEARNT * off.T @ off / len(best)
         centre = best.u.mean(axis=0)
         spread = float(np.ptp(best.log_likelihood))
-        highest = best.take(slice(1))
+        highest = best.take_rows(slice(1))
         met = max(met, highest, key=lambda one: float(one.log_likelihood[0]))
     # About a rounded top heights spread as the covariance.
     wider = _AS_DRAWN / spread if 0 < spread < _AS_DRAWN else 1.0
@@ -86,5 +86,5 @@ def gaussian_of_last_live_points(run: NestedResult, evaluate: Evaluator) -> Gaus
     last = slice(-run.n_live, None)
     live = evaluate.points_from_known_values(run.theta[last], run.log_likelihood[last], run.label[last])
     return GaussianAtPeak(
-        live.take(live.rows_by_rising_likelihood()[-1:]), live.u.mean(axis=0), covariance_root_of_points(live.u)
+        live.take_rows(live.rows_by_rising_likelihood()[-1:]), live.u.mean(axis=0), covariance_root_of_points(live.u)
     )

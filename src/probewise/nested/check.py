@@ -48,7 +48,7 @@ _LEAST_LIVE = 40
 _MATTERS = 0.25  # errors by which a lost mode raises log Z, above which the run is repeated
 
 
-class SingleRun(Protocol):
+class SingleRunFunction(Protocol):
     """A function that runs nested sampling once, without a check; it raises NotConvergedError as `run` does."""
 
     def __call__(
@@ -98,7 +98,7 @@ class _EvidenceRoute:
 class _CallBudget:
     """The evaluations that a check may use, those of the first run included: `limit` in all, `spent` so far."""
 
-    search: SingleRun
+    search: SingleRunFunction
     limit: float
     spent: int
     rng: np.random.Generator
@@ -163,7 +163,7 @@ def check_and_repeat(
     first: NestedResult,
     problem: Samplable,
     move: Move,
-    search: SingleRun,
+    search: SingleRunFunction,
     *,
     max_cost: float,
     max_calls: int | None,

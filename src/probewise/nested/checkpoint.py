@@ -46,7 +46,7 @@ class BirthRecords:
         """Return the records of `n` draws from the prior, numbered from 0."""
         return cls(np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
 
-    def take(self, rows: IntArray) -> BirthRecords:
+    def take_rows(self, rows: IntArray) -> BirthRecords:
         """Select rows."""
         return BirthRecords(*(getattr(self, f.name)[rows] for f in fields(self)))
 
@@ -114,7 +114,7 @@ def settings_of_run(
     ParameterError
         If the move is not a dataclass, which a checkpoint requires.
     """
-    _numeric_fields(move)
+    _numeric_fields_of_move(move)
     return {
         "names": list(names),
         "n_live": n_live,
@@ -182,7 +182,7 @@ class CheckpointFile:
         head = {
             "format": _FORMAT,
             "settings": self.settings,
-            "moving": _numeric_fields(now.moving),
+            "moving": _numeric_fields_of_move(now.moving),
             "log_volume": now.live.log_volume,
             "sizes": [len(d.points) for d in now.dead],
             "rng_state": now.rng_state,
@@ -307,7 +307,7 @@ def _run_state_from_file(head: dict[str, object], arrays: dict[str, np.ndarray],
     )
     plain = {name: head[name] for name in _PLAIN}
     plain["notes"] = tuple(plain["notes"])  # type: ignore[arg-type]
-    moving = _with_numeric_fields(move, head["moving"])
+    moving = _move_with_numeric_fields(move, head["moving"])
     return RunState(live, tuple(dead), moving, rng_state=_generator_state_with_arrays(head["rng_state"]), **plain)  # type: ignore[arg-type]
 
 
@@ -322,14 +322,14 @@ def _shortened_text(value: object) -> str:
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-def _numeric_fields(move: Move) -> dict[str, float]:
+def _numeric_fields_of_move(move: Move) -> dict[str, float]:
     """Return the numeric fields of a move, which hold what it has tuned."""
     if not is_dataclass(move):
         raise ParameterError("move", move, "a dataclass, whose numbers a checkpoint can keep")
     return {f.name: v for f in fields(move) if isinstance(v := getattr(move, f.name), int | float)}
 
 
-def _with_numeric_fields(move: Move, numbers: object) -> Move:
+def _move_with_numeric_fields(move: Move, numbers: object) -> Move:
     """Return a move with the tuned fields of the checkpoint; an error if it has no such fields."""
     if not is_dataclass(move) or not isinstance(numbers, dict):
         raise ValueError("the move cannot be restored")

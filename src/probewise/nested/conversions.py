@@ -30,7 +30,7 @@ def to_anesthetic(result: DeadPoints) -> Any:
         If anesthetic is not installed.
     """
     anesthetic = _import_optional("anesthetic")
-    death, birth = _levels_without_ties(result)
+    death, birth = _log_likelihoods_without_ties(result)
     return anesthetic.NestedSamples(
         data=np.array(result.theta), columns=list(result.names), logL=death, logL_birth=birth, label="probewise"
     )
@@ -80,7 +80,7 @@ def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.ra
     return arviz.from_dict(**groups, attrs=dict(attributes))
 
 
-def _levels_without_ties(result: DeadPoints) -> tuple[FloatArray, FloatArray]:
+def _log_likelihoods_without_ties(result: DeadPoints) -> tuple[FloatArray, FloatArray]:
     """Log likelihoods at death and birth, (n_dead,), with ties broken in the order of the labels."""
     order = np.lexsort((result.label, result.log_likelihood))
     strict = result.log_likelihood[order] + result.log_start

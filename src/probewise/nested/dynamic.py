@@ -164,7 +164,7 @@ def _draw_thread(
     log_volume = float(result.log_volume[first])
     begin = np.concatenate([rng.permutation(len(above)) for _ in range(math.ceil(n_live / len(above)))])[:n_live]
     now = move_at_volume(move, log_volume)
-    drawn, tally = now.draw(known.take(begin), bound, known.u, evaluate, rng)
+    drawn, tally = now.draw(known.take_rows(begin), bound, known.u, evaluate, rng)
     started = np.where(now is move, above[begin], -1)
     births = BirthRecords(
         np.full(n_live, bound.log_likelihood), np.full(n_live, bound.label), np.arange(n_live), np.full(n_live, -1)
@@ -185,7 +185,7 @@ def _draw_thread(
         ranks.append(gone.rank)
         counts.append(gone.n_ranked)
     order = live.points.rows_by_rising_likelihood()
-    dead.append((live.points.take(order), live.births.take(order)))
+    dead.append((live.points.take_rows(order), live.births.take_rows(order)))
     points, births = Points.join(*(points for points, _ in dead)), BirthRecords.join(*(born for _, born in dead))
     began = np.where(births.ident < n_live, started[np.minimum(births.ident, n_live - 1)], -1)
     return _Thread(points, births, began, np.concatenate(ranks), np.concatenate(counts))

@@ -47,11 +47,13 @@ class Points:
     def __len__(self) -> int:
         return len(self.u)
 
-    def take(self, rows: IntArray | BoolArray | slice) -> Points:
+    def take_rows(self, rows: IntArray | BoolArray | slice) -> Points:
         """Select rows."""
         return Points(
             self.u[rows], self.theta[rows], self.log_density[rows], self.log_likelihood[rows], self.label[rows]
         )
+
+    take = take_rows  # its earlier name
 
     def copy(self) -> Points:
         """Copy every array."""
@@ -63,11 +65,13 @@ class Points:
             self.label.copy(),
         )
 
-    def put(self, rows: IntArray | BoolArray, points: Points, which: IntArray) -> None:
+    def overwrite_rows(self, rows: IntArray | BoolArray, points: Points, which: IntArray) -> None:
         """Overwrite `rows` with the rows `which` of `points`."""
         self.u[rows], self.theta[rows] = points.u.take(which, axis=0), points.theta.take(which, axis=0)
         self.log_density[rows], self.label[rows] = points.log_density[which], points.label[which]
         self.log_likelihood[rows] = points.log_likelihood[which]
+
+    put = overwrite_rows  # its earlier name
 
     def rows_by_rising_likelihood(self) -> IntArray:
         """Return the row numbers from the least to the greatest log likelihood, ties by label, (n,)."""

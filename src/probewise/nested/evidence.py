@@ -68,7 +68,7 @@ def integrate(
         Log of the prior's share with a likelihood above zero, and its standard error.
     """
     log_x = log_volumes(n_at_death, log_start)
-    log_shell = _log_shells(np.concatenate([[log_start], log_x]))
+    log_shell = _log_shell_volumes(np.concatenate([[log_start], log_x]))
     # Relative to the best: volumes would vanish in the rounding of a log likelihood such as -1e100.
     best = float(log_likelihood.max())
     log_likelihood = log_likelihood - best
@@ -85,12 +85,12 @@ def integrate(
         n = min(size, _N_SIMULATIONS - first)
         shrink = -rng.standard_exponential((n, n_dead)) / n_at_death
         edges = np.concatenate([np.full((n, 1), log_start), log_start + np.cumsum(shrink, axis=1)], axis=1)
-        simulated[first : first + n] = logsumexp(_log_shells(edges) + log_likelihood, axis=1)
+        simulated[first : first + n] = logsumexp(_log_shell_volumes(edges) + log_likelihood, axis=1)
     spread = float(np.std(simulated, ddof=1))
     return Evidence(best + log_z, spread, log_start_error, information, log_weight, float(1.0 / (weight @ weight)))
 
 
-def _log_shells(log_edges: FloatArray) -> FloatArray:
+def _log_shell_volumes(log_edges: FloatArray) -> FloatArray:
     """Log of the volume between successive edges; the last shell reaches to zero volume."""
     before, after = log_edges[..., :-1], log_edges[..., 1:].copy()
     after[..., -1] = -np.inf

@@ -54,7 +54,7 @@ def find_higher_peaks(
     if top.met is not None:
         drawn = Points.join(drawn, top.met)
     for _ in range(_MOST_PEAKS):
-        best = drawn.take(drawn.rows_by_rising_likelihood()[-1:])
+        best = drawn.take_rows(drawn.rows_by_rising_likelihood()[-1:])
         if not len(best) or not best.log_likelihood[0] > known + _HIGHER:
             break
         peak = climb_to_top(

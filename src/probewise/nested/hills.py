@@ -90,7 +90,7 @@ def draw_uniformly_near_hilltop(top: GaussianAtPeak, evaluate: Evaluator, rng: n
     below = (n_params + 2) / 2
     move = SliceMove(hops=0)
     live = top.highest.u + rng.standard_normal((n, n_params)) @ top.root.T
-    starts = top.highest.take(np.zeros(n, dtype=np.int64))
+    starts = top.highest.take_rows(np.zeros(n, dtype=np.int64))
     highest, log_volume = top.highest_log_likelihood, -math.inf
     for _ in range(_ROUNDS):
         drawn, _ = move.draw(starts, Bound(highest - below, 1.0), live, evaluate, rng)
@@ -100,8 +100,8 @@ def draw_uniformly_near_hilltop(top: GaussianAtPeak, evaluate: Evaluator, rng: n
             break
         highest += rise
         live = drawn.u
-        starts = drawn.take((drawn.log_likelihood > highest - below).nonzero()[0])
-        starts = starts.take(rng.integers(len(starts), size=n))
+        starts = drawn.take_rows((drawn.log_likelihood > highest - below).nonzero()[0])
+        starts = starts.take_rows(rng.integers(len(starts), size=n))
     return drawn
 
 

@@ -54,7 +54,7 @@ class HoppingMove:
         rows = rows[dense]
         tried = evaluate.evaluate_mapped(u[rows], theta[dense], log_density[dense], rng)
         won = bound.mask_above(tried.log_likelihood, tried.label).nonzero()[0]
-        now.put(rows[won], tried, won)
+        now.overwrite_rows(rows[won], tried, won)
 
     def adapted(self, tally: Tally) -> HoppingMove:
         """Return the move with its chains adapted; see `SliceMove`."""

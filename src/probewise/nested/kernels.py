@@ -135,7 +135,7 @@ class KernelMove:
         where[inside] = np.arange(inside.size)
         moved = last.index >= 0
         ends = start.copy()
-        ends.put(moved, tried, where[last.index[moved]])
+        ends.overwrite_rows(moved, tried, where[last.index[moved]])
         tally = Tally(inside.size, last.n_accepted)
         if last.n_accepted * self.patience < n_tries:
             ends, more = self.otherwise.draw(ends, bound, live, evaluate, rng)

@@ -71,12 +71,12 @@ def peaks_climbed_from_early_points(
         return []
     chosen = apart[_rows_far_apart(start.u[apart] / scale, start.log_likelihood[apart])]
     roots = np.stack([covariance_root_of_points(u[row : row + _BLOCK]) for row in rows[chosen]])
-    now, scales = _climb_along_random_lines(start.take(chosen), roots, evaluate, rng)
+    now, scales = _climb_along_random_lines(start.take_rows(chosen), roots, evaluate, rng)
     # Of the evidence below a level a lost mode holds no more than its share of live points there.
     enough = first.log_likelihood[last] - _FROM_TOP * n_params
     high = np.flatnonzero(now.log_likelihood > enough)
-    high = high[separated_by_dip_mask(now.take(high), known, scale, _NEAREST, evaluate, rng)]
-    return [GaussianAtPeak(now.take(slice(k, k + 1)), now.u[k], scales[k] * roots[k]) for k in high]
+    high = high[separated_by_dip_mask(now.take_rows(high), known, scale, _NEAREST, evaluate, rng)]
+    return [GaussianAtPeak(now.take_rows(slice(k, k + 1)), now.u[k], scales[k] * roots[k]) for k in high]
 
 
 def _climb_along_random_lines(
@@ -100,7 +100,7 @@ def _climb_along_random_lines(
             inside = within_bounds_mask(space, u).nonzero()[0]
             tried = evaluate(u[inside], rng)
             higher = (tried.log_likelihood > now.log_likelihood[climbing[inside]]).nonzero()[0]
-            now.put(climbing[inside[higher]], tried, higher)
+            now.overwrite_rows(climbing[inside[higher]], tried, higher)
             ahead = t > 0
             high[climbing[ahead]], low[climbing[~ahead]] = t[ahead], t[~ahead]
             climbing = np.delete(climbing, inside[higher])
@@ -122,7 +122,7 @@ def separated_by_dip_mask(
     if not n:
         return np.zeros(0, dtype=bool)
     near = cKDTree(known.u / scale).query(points.u / scale, k=min(n_nearest, len(known)))[1].reshape(n, -1)
-    goal = known.take(near.ravel())
+    goal = known.take_rows(near.ravel())
     begin, begin_height = points.u.repeat(near.shape[1], axis=0), points.log_likelihood.repeat(near.shape[1])
     between = begin[:, None] + _ON_LINE[None, :, None] * (goal.u - begin)[:, None]
     height = evaluate(between.reshape(-1, n_params), rng).log_likelihood.reshape(len(goal), -1)

@@ -64,7 +64,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         record.log_likelihood, record.n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error
     )
     agreement = agreement_of(parts)
-    check = _joined_checks(parts, evidence.log_z, evidence.log_z_error(remembered))
+    check = _averaged_check(parts, evidence.log_z, evidence.log_z_error(remembered))
     p_value = combined_p_value([r.insertion_p_value for r in parts])
     error, doubts = _error_and_doubts(agreement, check, p_value, evidence.log_z, evidence.log_z_error(remembered))
     for doubt in doubts:
@@ -203,7 +203,7 @@ def n_alive_at_death(
 alive_at_death = n_alive_at_death  # its earlier name
 
 
-def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
+def _averaged_check(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
     """Average the runs' second estimates, weighted by their errors; None where a run has none."""
     checks = [r.check for r in parts if r.check is not None]
     if len(checks) < len(parts):

@@ -84,11 +84,11 @@ class PriorRejection:
         while found < wanted:
             batch = int(1.1 * (wanted - found) / self.volume) + 1
             tried = evaluate.draw_from_prior(batch, rng)
-            kept = tried.take(bound.mask_above(tried.log_likelihood, tried.label))
+            kept = tried.take_rows(bound.mask_above(tried.log_likelihood, tried.label))
             parts.append(kept)
             found += len(kept)
             n_evaluated += batch
-        return Points.join(*parts).take(slice(wanted)), Tally(n_evaluated, wanted)
+        return Points.join(*parts).take_rows(slice(wanted)), Tally(n_evaluated, wanted)
 
     def adapted(self, tally: Tally) -> PriorRejection:
         """Return itself: there is nothing to tune."""
@@ -177,7 +177,7 @@ class SliceMove:
         axis = _axis_numbers_in_random_order(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
-        metrics = _ClusterMetrics.from_clusters(clusters, start.u, home, live)
+        metrics = _ClusterCovariancesByChain.from_clusters(clusters, start.u, home, live)
         line = np.empty((n_chains, n_params))
         low, high, level = np.empty(n_chains), np.empty(n_chains), np.empty(n_chains)
         step = np.zeros(n_chains, dtype=np.int64)
@@ -187,7 +187,7 @@ class SliceMove:
         def begin_step(rows: IntArray) -> None:
             """Set up the next step's line, bracket and level."""
             at = step[rows]
-            kinds, measure = kind[rows, at], metrics.rows_of_metrics(rows, home[rows])
+            kinds, measure = kind[rows, at], metrics.covariance_row_of_each_chain(rows, home[rows])
             toward = np.zeros((rows.size, n_params))
             turned, along, follow = ((kinds == one).nonzero()[0] for one in (_FRAME, _AXIS, _DIFFERENCE))
             if turned.size:
@@ -263,7 +263,7 @@ class SliceMove:
             if won.size:
                 # A chain takes the first of its candidates above the bound.
                 taken, which = rows[won], won * n_ahead + n_needed[won] - 1
-                now.put(taken, tried, np.searchsorted(pending, which))
+                now.overwrite_rows(taken, tried, np.searchsorted(pending, which))
                 home[taken] = place[which]
                 moved[taken] = True
             n_tried += int(n_needed[~hop].sum())
@@ -342,10 +342,10 @@ def _axis_numbers_in_random_order(n_chains: int, n_steps: int, n_params: int, rn
 
 
 @dataclass(frozen=True, eq=False)
-class _ClusterMetrics:
-    """The clusters' metrics for each chain: its own cluster is computed without the chain's starting point.
+class _ClusterCovariancesByChain:
+    """The clusters' covariances for each chain: its own cluster is computed without the chain's starting point.
 
-    A metric that includes the start stretches the lines through it and shrinks the others; with
+    A covariance that includes the start stretches the lines through it and shrinks the others; with
     150 live points in 20 dimensions that alone raised log Z by more than one.
 
     The rows are the clusters, then each chain's version of its starting cluster: `each`, and for every axis the
@@ -360,8 +360,10 @@ class _ClusterMetrics:
     own_row: IntArray  # row of the start among the live points
 
     @classmethod
-    def from_clusters(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _ClusterMetrics:
-        """Compute the metrics for chains that start at `u`, (n_chains, n_params), in clusters `home`, (n_chains,)."""
+    def from_clusters(
+        cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray
+    ) -> _ClusterCovariancesByChain:
+        """Compute those of chains that start at `u`, (n_chains, n_params), in clusters `home`, (n_chains,)."""
         same = np.logical_and.reduce(
             [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]
         )
@@ -378,8 +380,8 @@ class _ClusterMetrics:
             np.argmax(same, axis=1),
         )
 
-    def rows_of_metrics(self, rows: IntArray, home: IntArray) -> IntArray:
-        """Return for chains `rows` the row of the metric of cluster `home`, their own cluster without their start."""
+    def covariance_row_of_each_chain(self, rows: IntArray, home: IntArray) -> IntArray:
+        """Return for chains `rows` the row of the covariance of cluster `home`; of their own, without their start."""
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
     def map_with_log_volume_ratio(
@@ -387,7 +389,7 @@ class _ClusterMetrics:
     ) -> tuple[FloatArray, FloatArray]:
         """Map points to their counterparts in other clusters; also return the log of the volume ratio."""
         return self.each.map_with_log_volume_ratio(
-            u, self.rows_of_metrics(rows, home), self.rows_of_metrics(rows, goal)
+            u, self.covariance_row_of_each_chain(rows, home), self.covariance_row_of_each_chain(rows, goal)
         )
 
 

@@ -160,7 +160,7 @@ def run_in_few_calls(
     original = replace(second, log_likelihood=second.log_likelihood - near.prior.log_prior_ratio(second.theta))
     report(evaluate.n_calls + second.n_calls)
     wanted = error if n_params <= _DENSE else max(error, _LEAST_ERROR)
-    found = _draw_until_error(
+    found = _draw_until_error_is_reached(
         explored, original, evaluate, space, wanted=wanted, max_calls=max_calls - second.n_calls, rng=rng
     )
     n_calls = evaluate.n_calls + second.n_calls
@@ -190,7 +190,7 @@ def _weighted_from_run(run: NestedResult, log_likelihood: FloatArray, n_calls: i
     )
 
 
-def _draw_until_error(
+def _draw_until_error_is_reached(
     explored: _WeightedDraws,
     second: NestedResult,
     evaluate: Evaluator,

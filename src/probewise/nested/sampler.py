@@ -82,9 +82,9 @@ def replace_worst_live_points(
     doomed, spared = order[:n_replaced], order[n_replaced:]
     last = doomed[-1]
     bound = Bound(float(live.points.log_likelihood[last]), float(live.points.label[last]))
-    survivors = live.points.take(spared)
+    survivors = live.points.take_rows(spared)
     begin = rng.permutation(len(spared))[:n_replaced]
-    start = survivors.take(begin)
+    start = survivors.take_rows(begin)
     new, tally = move.draw(start, bound, survivors.u, evaluate, rng)
     points = Points.join(survivors, new)
     place = np.empty(n_live, dtype=np.int64)
@@ -93,8 +93,8 @@ def replace_worst_live_points(
     n_ranked = len(spared) + np.arange(n_replaced)
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
     n_at_death = n_live - np.arange(n_replaced)
-    dead = DeadPointsOfRound(live.points.take(doomed), live.births.take(doomed), n_at_death, rank, n_ranked)
-    known = live.births.take(spared)
+    dead = DeadPointsOfRound(live.points.take_rows(doomed), live.births.take_rows(doomed), n_at_death, rank, n_ranked)
+    known = live.births.take_rows(spared)
     fresh = BirthRecords(
         np.full(n_replaced, bound.log_likelihood),
         np.full(n_replaced, bound.label),
@@ -146,7 +146,7 @@ def run_once(
     rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(generator_state_as_json(rng.bit_generator.state))
     if n_params == 0:
-        return _result_without_parameters(evaluate, n_live, seed_state)
+        return _result_of_problem_without_parameters(evaluate, n_live, seed_state)
     moving: Move = SliceMove() if move is None else move
     keeper = None
     if checkpoint is not None:
@@ -334,7 +334,7 @@ def _initial_run_state(
             drawn += int(possible[-1]) + 1
         else:
             drawn += batch
-        parts.append(tried.take(possible))
+        parts.append(tried.take_rows(possible))
         found += possible.size
     points = Points.join(*parts)
     if found == 0:
@@ -346,7 +346,7 @@ def _initial_run_state(
     log_volume, error = math.log(found / drawn), math.sqrt((1.0 - found / drawn) / found)
     if found < n_live:
         bound = Bound(-math.inf, 1.0)
-        start = points.take(rng.integers(found, size=n_live - found))
+        start = points.take_rows(rng.integers(found, size=n_live - found))
         cloud = points.u if found > n_params else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
         more, _ = move.draw(start, bound, cloud, evaluate, rng)
         points = Points.join(points, more)
@@ -369,14 +369,14 @@ def _final_result(
     if now.n_stuck > _STUCK_SHARE * n_dead:
         notes = (*notes, f"{now.n_stuck} of {n_dead} chains could not leave their start")
     order = live.points.rows_by_rising_likelihood()
-    parts = [*(d.points for d in dead), live.points.take(order)]
+    parts = [*(d.points for d in dead), live.points.take_rows(order)]
     theta = np.concatenate([part.theta for part in parts])
     log_likelihood, label = (np.concatenate([getattr(p, name) for p in parts]) for name in ("log_likelihood", "label"))
     n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(n_live, 0, -1)])
     evidence = integrate(
         log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )
-    births = BirthRecords.join(*(d.births for d in dead), live.births.take(order))
+    births = BirthRecords.join(*(d.births for d in dead), live.births.take_rows(order))
     parent = np.where(births.parent >= 0, np.argsort(births.ident)[births.parent], -1)
     born = birth_rows(log_likelihood, label, births.log_birth, births.birth_label)
     remembered = relative_lineage_variance(parent, born, n_at_death, evidence.log_weight)
@@ -424,7 +424,7 @@ def _final_result(
     )
 
 
-def _result_without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> NestedResult:
+def _result_of_problem_without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> NestedResult:
     """Evaluate the single hypothesis of a problem without free parameters."""
     theta = np.empty((1, 0))
     log_likelihood = evaluate.log_likelihood(theta)

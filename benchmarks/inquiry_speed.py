@@ -30,7 +30,7 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.experiment import ArmReachAndTravel, Experiment, Step, explore
-from probewise.experiment.acquisition import predict_and_rate_readings
+from probewise.experiment.acquisition import predict_readings_and_utilities
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.particles import Particles, update
 from probewise.inquiry import Grid
@@ -70,7 +70,7 @@ def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str
         rng = np.random.default_rng([run, number])
         scratch = partial(nested_sampling_from_scratch, problem, N_LIVE, rng)
         drawn = after.posterior.samples(experiment.n_samples, rng=rng)
-        ask = partial(predict_and_rate_readings, experiment, after.posterior, drawn, field, at=after.reading)
+        ask = partial(predict_readings_and_utilities, experiment, after.posterior, drawn, field, at=after.reading)
         before_it = Particles(before.posterior, np.arange(len(before.posterior.theta)), 0.0)
         infer = partial(update, before_it, problem, rng=rng, fall_back=scratch)
         row = {"map_s": seconds(ask), "inference_s": seconds(infer)}

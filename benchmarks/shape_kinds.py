@@ -60,7 +60,7 @@ def follow(number: int) -> dict:
     """Run once, and weigh the kinds again at some readings."""
     field = Field()
     experiment = experiment_of(field)
-    streams = RandomStreams.of(np.random.default_rng(number))
+    streams = RandomStreams.spawned_from(np.random.default_rng(number))
     hidden = HiddenShape.given_or_drawn(None, possible_shapes_by_name(experiment.shape), field, rng=streams.truth)
     spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.2)])
     world = World(spot, black=10.0, white=60.0, noise_sd=1.0)

@@ -311,8 +311,8 @@ def explore(
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     require_sensor(sensor, "in the order explore(sensor, ...)")
     require_flag("learn_sensor", learn_sensor)
-    lies = posing.shape_of(shape, field)
-    streams, hidden = posing.RandomStreams.of(rng), None
+    lies = posing.as_shape(shape, field)
+    streams, hidden = posing.RandomStreams.spawned_from(rng), None
     naive = _naive_levels(sensor, levels, method=method, model=model, has_arm=arm is not None, rng=streams.levels)
     asked = posing.experiment_from_names(
         sensor,

@@ -197,11 +197,11 @@ def test_an_arm_of_ones_own_is_entered_measured_with_and_left(sensor):
     ],
 )
 def test_what_is_hidden_is_the_truth_that_was_given(shape, truth, name, theta):
-    from probewise.experiment import HiddenShape, possible_shapes_by_name, shape_of
+    from probewise.experiment import HiddenShape, as_shape, possible_shapes_by_name
 
     field = Field()
     hidden = HiddenShape.given_or_drawn(
-        truth, possible_shapes_by_name(shape_of(shape, field)), field, rng=np.random.default_rng(0)
+        truth, possible_shapes_by_name(as_shape(shape, field)), field, rng=np.random.default_rng(0)
     )
     assert (hidden.name, hidden.theta.tolist()) == (name, theta)
 

@@ -43,7 +43,7 @@ def with_arm_error(exploration, geometry):
     last = exploration.last
     of = (exploration.experiment, FittedArm(geometry, LEVELS), exploration.readings, last.posterior)
     moments = {name: getattr(last, name) for name in ("mean", "sd", "likely_shape")}
-    error = arm_error_in_posterior(*of, last.kinds.with_warier_odds, **moments, rng=np.random.default_rng(1))
+    error = arm_error_in_posterior(*of, last.kinds.with_raised_fault_odds, **moments, rng=np.random.default_rng(1))
     return dataclasses.replace(exploration, steps=(*exploration.steps[:-1], dataclasses.replace(last, arm_error=error)))
 
 

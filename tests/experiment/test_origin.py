@@ -4,7 +4,7 @@ import numpy as np
 
 from probewise.calibration import FittedSensor
 from probewise.effects import Origin
-from probewise.experiment.simulation import chain_of
+from probewise.experiment.simulation import sensor_chain_at_means
 from probewise.recordings import Instrumentation
 from probewise.scene import KnownScene
 from probewise.sensor import SSFField, mixture_names
@@ -23,5 +23,5 @@ def test_effects_of_a_sensor_from_far_away_count_from_0_in_a_run():
         origins={"gain_drift": Origin(time_s=1.7e9)},
     )
     (kept,) = sensor.effects_on_new_scans
-    (of_run,) = chain_of(sensor, KnownScene({})).effects
+    (of_run,) = sensor_chain_at_means(sensor, KnownScene({})).effects
     assert (kept.origin, of_run.effect.origin) == (Origin(time_s=1.7e9), Origin())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.arm import Pose, Reading
-from probewise.experiment.pace import EACH_S, EffectInRunTime, Pace
+from probewise.experiment.pace import EACH_S, EffectInPacedTime, Pace
 from probewise.experiment.rivals import GainLoss, rivals_of
 from probewise.study import experiment_of
 from probewise.study.rows import REFERENCE
@@ -27,7 +27,7 @@ def test_a_fast_instrument_drifts_over_as_many_readings_as_a_slow_one(name):
     experiment = replace(experiment_of(REFERENCE), trust=0.9)
     slow, fast = (experiment.problem(readings(*clock)).recording.plan for clock in ((8.0,), (0.02, 1.7e9)))
     for effect in rivals(name):
-        assert isinstance(effect, EffectInRunTime)
+        assert isinstance(effect, EffectInPacedTime)
         theta = effect.prior.from_unit_cube(np.random.default_rng(1).random((20, len(effect.prior.names))))
         value = np.tile(np.linspace(10.0, 60.0, 8), (20, 1))
         np.testing.assert_allclose(effect.apply(value, theta, fast), effect.apply(value, theta, slow), rtol=1e-4)

@@ -14,7 +14,7 @@ from probewise.experiment.evidence import bridged_evidence, posterior_sampled_ab
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.particles import (
     Particles,
-    _LastReading,
+    _LastReadingEvaluator,
     _move_by_metropolis,
     _partition_rows,
     prior_particles,
@@ -263,7 +263,7 @@ def test_copies_of_one_sample_are_not_moved(small):
     """They are left where they are, and the posterior is marked as strained."""
     problem = small.experiment().problem([Reading(40.0, Pose(50.0, 30.0, 0.0), 1.0)])
     theta = np.repeat(problem.prior.from_unit_cube(np.full((1, len(problem.prior.names)), 0.5)), 60, axis=0)
-    cloud = _LastReading(problem).evaluate_samples(theta)
-    moved, moves = _move_by_metropolis(cloud, 1.0, _LastReading(problem), np.random.default_rng(1))
+    cloud = _LastReadingEvaluator(problem).evaluate_samples(theta)
+    moved, moves = _move_by_metropolis(cloud, 1.0, _LastReadingEvaluator(problem), np.random.default_rng(1))
     assert moves.accepted == 0.0
     np.testing.assert_array_equal(moved.theta, theta)

@@ -29,15 +29,20 @@ from probewise.experiment import (
     sampled_anew,
     step,
 )
-from probewise.experiment.acquisition import ArmReachAndTravel, predict_and_rate_readings
+from probewise.experiment.acquisition import ArmReachAndTravel, predict_readings_and_utilities
 from probewise.experiment.arm_error import arm_error_in_posterior
-from probewise.experiment.checking import ENOUGH_BITS, NAMES, OutlineGaps, bits_about_left_out
+from probewise.experiment.checking import (
+    ENOUGH_BITS,
+    NAMES,
+    OutlineReadingDistances,
+    expected_bits_about_left_out_effect,
+)
 from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.noise_rivals import (
+    CoarserRoundingLikelihood,
     CorrelatedLikelihood,
     FlickerLikelihood,
-    LatticeLikelihood,
     LostReadingLikelihood,
     OutlierLikelihood,
     SignalDependentLikelihood,
@@ -146,7 +151,7 @@ def test_laws_of_the_residual_alone_are_densities(law):
     assert np.trapezoid(density, level) == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("law", laws(LostReadingLikelihood, SignalDependentLikelihood, LatticeLikelihood))
+@pytest.mark.parametrize("law", laws(LostReadingLikelihood, SignalDependentLikelihood, CoarserRoundingLikelihood))
 def test_laws_of_the_noise_are_densities(law):
     """The density of one reading over all readings is one."""
 
@@ -158,7 +163,7 @@ def test_laws_of_the_noise_are_densities(law):
     assert total == pytest.approx(1.0, abs=0.01)
 
 
-NOISE_ON_A_SCALE = DeclaredNoise.of(Rounded(sd=2.0, step=1.0, low=4.0, high=36.0))
+NOISE_ON_A_SCALE = DeclaredNoise.from_likelihood(Rounded(sd=2.0, step=1.0, low=4.0, high=36.0))
 
 
 @pytest.mark.parametrize(
@@ -181,9 +186,9 @@ def test_readings_at_an_end_of_the_scale_cover_everything_beyond(law):
 def test_readings_at_an_end_of_the_scale_show_no_lattice():
     """A bright field reads 100 again and again: as likely under coarser rounding as without it."""
     plain = Rounded(sd=1.0, step=1.0, low=0.0, high=100.0)
-    noise = DeclaredNoise.of(plain)
+    noise = DeclaredNoise.from_likelihood(plain)
     readings, level = np.full(6, 100.0), np.full((1, 6), 101.0)
-    assert LatticeLikelihood(noise).log_prob(readings, level)[0] == pytest.approx(
+    assert CoarserRoundingLikelihood(noise).log_prob(readings, level)[0] == pytest.approx(
         plain.log_prob(readings, level)[0], abs=1e-3
     )
 
@@ -259,7 +264,7 @@ def test_a_reading_tells_names_by_what_they_predict():
     alike = np.tile(20.0 + 3.0 * even, 2)
     apart = np.concatenate([20.0 + 3.0 * even, 90.0 + 3.0 * even])
     near = np.concatenate([20.0 + 0.5 * even, 23.0 + 2.0 * even])
-    bits = bits_about_left_out(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
+    bits = expected_bits_about_left_out_effect(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
     at = np.linspace(-20.0, 60.0, 20_001)
     given = [norm.pdf(at, mean, math.hypot(sd, 1.0)) for mean, sd in ((20.0, 0.5), (23.0, 2.0))]
     both = 0.5 * (given[0] + given[1])
@@ -275,7 +280,7 @@ def test_a_few_stragglers_of_a_name_promise_nothing():
     even = 20.0 + 0.5 * norm.ppf((np.arange(n) + 0.5) / n)
     weight, names = np.full(2 * n, 0.5 / n), np.repeat(["", "halo"], n)
     straggling = np.concatenate([even, np.append(even[:-1], 60.0)])
-    bits = bits_about_left_out(weight, straggling[:, None], names, Readout(1.0))
+    bits = expected_bits_about_left_out_effect(weight, straggling[:, None], names, Readout(1.0))
     at = np.linspace(0.0, 80.0, 20_001)
     given = [norm.pdf(at[:, None], own, 1.0).mean(axis=1) for own in np.split(straggling, 2)]
     both = np.maximum(0.5 * (given[0] + given[1]), 1e-300)
@@ -305,7 +310,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
         named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
         return arm_error_in_posterior(*of, **named, rng=np.random.default_rng(1)).slopes
 
-    np.testing.assert_allclose(last.arm.slopes, slopes(last.kinds.with_warier_odds))
+    np.testing.assert_allclose(last.arm.slopes, slopes(last.kinds.with_raised_fault_odds))
     assert not np.allclose(last.arm.slopes, slopes(last.kinds))
 
 
@@ -320,8 +325,8 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
         field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
-    utility_input, _ = predict_and_rate_readings(doubting, joined, joined.theta[:20], field, at=inside)
-    outline = OutlineGaps.from_region(
+    utility_input, _ = predict_readings_and_utilities(doubting, joined, joined.theta[:20], field, at=inside)
+    outline = OutlineReadingDistances.from_region(
         utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge)
     )
     assert outline is not None
@@ -438,7 +443,7 @@ def test_a_memory_of_the_noise_is_heard():
 
 
 def test_readings_on_a_lattice_are_no_chance():
-    law, level = LatticeLikelihood(DeclaredNoise(1.0, 0.0)), np.full((1, 8), 35.0)
+    law, level = CoarserRoundingLikelihood(DeclaredNoise(1.0, 0.0)), np.full((1, 8), 35.0)
     level[0, 4:] = 12.0
     plain = experiment_of(REFERENCE).likelihood
     coarse = np.array([35.0, 35.0, 40.0, 30.0, 10.0, 15.0, 10.0, 10.0])
@@ -451,7 +456,7 @@ def test_readings_on_a_lattice_are_no_chance():
 def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
     """Before a shape is seen all is black: readings of 10.0 and 5.0 are no lost ones, and places without a shape."""
     readings, level = np.array(read), np.full((1, len(read)), 9.0)
-    rounded, lost = LatticeLikelihood(DeclaredNoise(1.0, 0.0)), laws(LostReadingLikelihood)[0]
+    rounded, lost = CoarserRoundingLikelihood(DeclaredNoise(1.0, 0.0)), laws(LostReadingLikelihood)[0]
     assert rounded.log_prob(readings, level)[0] > lost.log_prob(readings, level)[0] + 2.0
     shared = np.array([10.0, 9.31, 10.72, 8.4, 10.0])  # two were lost, the others were read
     level = np.full((1, 5), 9.6)
@@ -459,7 +464,7 @@ def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
 
 
 def test_readings_that_are_rounded_as_declared_recur_by_nature():
-    law, level = LatticeLikelihood(DeclaredNoise(0.6, 1.0)), np.full((1, 6), 10.2)
+    law, level = CoarserRoundingLikelihood(DeclaredNoise(0.6, 1.0)), np.full((1, 6), 10.2)
     plain = Rounded(sd=0.6, step=1.0, low=1.0, high=100.0)
     for read in ([10.0] * 6, [10.0, 11.0, 10.0, 10.0, 11.0, 10.0]):
         assert law.log_prob(np.array(read), level)[0] == pytest.approx(

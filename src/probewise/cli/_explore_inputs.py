@@ -65,7 +65,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> ExploreInputs:
     sensor = read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
-    streams = posing.RandomStreams.of(np.random.default_rng(arguments.seed))
+    streams = posing.RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
     shape = posing.shape_named(arguments.shape, field)
     orientations_rad, heights_mm, repeats = _checked_setting_choices(arguments, geometry)
     cards = parse_cards(arguments.reference, field)

@@ -16,7 +16,7 @@ from probewise.experiment.journal import (
     recording_of,
     require_same_settings,
 )
-from probewise.experiment.left_out import CLEAN, LeftOut, left_out_after_step, repaired_sensor
+from probewise.experiment.left_out import CLEAN, LeftOutEffects, left_out_after_step, repaired_sensor
 from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
 from probewise.experiment.method import Method, SequentialMonteCarlo
@@ -34,12 +34,12 @@ from probewise.experiment.simulation import (
     Model,
     RandomStreams,
     arm_over,
+    as_shape,
     default_trust,
     experiment_for,
     scale_of,
     sensor_entry,
     shape_named,
-    shape_of,
     surface_of,
     with_cards,
     world_like,
@@ -66,7 +66,7 @@ __all__ = [
     "HiddenShape",
     "Journal",
     "JournalWriter",
-    "LeftOut",
+    "LeftOutEffects",
     "Method",
     "MethodName",
     "Model",
@@ -79,6 +79,7 @@ __all__ = [
     "Step",
     "Truth",
     "arm_over",
+    "as_shape",
     "begin",
     "default_trust",
     "experiment_for",
@@ -105,7 +106,6 @@ __all__ = [
     "sensor_prior",
     "shadow_run",
     "shape_named",
-    "shape_of",
     "step",
     "student_t_likelihood",
     "surface_of",
@@ -167,3 +167,9 @@ Change = SensorChangeSds
 
 chance_off = probability_of_length_off
 """The old name of `probability_of_length_off`."""
+
+LeftOut = LeftOutEffects
+"""The old name of `LeftOutEffects`."""
+
+shape_of = as_shape
+"""The old name of `as_shape`."""

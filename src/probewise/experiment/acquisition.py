@@ -45,7 +45,7 @@ class ArmReachAndTravel:
     """The old names of `from_instrument`."""
 
 
-def predict_and_rate_readings(
+def predict_readings_and_utilities(
     experiment: Experiment,
     posterior: Weighted,
     drawn: FloatArray,

@@ -34,7 +34,7 @@ _FAR = 0.75  # of the shape's diameter: two opposite readings at the edge of a c
 _AT_EDGE = 1.0  # spacings of the grid within which a reading is at the edge
 
 
-def bits_about_left_out(
+def expected_bits_about_left_out_effect(
     weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout
 ) -> FloatArray:
     """Return the expected information of a reading about the name of what is left out: the smaller of two estimates.
@@ -57,11 +57,13 @@ def bits_about_left_out(
     Bits, (n_designs,).
     """
     each = [names == name for name in np.unique(names)]
-    by_gaussians = _bits_by_gaussians(weight, answers, each, readout.noise_sd)
-    return np.asarray(np.maximum(np.minimum(by_gaussians, _bits_by_cells(weight, answers, each, readout)), 0.0))
+    by_gaussians = _expected_bits_by_gaussians(weight, answers, each, readout.noise_sd)
+    return np.asarray(
+        np.maximum(np.minimum(by_gaussians, _expected_bits_by_cells(weight, answers, each, readout)), 0.0)
+    )
 
 
-def _bits_by_gaussians(
+def _expected_bits_by_gaussians(
     weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], noise_sd: float
 ) -> FloatArray:
     """Return bits about the name, (n_designs,), if the predictions of each name are Gaussian.
@@ -89,7 +91,9 @@ def _bits_by_gaussians(
     return np.asarray(told / math.log(2.0))
 
 
-def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout) -> FloatArray:
+def _expected_bits_by_cells(
+    weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout
+) -> FloatArray:
     """Return bits about the name, (n_designs,): entropy of the reading's cell minus its mean entropy given the name."""
     given = WeightsGivenReading(answers, weight, readout, fine=_CELL)
     told = entropy_bits(given.weight_by_cell)
@@ -100,7 +104,7 @@ def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolA
 
 
 @dataclass(frozen=True, eq=False)
-class OutlineGaps:
+class OutlineReadingDistances:
     """The part of a probable shape's outline within reach, and its distances from the readings taken near it.
 
     Attributes

@@ -268,7 +268,7 @@ class Experiment:
         """Return the inference problem for these readings."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
         if self.trust < 1:
-            recording = Pace.from_readings(readings).recording_with_run_time(recording)
+            recording = Pace.from_readings(readings).recording_with_paced_time(recording)
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
     @cached_property

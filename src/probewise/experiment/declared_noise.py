@@ -28,7 +28,7 @@ class DeclaredNoise:
     ends: ScaleEnds | None = None
 
     @classmethod
-    def of(cls, likelihood: Likelihood) -> Self | None:
+    def from_likelihood(cls, likelihood: Likelihood) -> Self | None:
         """Return the noise of a likelihood with one known sd; None for any other."""
         if isinstance(likelihood, Rounded):
             return cls(likelihood.sd, likelihood.step, likelihood.ends)
@@ -36,7 +36,7 @@ class DeclaredNoise:
             return cls(float(np.asarray(likelihood.sd)))
         return None
 
-    def is_inside(self, readings: FloatArray) -> BoolArray:
+    def inside_scale_mask(self, readings: FloatArray) -> BoolArray:
         """Return which readings, (n_points,), lie between the ends of the scale."""
         if self.ends is None:
             return np.ones(len(readings), dtype=np.bool_)
@@ -56,9 +56,11 @@ class DeclaredNoise:
         """
         sd, step = self.sd if sd is None else sd, self.step if step is None else step
         if not step:
-            return self._with_ends(readings, predicted, sd, log_gaussian_density(readings, predicted, sd))
+            return self._with_probability_beyond_ends(
+                readings, predicted, sd, log_gaussian_density(readings, predicted, sd)
+            )
         within = log_rounding_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
-        return self._with_ends(readings, predicted, sd, within)
+        return self._with_probability_beyond_ends(readings, predicted, sd, within)
 
     def quick_log_density(self, readings: FloatArray, predicted: FloatArray, *, sd: float) -> FloatArray:
         """Return the same as `log_density`, faster if the noise is wider than the rounding cell.
@@ -68,22 +70,28 @@ class DeclaredNoise:
         if sd < self.step:
             return self.log_density(readings, predicted, sd=sd)
         within = log_gaussian_density(readings, predicted, math.hypot(sd, self.step / math.sqrt(12.0)))
-        return self._with_ends(readings, predicted, sd, within + (math.log(self.step) if self.step else 0.0))
+        return self._with_probability_beyond_ends(
+            readings, predicted, sd, within + (math.log(self.step) if self.step else 0.0)
+        )
 
     def log_uniform_density(self, readings: FloatArray, low: float, high: float) -> FloatArray:
         """Return the log density of readings, (n_points,), that are uniform from `low` to `high`; -inf beyond."""
         width = np.full(len(readings), self.step or 1.0)
         if self.ends is not None:
-            width = np.where(self.ends.lowest_reading_mask(readings), self.ends.lowest_cell + 0.5 * self.step - low, width)
-            width = np.where(self.ends.highest_reading_mask(readings), high - self.ends.highest_cell + 0.5 * self.step, width)
+            width = np.where(
+                self.ends.lowest_reading_mask(readings), self.ends.lowest_cell + 0.5 * self.step - low, width
+            )
+            width = np.where(
+                self.ends.highest_reading_mask(readings), high - self.ends.highest_cell + 0.5 * self.step, width
+            )
         possible = (readings >= low) & (readings <= high) & (width > 0)
         return np.log(np.where(possible, width, 1.0) / (high - low)) + np.where(possible, 0.0, -np.inf)
 
-    def _with_ends(
+    def _with_probability_beyond_ends(
         self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, within: FloatArray
     ) -> FloatArray:
         """Replace the log densities of readings at an end of the scale by the log probability of all beyond it."""
-        inside = self.is_inside(readings)
+        inside = self.inside_scale_mask(readings)
         if self.ends is None or inside.all():
             return within
         return np.where(inside, within, self.ends.log_prob_at_ends(readings, predicted, sd))

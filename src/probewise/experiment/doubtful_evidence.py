@@ -16,7 +16,7 @@ from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import bridged_evidence
 from probewise.experiment.particles import Particles, particles_from_posterior
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.sampled_anew import FromScratch, independent_start_with_evidence, samples_from_run
+from probewise.experiment.sampled_anew import SolverFromScratch, samples_from_run, with_new_evidence_and_lineages
 from probewise.inference.problem import SensorProblem
 
 HAS_A_SAY = 0.02  # probability of a kind in doubt that is solved from scratch; before a run ends, of every kind
@@ -27,11 +27,11 @@ _DRAWS = 1000
 _LOST = 0.01  # probability of a kind that must not be missed
 
 
-def reestimated_where_doubtful(
+def with_doubtful_evidences_reestimated(
     now: Posterior,
     problems: list[SensorProblem],
     n: int,
-    from_scratch: FromScratch,
+    from_scratch: SolverFromScratch,
     rng: np.random.Generator,
     *,
     most_off: float,
@@ -72,21 +72,21 @@ def _kind_with_most_doubtful_evidence(now: Posterior, settled: set[int], most_of
 
 
 def _reestimate_kind(
-    particles: Particles, problem: SensorProblem, n: int, from_scratch: FromScratch, rng: np.random.Generator
+    particles: Particles, problem: SensorProblem, n: int, from_scratch: SolverFromScratch, rng: np.random.Generator
 ) -> Particles:
     """Re-estimate a kind's evidence from all readings, and its samples too if they may be incomplete."""
     had = particles.weighted
     if not particles.strained:
         found = bridged_evidence(had, problem, rng=rng, n_draws=n)
         if abs(found.log_z - had.log_z) < TOLD_APART:
-            return independent_start_with_evidence(particles, found)
+            return with_new_evidence_and_lineages(particles, found)
     try:
         run = from_scratch(problem)
     except NotConvergedError:  # no hypothesis of this kind could have given the readings
         return replace(particles, weighted=replace(had, log_z=-math.inf, log_z_error=math.inf), strained=False)
     drawn = samples_from_run(run, had, problem, n, rng, with_own=particles.log_z > -math.inf)
     fresh = particles_from_posterior(drawn, n, problem, rng=rng)
-    fresh = independent_start_with_evidence(fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=n))
+    fresh = with_new_evidence_and_lineages(fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=n))
     return replace(fresh, weighted=replace(fresh.weighted, run=run), refitted=True)
 
 
@@ -94,7 +94,7 @@ def with_bridged_evidence(particles: Particles, problem: SensorProblem, rng: np.
     """Re-estimate the evidence of hurried samples by bridge sampling; the moved samples themselves are valid."""
     found = bridged_evidence(particles.weighted, problem, rng=rng, n_draws=min(2 * len(particles.ancestor), _DRAWS))
     return (
-        replace(independent_start_with_evidence(particles, found), strained=particles.strained)
+        replace(with_new_evidence_and_lineages(particles, found), strained=particles.strained)
         if math.isfinite(found.log_z)
         else particles
     )

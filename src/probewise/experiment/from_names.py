@@ -8,7 +8,7 @@ from probewise.calibration import FittedSensor
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.paper import paper_experiment
-from probewise.experiment.simulation import Model, bin_width_of, default_trust, experiment_for
+from probewise.experiment.simulation import Model, default_trust, entropy_bin_width_of, experiment_for
 from probewise.inference import Naive
 from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
 from probewise.nested import NestedStop
@@ -54,7 +54,7 @@ def experiment_from_names(
     ParameterError
         If an option does not go with the method.
     """
-    bin_width = bin_width_of(sensor)
+    bin_width = entropy_bin_width_of(sensor)
     chosen = utility_named(utility, bin_width=bin_width) if isinstance(utility, str) else utility
     if method == "paper":
         refused = (

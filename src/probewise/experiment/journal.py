@@ -173,7 +173,7 @@ def read_journal(path: str | Path) -> Journal:
     notes: list[str] = []
     n_torn = 0
     if tail:
-        head = _part_up_to_reading(tail)
+        head = _line_without_summary(tail)
         saved = _parse_entry_without_summary(path, head, len(entries) + 1)
         if saved is None:
             head = b""
@@ -192,7 +192,7 @@ def _parse_line(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
     return value
 
 
-def _part_up_to_reading(tail: bytes) -> bytes:
+def _line_without_summary(tail: bytes) -> bytes:
     """Return an incomplete line without the posterior summary, of which a part may be written."""
     mark = _SUMMARY_KEY.encode()
     head = tail.split(mark)[0]

@@ -95,7 +95,7 @@ def kinds_of(
     for part in _member_shapes(shape, sensor_prior, prior):
         own, log_prior = part.prior, math.log(part.share)
         plain = log_prior + math.log(trust)
-        whole, model = _add_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
+        whole, model = _prior_and_model_with_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
         kinds.append(
             HypothesisKind(
                 part.label, "", plain, whole, part.restrict_model(model), likelihood, part.to_whole_theta, prior.names
@@ -130,7 +130,9 @@ def kinds_of(
     return tuple(kinds)
 
 
-def _add_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior, SensorModel]:
+def _prior_and_model_with_estimated_effects(
+    own: Prior, chain: SensorModel, quick: SensorModel
+) -> tuple[Prior, SensorModel]:
     """Return prior and model with the parameters of effects that a repair estimated; unchanged if there are none."""
     estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
     if not estimated or not isinstance(chain, Chain):

@@ -26,7 +26,7 @@ _ALIASES = (
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeftOutEffects:
     """Probability of each effect by name, most probable first, and a sentence.
 
     `wary` holds the same probabilities with the odds of every effect multiplied by `posterior.WARY`. `leading` is the
@@ -60,19 +60,19 @@ class LeftOut:
         return {"hypotheses": hypotheses, "credible_set": list(self.credible_set), "sentence": self.sentence}
 
 
-def left_out_after_step(last: Step, trust: float) -> LeftOut:
+def left_out_after_step(last: Step, trust: float) -> LeftOutEffects:
     """Summarise the probabilities of left-out effects after a step, in a run with this prior trust in its sensor."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     probability = {name: p for p, name in shares}
-    wary = {name or CLEAN: p for name, p in last.kinds.with_warier_odds.left_out.items()}
+    wary = {name or CLEAN: p for name, p in last.kinds.with_raised_fault_odds.left_out.items()}
     if trust == 1:
-        return LeftOut(probability, wary, "The sensor model was taken for complete, as it was told to be.")
+        return LeftOutEffects(probability, wary, "The sensor model was taken for complete, as it was told to be.")
     name, p = next(iter(probability.items()))
-    others = [spoken_name(n) for n in LeftOut(probability, wary).credible_set[1:] if n != CLEAN]
+    others = [spoken_name(n) for n in LeftOutEffects(probability, wary).credible_set[1:] if n != CLEAN]
     aliases = _ALIASES if WITH_CARDS.keys().isdisjoint(last.left_out) else ""
     beside = f" Not excluded: {', '.join(others)}." if others else ""
     if name == CLEAN:
-        return LeftOut(
+        return LeftOutEffects(
             probability,
             wary,
             f"The sensor model leaves nothing out that shows (probability {p:.3g}).{beside} {aliases}".strip(),
@@ -81,7 +81,7 @@ def left_out_after_step(last: Step, trust: float) -> LeftOut:
         said = f"Something may be left out, most probably {spoken_name(name)} (probability {p:.3g})."
     else:
         said = f"The sensor model leaves something out: {_effect_sentence(last, name)} (probability {p:.3g})."
-    return LeftOut(probability, wary, f"{said}{beside} {aliases}".strip())
+    return LeftOutEffects(probability, wary, f"{said}{beside} {aliases}".strip())
 
 
 def _effect_sentence(last: Step, name: str) -> str:

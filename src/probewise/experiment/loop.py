@@ -20,7 +20,7 @@ from probewise._kinds import checked_path, checked_whole, require_callable, requ
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
-from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_and_rate_readings
+from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_readings_and_utilities
 from probewise.experiment.aligned_angles import with_aligned_angles
 from probewise.experiment.arm_error import arm_error_in_posterior, draw_shape_shifts_from_arm_error
 from probewise.experiment.configuration import Experiment, largest_sd_mm
@@ -72,7 +72,7 @@ def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Ge
     posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
     joined = posterior.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
-    utility_input, utilities = predict_and_rate_readings(experiment, joined, drawn, field, at=None)
+    utility_input, utilities = predict_readings_and_utilities(experiment, joined, drawn, field, at=None)
     if utilities.is_flat:
         raise ParameterError(
             "utility",
@@ -129,18 +129,18 @@ def step(
         # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
-    wary = carried.with_warier_odds
+    wary = carried.with_raised_fault_odds
     joined = wary.joined(rng=rng)
     posterior = with_aligned_angles(experiment, joined)
     if _may_stop_and_chance_off(experiment, posterior, None, "", rng)[0]:
         carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
-        wary = carried.with_warier_odds
+        wary = carried.with_raised_fault_odds
         joined = wary.joined(rng=rng)
         posterior = with_aligned_angles(experiment, joined)
     mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
-    leader = carried.kinds[carried.leader]
+    leader = carried.kinds[carried.most_probable_kind_index]
     p_value, worst = p_value_and_worst_reading(
-        experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording)
+        experiment, carried.particles[carried.most_probable_kind_index].weighted, leader.problem(problem.recording)
     )
     if leader.likelihood is not experiment.likelihood:
         p_value = 1.0  # this noise model allows for outliers
@@ -158,7 +158,7 @@ def step(
 
     arm = error_of_arm() if largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
     known, off = _may_stop_and_chance_off(experiment, posterior, arm, likely, rng)
-    utility_input, utilities = predict_and_rate_readings(
+    utility_input, utilities = predict_readings_and_utilities(
         experiment, posterior, drawn, field, at=reading, goal=_goal_less_arm_error(experiment, arm)
     )
     asks = False

@@ -15,7 +15,7 @@ import numpy as np
 from probewise.experiment.doubtful_evidence import HAS_A_SAY, with_bridged_evidence
 from probewise.experiment.particles import particles_from_posterior
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.sampled_anew import FromScratch, search_from_scratch
+from probewise.experiment.sampled_anew import SolverFromScratch, sample_from_scratch
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 
@@ -24,7 +24,7 @@ _LOST = 0.05  # share of a posterior that may lie beyond all of a kind's samples
 
 
 def with_lost_modes_found(
-    posterior: Posterior, problems: list[SensorProblem], *, rng: np.random.Generator, from_scratch: FromScratch
+    posterior: Posterior, problems: list[SensorProblem], *, rng: np.random.Generator, from_scratch: SolverFromScratch
 ) -> Posterior:
     """Return the posterior with modes that its samples had lost; as it is if they had lost none.
 
@@ -39,15 +39,15 @@ def with_lost_modes_found(
             continue
         particles[k] = own = replace(own, searched_at=n_readings)
         n = len(own.ancestor)
-        anew = search_from_scratch(problem, own.weighted, n, -math.inf, rng, from_scratch)
-        if anew.samples is not None and _share_beyond(own.weighted, anew.samples) > _LOST:
+        anew = sample_from_scratch(problem, own.weighted, n, -math.inf, rng, from_scratch)
+        if anew.samples is not None and _share_beyond_own_samples(own.weighted, anew.samples) > _LOST:
             fresh = particles_from_posterior(anew.samples, n, problem, rng=rng)
             fresh = with_bridged_evidence(fresh, problem, rng)
             particles[k] = replace(fresh, searched_at=n_readings, refitted=True)
     return replace(posterior, particles=tuple(particles))
 
 
-def _share_beyond(own: Weighted, found: Weighted) -> float:
+def _share_beyond_own_samples(own: Weighted, found: Weighted) -> float:
     """Return the share of the samples found beyond the range of a kind's own in some parameter, less chance's part."""
     kept = own.theta[own.weight > 0]
     outside = ((found.theta < kept.min(axis=0)) | (found.theta > kept.max(axis=0))).any(axis=1)

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.experiment.lost_modes import with_lost_modes_found
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
-from probewise.experiment.sampled_anew import FromScratch
+from probewise.experiment.sampled_anew import SolverFromScratch
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.kernels import KernelMove
@@ -97,7 +97,7 @@ class SequentialMonteCarlo:
         problems = [kind.problem(recording) for kind in posterior.kinds]
         return with_lost_modes_found(posterior, problems, rng=own, from_scratch=self._solver_from_scratch(own))
 
-    def _solver_from_scratch(self, rng: np.random.Generator) -> FromScratch:
+    def _solver_from_scratch(self, rng: np.random.Generator) -> SolverFromScratch:
         """Return the function that solves a problem by nested sampling."""
         return partial(nested_sampling_from_scratch, n_live=self.n_live, rng=rng)
 

@@ -156,7 +156,7 @@ class FlickerLikelihood:
 
 
 @dataclass(frozen=True, eq=False)
-class LatticeLikelihood:
+class CoarserRoundingLikelihood:
     """Likelihood with coarser rounding than declared; if the readings show none, that of the declared noise.
 
     A lattice is the set of multiples of the coarser step. Three different values or more determine it. If the declared
@@ -168,16 +168,16 @@ class LatticeLikelihood:
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        inside = self.noise.is_inside(readings)
+        inside = self.noise.inside_scale_mask(readings)
         if inside.all():
-            return self._log_prob_inside(readings, predicted)
+            return self._log_prob_inside_scale(readings, predicted)
         at_end = self.noise.log_density(readings[~inside], predicted[:, ~inside]).sum(axis=1)
-        return np.asarray(at_end + self._log_prob_inside(readings[inside], predicted[:, inside]))
+        return np.asarray(at_end + self._log_prob_inside_scale(readings[inside], predicted[:, inside]))
 
-    def _log_prob_inside(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    def _log_prob_inside_scale(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return log likelihoods of readings that lie inside the scale, (n_samples,)."""
         least = max(_COARSE * self.noise.sd, 1.5 * self.noise.step)
-        steps, n_free = self._lattice_steps_and_n_free(readings)
+        steps, n_free = self._rounding_steps_and_n_determining(readings)
         nodes = [
             self._log_prob_if_rounded_to(coarse, n_free, readings, predicted) for coarse in steps if coarse > least
         ]
@@ -185,7 +185,7 @@ class LatticeLikelihood:
             return np.asarray(self.noise.log_density(readings, predicted).sum(axis=1))
         return _log_mean_over_nodes(nodes)
 
-    def _lattice_steps_and_n_free(self, readings: FloatArray) -> tuple[list[float], int]:
+    def _rounding_steps_and_n_determining(self, readings: FloatArray) -> tuple[list[float], int]:
         """Return possible steps of a lattice, equally weighted, and how many readings determine it."""
         values = np.unique(readings)
         recur = not self.noise.step and len(values) < len(readings)
@@ -211,7 +211,7 @@ NoiseLikelihood = (
     | CorrelatedLikelihood
     | SignalDependentLikelihood
     | FlickerLikelihood
-    | LatticeLikelihood
+    | CoarserRoundingLikelihood
 )
 
 
@@ -235,5 +235,5 @@ def noise_likelihoods(noise: DeclaredNoise, ends: tuple[float, float]) -> dict[s
         "correlated_noise": CorrelatedLikelihood(noise),
         "signal_dependent_noise": SignalDependentLikelihood(noise, dark, bright),
         "flicker": FlickerLikelihood(noise, tuple(amplitudes.tolist())),
-        "quantisation": LatticeLikelihood(noise),
+        "quantisation": CoarserRoundingLikelihood(noise),
     }

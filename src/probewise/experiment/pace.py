@@ -1,4 +1,4 @@
-"""A run's own time, counted in readings, so that priors of drifts do not depend on the speed of the instrument.
+"""A run's own time ("paced time"), counted in readings: priors of drifts do not depend on the speed of the instrument.
 
 Priors of effects in time are set before the speed of the instrument is known. So these effects use the run's own time,
 in which each reading takes eight seconds on average.
@@ -38,17 +38,17 @@ class Pace:
             return cls(readings[0].time_s if readings else 0.0)
         return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
 
-    def plan_with_run_time(self, plan: Plan) -> Plan:
+    def plan_with_paced_time(self, plan: Plan) -> Plan:
         """Add a column with the run's own time to a plan."""
         own = (plan.time_s - self.start_s) * (EACH_S / self.each_s)
         return replace(plan, covariates={**plan.covariates, _COLUMN: own})
 
-    def recording_with_run_time(self, recording: Recording) -> Recording:
+    def recording_with_paced_time(self, recording: Recording) -> Recording:
         """Add a column with the run's own time to a recording's plan."""
-        return replace(recording, plan=self.plan_with_run_time(recording.plan))
+        return replace(recording, plan=self.plan_with_paced_time(recording.plan))
 
 
-def run_time_s(plan: Plan) -> FloatArray | None:
+def paced_time_s(plan: Plan) -> FloatArray | None:
     """Return the run's own time of each reading, (n_points,); None where the plan has no such column."""
     return plan.covariates.get(_COLUMN)
 
@@ -62,7 +62,7 @@ class DescribedEffect(Effect[Any], Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class EffectInRunTime(WrappedEffect[FloatArray]):
+class EffectInPacedTime(WrappedEffect[FloatArray]):
     """An effect whose times and rates are in the run's own time; without that column in the plan, in recorded time."""
 
     effect: DescribedEffect
@@ -71,7 +71,7 @@ class EffectInRunTime(WrappedEffect[FloatArray]):
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effect in the run's own time, if the plan has it."""
-        own = run_time_s(plan)
+        own = paced_time_s(plan)
         return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
 
     def theta_in_seconds(self, theta: FloatArray, pace: Pace) -> FloatArray:
@@ -93,7 +93,7 @@ class FromRest(WrappedEffect[Any]):
     def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
         """Apply the effect to all readings but the run's first."""
         found = self.effect.apply(value, theta, plan)
-        own = run_time_s(plan)
+        own = paced_time_s(plan)
         if own is None or not (first := own <= 0.0).any():
             return found
         if not isinstance(value, Poses):
@@ -110,5 +110,5 @@ class FromRest(WrappedEffect[Any]):
 
 
 def theta_in_seconds_of(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
-    """Return an effect's parameters in seconds: converted if it is an `EffectInRunTime`, else as they are."""
-    return effect.theta_in_seconds(theta, pace) if isinstance(effect, EffectInRunTime) else theta
+    """Return an effect's parameters in seconds: converted if it is an `EffectInPacedTime`, else as they are."""
+    return effect.theta_in_seconds(theta, pace) if isinstance(effect, EffectInPacedTime) else theta

@@ -25,11 +25,11 @@ from probewise.experiment.particles import Particles
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.simulation import (
     Model,
-    bin_width_of,
-    chain_of,
+    entropy_bin_width_of,
     experiment_without_inference,
-    levels_of,
+    mean_levels_of,
     scale_of,
+    sensor_chain_at_means,
 )
 from probewise.inference import Naive
 from probewise.inquiry import ReadingEntropy
@@ -198,13 +198,13 @@ def paper_experiment(
         experiment_without_inference(
             sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm
         ),
-        utility=ReadingEntropy(bin_width_of(sensor)),
+        utility=ReadingEntropy(entropy_bin_width_of(sensor)),
         n_samples=_N_SAMPLES,
         n_live=N_LIVE,
         method=NestedSampling(stop=NESTED_STOP[nested_stop]),
     )
     if model != "naive":
-        return pose(chain_of(sensor, scene), student_t_likelihood(levels_of(sensor), scale.step))
+        return pose(sensor_chain_at_means(sensor, scene), student_t_likelihood(mean_levels_of(sensor), scale.step))
     if naive is None:
         raise ParameterError(
             "naive", None, 'levels and sds with the model "naive", from repeated readings over black and white'

@@ -168,7 +168,7 @@ def update(
         As many samples as before; `weighted.run` is the run from scratch, if one was needed. If no sample could have
         given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
     """
-    last = _LastReading(problem)
+    last = _LastReadingEvaluator(problem)
     previous = replace(previous, log_z_limit=previous.log_z_limit + last.perfect_log_likelihood)
     before = previous.weighted
     n = len(before.theta)
@@ -205,7 +205,7 @@ def update(
             break
         rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
         now, moves = _move_by_metropolis(
-            now.take(rows), share, last, rng, _partition_rows(rows) if fall_back is None else None, effort
+            now.take_rows(rows), share, last, rng, _partition_rows(rows) if fall_back is None else None, effort
         )
         n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
         if moves.accepted < _STIFF:
@@ -260,9 +260,9 @@ def resample_and_move(
         had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1))
     )
     moved, moves = (
-        _move_by_metropolis(start, 1.0, _LastReading(problem), rng, effort=effort)
+        _move_by_metropolis(start, 1.0, _LastReadingEvaluator(problem), rng, effort=effort)
         if len(problem.recording)
-        else (start, _MoveCounts(0.0, 0))
+        else (start, _AcceptedStepsAndCalls(0.0, 0))
     )
     found = replace(_equally_weighted_posterior(moved, had), n_calls=had.n_calls + moves.n_calls)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
@@ -272,7 +272,7 @@ def particles_from_posterior(
     found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: UpdateSettings | None = None
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
-    last = _LastReading(problem)
+    last = _LastReadingEvaluator(problem)
     cloud = last.evaluate_samples(found.theta[resampled_rows(found.weight, n, rng)])
     moved, moves = _move_by_metropolis(cloud, 1.0, last, rng, effort=effort)
     drawn = replace(_equally_weighted_posterior(moved, found), n_calls=found.n_calls + n + moves.n_calls)
@@ -301,10 +301,10 @@ class _EvaluatedSamples:
         """Return the log likelihood with the last reading's raised to a power `share`."""
         return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
 
-    def take(self, rows: IntArray) -> _EvaluatedSamples:
+    def take_rows(self, rows: IntArray) -> _EvaluatedSamples:
         return _EvaluatedSamples(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
 
-    def overwritten(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
+    def with_rows_overwritten(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
         """Overwrite rows with the samples of `other`, in the same order."""
         return _EvaluatedSamples(
             np.where(rows[:, None], other.theta, self.theta),
@@ -315,7 +315,7 @@ class _EvaluatedSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class _LastReading:
+class _LastReadingEvaluator:
     """The problem with and without its last reading, from one prediction."""
 
     problem: SensorProblem
@@ -366,7 +366,7 @@ class _LastReading:
 
 
 @dataclass(frozen=True)
-class _MoveCounts:
+class _AcceptedStepsAndCalls:
     """Mean number of accepted steps per sample, and number of likelihood evaluations."""
 
     accepted: float
@@ -376,11 +376,11 @@ class _MoveCounts:
 def _move_by_metropolis(
     start: _EvaluatedSamples,
     share: float,
-    last: _LastReading,
+    last: _LastReadingEvaluator,
     rng: np.random.Generator,
     parts: Sequence[IntArray] | None = None,
     effort: UpdateSettings | None = None,
-) -> tuple[_EvaluatedSamples, _MoveCounts]:
+) -> tuple[_EvaluatedSamples, _AcceptedStepsAndCalls]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
     A round is a proposal from kernels fitted to samples, then one along the difference of two of them (ter Braak 2006):
@@ -389,7 +389,7 @@ def _move_by_metropolis(
     """
     n, n_params = start.theta.shape
     if len(np.unique(start.theta[:, 0])) <= 2 * n_params:  # too few distinct samples to fit kernels
-        return start, _MoveCounts(0.0, 0)
+        return start, _AcceptedStepsAndCalls(0.0, 0)
     parts = [np.arange(n)] if parts is None else parts
     effort = THOROUGH if effort is None else effort
     kernels = [LocalKernels.fitted_to(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
@@ -408,12 +408,12 @@ def _move_by_metropolis(
                 + log_ratio
             )
             taken = np.log(rng.random(n)) < odds
-            now = now.overwritten(taken, proposed)
+            now = now.with_rows_overwritten(taken, proposed)
             n_calls += n
             accepted += float(taken.mean())
         if accepted >= effort.steps_per_sample:
             break
-    return now, _MoveCounts(accepted, n_calls)
+    return now, _AcceptedStepsAndCalls(accepted, n_calls)
 
 
 def _propose_from_kernels(
@@ -464,7 +464,7 @@ def _updated_log_weights(log_weight: FloatArray, after: FloatArray, before: Floa
 def _particles_from_run(
     run: NestedResult,
     n: int,
-    last: _LastReading,
+    last: _LastReadingEvaluator,
     n_calls: int,
     rng: np.random.Generator,
 ) -> Particles:

@@ -59,7 +59,7 @@ class Posterior:
         return shares
 
     @property
-    def leader(self) -> int:
+    def most_probable_kind_index(self) -> int:
         """Index of the most probable kind."""
         return int(self.log_odds.argmax())
 
@@ -71,7 +71,7 @@ class Posterior:
         return replace(self, kinds=kinds)
 
     @property
-    def with_warier_odds(self) -> Posterior:
+    def with_raised_fault_odds(self) -> Posterior:
         """The posterior with the odds of an incomplete model multiplied by `WARY`; itself if no kind has an effect."""
         return self.with_fault_odds_times(WARY) if any(kind.left_out for kind in self.kinds) else self
 
@@ -82,7 +82,7 @@ class Posterior:
         probability = self.probability
         some = [k for k, p in enumerate(probability) if p > 0]
         own = [self.particles[k].weighted for k in some]
-        leader = self.particles[self.leader].weighted
+        leader = self.particles[self.most_probable_kind_index].weighted
         theta = np.concatenate([self.kinds[k].to_whole_theta(w.theta, rng) for k, w in zip(some, own, strict=True)])
         log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, own, strict=True)])
         weight = np.exp(log_weight)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from probewise.errors import NotConvergedError
-from probewise.experiment.doubtful_evidence import reestimated_where_doubtful, with_bridged_evidence
+from probewise.experiment.doubtful_evidence import with_bridged_evidence, with_doubtful_evidences_reestimated
 from probewise.experiment.particles import BRIEF, STEADY, THOROUGH, Particles, UpdateSettings, resample_and_move, update
 from probewise.experiment.posterior import IMPROBABLE, SUSPECTED, Posterior, n_samples_of_kind
 from probewise.experiment.rivals_again import sample_rivals_again
-from probewise.experiment.sampled_anew import FromScratch
+from probewise.experiment.sampled_anew import SolverFromScratch
 from probewise.inference.problem import SensorProblem
 from probewise.recordings.plan import Recording
 
@@ -28,7 +28,7 @@ def updated(
     n_particles: int,
     *,
     rng: np.random.Generator,
-    from_scratch: FromScratch,
+    from_scratch: SolverFromScratch,
 ) -> Posterior:
     """Update the posterior with the last reading of a recording.
 
@@ -67,7 +67,7 @@ def updated(
         ]
         now = replace(previous, particles=tuple(particles))
     n = min(n_particles, _MOST_DRAWS) if doubted else n_particles
-    now = reestimated_where_doubtful(
+    now = with_doubtful_evidences_reestimated(
         now, problems, n, from_scratch, rng, most_off=_DOUBTED_OFF if doubted else _MOST_OFF
     )
     particles = list(now.particles)
@@ -100,7 +100,7 @@ def with_rivals_sampled_again(
     n_particles: int,
     *,
     rng: np.random.Generator,
-    from_scratch: FromScratch,
+    from_scratch: SolverFromScratch,
 ) -> Posterior:
     """Return the posterior with rivals sampled again and doubtful evidences re-estimated; called before a run ends.
 
@@ -111,6 +111,6 @@ def with_rivals_sampled_again(
     now = replace(
         posterior, particles=tuple(sample_rivals_again(posterior, problems, n_particles, rng, from_scratch, each=True))
     )
-    return reestimated_where_doubtful(
+    return with_doubtful_evidences_reestimated(
         now, problems, min(n_particles, _MOST_DRAWS), from_scratch, rng, most_off=_OFF_AT_THE_END
     )

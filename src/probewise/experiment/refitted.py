@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.experiment.evidence import importance_weighted_draws
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.kinds import HypothesisKind
-from probewise.experiment.pace import EACH_S, run_time_s
+from probewise.experiment.pace import EACH_S, paced_time_s
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.weights import resampled_rows
@@ -114,7 +114,7 @@ def fit_kind(
     scale = np.maximum(0.5 * (high - low), 1e-12)
     theta = drawn[:_STARTS].copy()
     moments = [j for j, name in enumerate(kind.prior.names) if name.endswith(".at_s")]
-    times_s = run_time_s(plan)
+    times_s = paced_time_s(plan)
     if moments and times_s is not None and len(times_s) > 1:
         # A change is seen by the gap between readings that it falls into, whatever the slope says.
         gap = rng.integers(1, len(times_s), len(theta))
@@ -180,7 +180,7 @@ def _prediction_slopes(
 
 
 @dataclass(frozen=True, eq=False)
-class _OpenShapeDensity:
+class _ShapePriorAndEffectKernels:
     """A density over a kind's parameters: the prior for those of the shape, kernels about fits for the effect's.
 
     Where the readings leave the shape open (a step of the light, and no white yet), Gaussians about fits cover little
@@ -192,7 +192,7 @@ class _OpenShapeDensity:
     of_effect: LocalKernels
 
     @classmethod
-    def about_fits(cls, kind: HypothesisKind, found: Fits, rows: IntArray) -> _OpenShapeDensity | None:
+    def about_fits(cls, kind: HypothesisKind, found: Fits, rows: IntArray) -> _ShapePriorAndEffectKernels | None:
         """Build from some fits of a kind; None for a kind whose rival is a noise model."""
         if kind.effect is None:
             return None
@@ -249,7 +249,7 @@ def sampled_about_fits(
     densities: list[_Density] = [
         LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse_precision(found.precision[best]))
     ]
-    if (open_shape := _OpenShapeDensity.about_fits(kind, found, best)) is not None:
+    if (open_shape := _ShapePriorAndEffectKernels.about_fits(kind, found, best)) is not None:
         densities.append(open_shape)
     if with_own and len(rows := _resampled_rows_if_distinct(own, n_params, rng)):
         densities.append(LocalKernels.fitted_to(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
@@ -262,7 +262,7 @@ def sampled_about_fits(
     return _importance_sampled(first, problem, [near, near, far, *densities], n_draws, rng) or first
 
 
-_Density = LocalKernels | _OpenShapeDensity
+_Density = LocalKernels | _ShapePriorAndEffectKernels
 
 
 def _inverse_precision(precision: FloatArray) -> FloatArray:

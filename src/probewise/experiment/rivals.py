@@ -30,7 +30,7 @@ from probewise.errors import ParameterError
 from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.experiment.effect_with_run_prior import EffectWithRunPrior
 from probewise.experiment.noise_rivals import noise_likelihoods
-from probewise.experiment.pace import EACH_S, DescribedEffect, EffectInRunTime, FromRest
+from probewise.experiment.pace import EACH_S, DescribedEffect, EffectInPacedTime, FromRest
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import cards_of
 from probewise.recordings.plan import Instrumentation, Plan
@@ -113,7 +113,7 @@ def rivals_of(
         effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _plan_there_and_back(reach_mm)))
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, field_mm)]
-    noise = DeclaredNoise.of(likelihood)
+    noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
         laws = noise_likelihoods(noise, (model.levels.i_min, model.levels.i_max))
         found += [SensorModelRival(name, likelihood=law) for name, law in laws.items()]
@@ -127,7 +127,7 @@ def _forms_of_effect_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[flo
     if effect.name not in _IN_TIME:
         return [EffectWithRunPrior(effect, field_mm)]
     ways = [effect, GainLoss.from_gain_drift(effect)] if isinstance(effect, GainDrift) else [effect]
-    return [EffectInRunTime(EffectWithRunPrior(way, field_mm)) for way in ways]
+    return [EffectInPacedTime(EffectWithRunPrior(way, field_mm)) for way in ways]
 
 
 @dataclass(frozen=True)

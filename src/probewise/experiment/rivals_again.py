@@ -12,10 +12,10 @@ from probewise.experiment.particles import BRIEF, Particles, particles_from_post
 from probewise.experiment.posterior import Posterior, n_samples_of_kind
 from probewise.experiment.sampled_anew import (
     WELL_FOUND,
-    FromScratch,
     SamplesAnew,
+    SolverFromScratch,
+    sample_from_scratch,
     sample_near_other_kinds,
-    search_from_scratch,
 )
 from probewise.inference.problem import SensorProblem
 
@@ -33,7 +33,7 @@ def sample_rivals_again(
     problems: list[SensorProblem],
     n_particles: int,
     rng: np.random.Generator,
-    from_scratch: FromScratch,
+    from_scratch: SolverFromScratch,
     *,
     each: bool = False,
 ) -> list[Particles]:
@@ -50,7 +50,7 @@ def sample_rivals_again(
     far below the best kind is sampled again when the readings since could have made up the difference.
     """
     particles, log_odds = list(now.particles), now.log_odds
-    probability = now.with_warier_odds.probability
+    probability = now.with_raised_fault_odds.probability
     n_kinds, n_searches = len(now.kinds), len(now.kinds) if each else _SEARCHED_PER_READING
     for k in np.roll(np.arange(n_kinds), -(len(problems[0].recording) % n_kinds)).tolist():
         kind, problem = now.kinds[k], problems[k]
@@ -75,7 +75,7 @@ def sample_rivals_again(
         few = _LEAST_FOUND if kind.effect is not None else WELL_FOUND
         if may_search and (matters or not anew.is_reproduced or (each and anew.n_eff < few)):
             n_searches -= 1
-            anew = search_from_scratch(problem, own.weighted, n, hopeless, rng, from_scratch)
+            anew = sample_from_scratch(problem, own.weighted, n, hopeless, rng, from_scratch)
             own = replace(own, searched_at=len(problem.recording))
         particles[k] = _replaced_if_better(own, anew, n, problem, hopeless, rng)
     return particles

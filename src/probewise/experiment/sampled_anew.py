@@ -24,7 +24,7 @@ _REPRODUCED = 5  # of the starts, which must lead to fits as good as the best: o
 WELL_FOUND = 100.0  # effective draws from which on samples need not be taken anew until a reading strains them
 
 
-class FromScratch(Protocol):
+class SolverFromScratch(Protocol):
     """Solves a kind's whole problem by nested sampling; with fewer live points if `quick`."""
 
     def __call__(self, problem: SensorProblem, *, quick: bool = False) -> NestedResult:
@@ -72,7 +72,7 @@ def sample_near_other_kinds(
 
     No samples are drawn if the largest log evidence by fits is below `hopeless`.
     """
-    noise = DeclaredNoise.of(kind.likelihood)
+    noise = DeclaredNoise.from_likelihood(kind.likelihood)
     if kind.effect is not None:
         if noise is None:
             return SamplesAnew(None)
@@ -94,13 +94,13 @@ def sample_near_other_kinds(
     return SamplesAnew(_importance_sampled_if_possible(np.concatenate(points), problem, n, rng))
 
 
-def search_from_scratch(
+def sample_from_scratch(
     problem: SensorProblem,
     own: Weighted,
     n: int,
     hopeless: float,
     rng: np.random.Generator,
-    from_scratch: FromScratch,
+    from_scratch: SolverFromScratch,
 ) -> SamplesAnew:
     """Sample a kind's posterior by a quick run of nested sampling."""
     try:
@@ -143,7 +143,7 @@ def _importance_sampled_if_possible(
         return None
 
 
-def independent_start_with_evidence(particles: Particles, found: BridgedEvidence) -> Particles:
+def with_new_evidence_and_lineages(particles: Particles, found: BridgedEvidence) -> Particles:
     """Give the samples a new evidence, and make them an independent start: each is its own ancestor."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)

@@ -66,10 +66,15 @@ class RandomStreams(NamedTuple):
     levels: np.random.Generator
 
     @classmethod
-    def of(cls, rng: np.random.Generator) -> RandomStreams:
+    def spawned_from(cls, rng: np.random.Generator) -> RandomStreams:
         """Spawn them from one generator, so that one seed gives the whole run."""
         run, truth, shadow, noise, levels = rng.spawn(5)
         return cls(run, truth, shadow, int(noise.integers(2**63)), levels)
+
+    @classmethod
+    def of(cls, rng: np.random.Generator) -> RandomStreams:
+        """Spawn them, under the old name of `spawned_from`."""
+        return cls.spawned_from(rng)
 
 
 def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
@@ -79,7 +84,7 @@ def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = Non
     return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
 
 
-def bin_width_of(sensor: FittedSensor) -> float:
+def entropy_bin_width_of(sensor: FittedSensor) -> float:
     """Return the bin width of the paper's entropy: the instrument's rounding step, or else its noise sd."""
     return scale_of(sensor.instrumentation).step or float(sensor.noise_sd.mean())
 
@@ -103,7 +108,7 @@ def shape_named(names: Sequence[str], field: Field) -> Shape:
     return AnyOf(chosen) if len(chosen) > 1 else next(iter(chosen.values()))
 
 
-def shape_of(shape: str | Sequence[str] | Shape, field: Field) -> Shape:
+def as_shape(shape: str | Sequence[str] | Shape, field: Field) -> Shape:
     """Return a shape, or build it from one or several names.
 
     Raises
@@ -171,7 +176,7 @@ def experiment_for(
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
     sensor = sensor.with_leading_effects()  # a mean over several hypotheses describes none of them
-    levels, noise_sd, scale = levels_of(sensor), float(sensor.noise_sd.mean()), scale_of(sensor.instrumentation)
+    levels, noise_sd, scale = mean_levels_of(sensor), float(sensor.noise_sd.mean()), scale_of(sensor.instrumentation)
     scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
     pose = partial(
         experiment_without_inference(
@@ -190,7 +195,7 @@ def experiment_for(
         sd = math.hypot(noise_sd, (scale.step or 0.0) / math.sqrt(12))
         # A reading on the edge fits neither level, and the naive model has no partial coverage.
         return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
-    chain = chain_of(sensor, scene, estimated=trust < 1 and not learn_sensor)
+    chain = sensor_chain_at_means(sensor, scene, estimated=trust < 1 and not learn_sensor)
     # Unrounded readings get cells scaled to the noise; the end cells are open.
     step = scale.step or noise_sd / _CELLS_PER_SD
     likelihood = Rounded(noise_sd, step, scale.low, scale.high, whole_steps=scale.step is not None)
@@ -229,13 +234,13 @@ def experiment_without_inference(
     )
 
 
-def levels_of(sensor: FittedSensor) -> FixedLevels:
+def mean_levels_of(sensor: FittedSensor) -> FixedLevels:
     """Return the posterior mean levels of a fitted sensor."""
     means = sensor.mean()
     return FixedLevels(means["I_min"], means["I_max"])
 
 
-def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = False) -> Chain:
+def sensor_chain_at_means(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = False) -> Chain:
     """Return the chain of a fitted sensor over a scene: mean field's mixture, mean levels, effects at their means.
 
     With `estimated`, the effects remember how well they are known, so that a run can infer them along; those of the
@@ -255,7 +260,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
             effects.append(Estimated(acting, values, tuple(map(_marginal_prior_from_samples, samples))))
         else:
             effects.append(Known(effect, values))
-    return Chain(sensor.mean_mixture(), levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)
+    return Chain(sensor.mean_mixture(), mean_levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)
 
 
 def _marginal_prior_from_samples(samples: FloatArray) -> Marginal:

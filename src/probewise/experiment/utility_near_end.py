@@ -19,9 +19,9 @@ from probewise.experiment.checking import (
     ENOUGH_BITS,
     FAR_SIDE,
     NAMES,
-    OutlineGaps,
+    OutlineReadingDistances,
     available_places_mm,
-    bits_about_left_out,
+    expected_bits_about_left_out_effect,
 )
 from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
@@ -78,14 +78,16 @@ def utility_map_and_must_continue(
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return utilities, False
-    outline = OutlineGaps.from_region(
+    outline = OutlineReadingDistances.from_region(
         utility_input, experiment.shape.region(_mean_shape_theta(experiment, utility_input)), readings
     )
     far = () if outline is None or outline.far_side_design is None else (outline.far_side_design,)
     rows = np.union1d(_candidate_designs(experiment, utility_input, utilities, theta, readings, rng), far).astype(
         np.int64
     )
-    plan = Pace.from_readings(readings).plan_with_run_time(_plan_of_candidates(utility_input, rows, readings[-1]))
+    plan = Pace.from_readings(readings).plan_with_paced_time(
+        _plan_from_arm_to_candidates(utility_input, rows, readings[-1])
+    )
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
@@ -96,13 +98,15 @@ def utility_map_and_must_continue(
         else outline.leaves_no_far_side_mask(available_places_mm(utility_input)[rows])
     )
     if known and not far:
-        utility = bits_about_left_out(weight, answers, names, utility_input.readout)
-        return _map_of_candidates(utility_input, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
+        utility = expected_bits_about_left_out_effect(weight, answers, names, utility_input.readout)
+        return _utility_map_of_candidates(utility_input, utilities, rows, utility, NAMES), bool(
+            utility.max() >= ENOUGH_BITS
+        )
     utility = _expected_bits(weight, answers, utility_input)
     if known:
         # The far side first: it has to be read in any case, and tells something about the names too.
         there = seen if seen.any() else np.isin(rows, far)
-        return _map_of_candidates(
+        return _utility_map_of_candidates(
             utility_input, utilities, rows, np.where(there, np.maximum(utility, _LEAST_BITS), 0.0), FAR_SIDE
         ), True
     order = np.argsort(-utility, kind="stable")
@@ -111,15 +115,15 @@ def utility_map_and_must_continue(
         lengths, weight, answers[:, best], utility_input, goal.sd, OFF_SDS * experiment.stop_sd_mm
     )
     if chance.max() < _LEAST_CHANCE:
-        return _map_of_candidates(utility_input, utilities, rows, utility, _LABEL), False
+        return _utility_map_of_candidates(utility_input, utilities, rows, utility, _LABEL), False
     # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
-    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_about_left_out(
+    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + expected_bits_about_left_out_effect(
         weight, answers[:, best], names, utility_input.readout
     )
-    return _map_of_candidates(utility_input, utilities, rows[best], ends, _ENDS), False
+    return _utility_map_of_candidates(utility_input, utilities, rows[best], ends, _ENDS), False
 
 
-def _map_of_candidates(
+def _utility_map_of_candidates(
     utility_input: UtilityInput, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str
 ) -> UtilityMap:
     """Return the utility map with these values, (n,), for some available designs and 0 for the others."""
@@ -186,7 +190,7 @@ def _candidate_designs(
     return np.unique(np.concatenate([best, nearest, rng.integers(len(there), size=_ANYWHERE)]))
 
 
-def _plan_of_candidates(utility_input: UtilityInput, rows: IntArray, last: Reading) -> Plan:
+def _plan_from_arm_to_candidates(utility_input: UtilityInput, rows: IntArray, last: Reading) -> Plan:
     """Return a plan of two rows per candidate: the arm's current place, then the candidate, as a scan of their own."""
     n = len(rows)
     at = utility_input.rows[rows]

@@ -201,7 +201,7 @@ MISTAKES = {
     "a table to audit": (lambda: probewise.audit(Frame()), A_PLAN),
     "a sensor's path to audit": (lambda: probewise.audit(PLAN, sensor="s.json"), f"sensor is 's.json'; {A_SENSOR}"),
     "a misspelt word of an audit": (
-        lambda: probewise.audit(PLAN).seen_as("invisibel"),
+        lambda: probewise.audit(PLAN).effects_with_detectability("invisibel"),
         "detectability is 'invisibel'; .*; did you mean invisible",
     ),
     "an unknown pattern to audit": (lambda: probewise.audit(UNDESCRIBED), "'edge' is named but not described"),

@@ -425,7 +425,7 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progres
     >>> import probewise
     >>> from probewise.recordings import Uniform
     >>> plan = probewise.Plan.from_arrays(x_mm=range(30), y_mm=0, patterns=Uniform(0.5), unit="V", min=0, max=5)
-    >>> len(probewise.audit(plan).seen_as("invisible")) > 0
+    >>> len(probewise.audit(plan).effects_with_detectability("invisible")) > 0
     True
     """
     from probewise._progress import progress_or_bar

@@ -18,8 +18,8 @@ from probewise.diagnosis.evidence.laplace import (
     SCALES,
     Linearised,
     OrthonormalBlocks,
+    average_over_amplitude_scales,
     block_log_bayes_factors,
-    mix_scales,
 )
 from probewise.diagnosis.evidence.templates import EffectTemplates, templates_of_effect
 from probewise.diagnosis.fitting.coordinates import (
@@ -34,7 +34,7 @@ from probewise.diagnosis.fitting.sensor_prior import sensor_from_posterior
 from probewise.diagnosis.joining import join, join_plans
 from probewise.diagnosis.judgement.judged import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.diagnosis.light_sensor.candidate_scans import rows_as_new_scan
-from probewise.diagnosis.light_sensor.covariates import covariate_of
+from probewise.diagnosis.light_sensor.covariates import covariate_of_effect
 from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -77,7 +77,7 @@ def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:
 
 
 def placed(effect, change, without, plan, covariates):
-    shows_in = covariate_of(effect, change, without, plan, covariates)
+    shows_in = covariate_of_effect(effect, change, without, plan, covariates)
     scans = next((c for c in covariates if c.name == "scan"), None)
     return places_of_effect(effect, change, shows_in, scans, plan, change, p_value=0.001, size=8.0, sd=0.5)
 
@@ -260,8 +260,8 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
 
 def test_a_template_of_which_nothing_survives_is_out_of_the_question():
     explained, gain = np.full((2, 1, 1), 0.01), np.array([[300.0], [1e-4]])
-    assert mix_scales(explained, gain, 400)[0, 0] > -5
-    assert mix_scales(explained, gain, 400)[1, 0] < -40
+    assert average_over_amplitude_scales(explained, gain, 400)[0, 0] > -5
+    assert average_over_amplitude_scales(explained, gain, 400)[1, 0] < -40
 
 
 def test_a_bank_weighs_as_blocks_do():

@@ -8,7 +8,7 @@ import pytest
 from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis import SensorAndShape, audit_plan
 from probewise.diagnosis.apparatus import Apparatus
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import prepare
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import VOCABULARY, Extent
@@ -17,7 +17,7 @@ from probewise.recordings import Recording, paper_plan
 from probewise.scene import Circle
 from probewise.sensor import SSFField, mixture_names
 
-SENSOR: Apparatus = LightSensor()
+SENSOR: Apparatus = LightSensorApparatus()
 
 
 def recording(n=408):
@@ -106,6 +106,6 @@ def test_no_reading_is_refused():
 
 
 def test_an_effect_of_ones_own_stands_beside_the_vocabulary():
-    own = LightSensor({"backlash": VOCABULARY["backlash"]}).effects(recording(), None)
+    own = LightSensorApparatus({"backlash": VOCABULARY["backlash"]}).effects(recording(), None)
     assert "backlash" in own
     assert "lag" not in own

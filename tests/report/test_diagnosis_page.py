@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mixtures import fixed_mixture
 
-from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
+from probewise.diagnosis import ParameterFound, Place, audit_plan_of_diagnosis, diagnose
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
@@ -40,7 +40,7 @@ def saturated():
 def test_the_page_says_what_is_missing_and_what_to_do(saturated):
     drawn = page.encoded_figures(saturated)
     assert {place.figure_name for place in saturated.where} <= set(drawn)
-    audit = audit_recorded(saturated)
+    audit = audit_plan_of_diagnosis(saturated)
     html = page.page_html(saturated, drawn, source="some.csv", seed=1, audit=audit)
     screen, rest = html.split("<h2>", 1)
     assert "saturate" in screen

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import EffectFound, Hypothesis
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.effects import EFFECTS, NUISANCES, VOCABULARY
 from probewise.recordings import Instrumentation
 from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words
@@ -34,7 +34,7 @@ def found(
     stated = [Hypothesis(tuple(names), 0.9 / max(len(rivals), 1)) for names in rivals]
     return SimpleNamespace(
         recording=SimpleNamespace(usable=np.ones(n, dtype=bool), readings=np.arange(float(n)), plan=PLAN),
-        apparatus=LightSensor(),
+        apparatus=LightSensorApparatus(),
         verdict=verdict,
         combination=tuple(combination),
         p_value=p_value,

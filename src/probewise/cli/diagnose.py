@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     from functools import partial
 
     from probewise._progress import progress_shown
-    from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
+    from probewise.diagnosis import SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
     from probewise.report import diagnosis as report
 
     out = checked_output_directory(arguments.out)
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         if null is not None:
             diagnosis = null.with_shape_in_next_plan(diagnosis)
         progress("auditing the plan")
-        audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)
+        audit = None if null is not None else audit_plan_of_diagnosis(diagnosis, sensor=sensor)
         progress("drawing the figures")
         drawn = report.encoded_figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)

@@ -14,7 +14,7 @@ from probewise.diagnosis.audit.plan_audit import (
     EffectAudit,
     PlanAudit,
     audit_plan,
-    audit_recorded,
+    audit_plan_of_diagnosis,
 )
 from probewise.diagnosis.engine import Thorough, diagnose
 from probewise.diagnosis.fitting.null import Null
@@ -25,7 +25,7 @@ from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
 from probewise.diagnosis.model_with import model_with
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.repair.improvement import Improvement
-from probewise.diagnosis.repair.repair import Predicted, Repair
+from probewise.diagnosis.repair.repair import PredictionAndResiduals, Repair
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.scheduling import MOST_READINGS
@@ -69,7 +69,7 @@ __all__ = [
     "Parameters",
     "Place",
     "PlanAudit",
-    "Predicted",
+    "PredictionAndResiduals",
     "PriorOdds",
     "Remainder",
     "Repair",
@@ -82,7 +82,7 @@ __all__ = [
     "Weighing",
     "audit_json",
     "audit_plan",
-    "audit_recorded",
+    "audit_plan_of_diagnosis",
     "audit_system",
     "calibrated_of",
     "diagnose",
@@ -101,3 +101,9 @@ __all__ = [
 
 Smallest = DetectableSize
 """The old name of `DetectableSize`."""
+
+Predicted = PredictionAndResiduals
+"""The old name of `PredictionAndResiduals`."""
+
+audit_recorded = audit_plan_of_diagnosis
+"""The old name of `audit_plan_of_diagnosis`."""

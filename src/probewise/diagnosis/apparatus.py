@@ -86,11 +86,13 @@ class Apparatus(Protocol):
         """Return the forms of the null to calibrate from the recording, if no null is given."""
         ...
 
-    def covariates_and_slope(self, found: Fit, recording: Recording) -> tuple[Sequence[Covariate], FloatArray]:
+    def covariates_and_predicted_slope(
+        self, found: Fit, recording: Recording
+    ) -> tuple[Sequence[Covariate], FloatArray]:
         """Return the covariates of a residual, and the slope of the prediction along the motion, (n_usable,)."""
         ...
 
-    def covariate_of(
+    def covariate_of_effect(
         self,
         effect: NamedEffect[Any],
         change: FloatArray,

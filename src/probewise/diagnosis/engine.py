@@ -19,7 +19,7 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
 from probewise.diagnosis.judgement.judged import judge
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import Prepared, prepare
 from probewise.diagnosis.repair.best_repair import BestRepair, judged_and_best_repair
 from probewise.diagnosis.repair.correction import improvement_and_correction
@@ -101,7 +101,7 @@ def diagnose(
             "a null model: OwnModel(simulate, prior) or SensorAndShape, of probewise.diagnosis; a sensor is sensor="
         )
         require_like("null", null, ("admits", "starts", "n_params"), allowed)
-    prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensor(dict(effects), hands))
+    prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensorApparatus(dict(effects), hands))
     return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)
 
 
@@ -161,7 +161,7 @@ def _facts_for_reason(
     """Collect the facts for the reason."""
     prepared, shares = searched.prepared, searched.evidences.unknown_shares
     orders = searched.posterior.order_probabilities
-    beside = searched.likeliest_beside_unknown(test.noise)
+    beside = searched.likeliest_fit_beside_unknown(test.noise)
     formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
     columns = [drawn.best.effect_samples(effect.name) for effect in formulas]
     return Grounds(

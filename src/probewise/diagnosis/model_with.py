@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from probewise._kinds import checked_texts, require_one_of, require_rng
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.diagnosis.search.constants import MAX_ORDER
@@ -52,7 +52,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
         if effect is None:
             raise ParameterError("names", name, "effects of the vocabulary that this recording can show")
         effects[name] = effect
-    prepared = Prepared(recording, effects, None, LightSensor(), recording)
+    prepared = Prepared(recording, effects, None, LightSensorApparatus(), recording)
     found = search(prepared, max_order=MAX_ORDER, depth=max(len(names), 1))
     on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
     on_noise = tuple(sorted(set(names) - set(on_mean)))

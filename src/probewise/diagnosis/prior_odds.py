@@ -59,18 +59,18 @@ class PriorOdds:
         """Return the log prior probability of a combination of effects on the mean."""
         named = [name for name in names if not is_out_of_vocabulary(name)]
         if self.twice is None:
-            log_p = self._log_prior_of_count(len(named))
+            log_p = self._log_prior_per_combination(len(named))
         else:
             once = self.twofold.intersection(named)
             n_again = sum(name_of_first_copy(name) is not None for name in named)
-            log_p = self._log_prior_of_count(len(named) - n_again)
+            log_p = self._log_prior_per_combination(len(named) - n_again)
             log_p += n_again * math.log(self.twice) + (len(once) - n_again) * math.log1p(-self.twice)
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
             log_p += math.log(share * self.out_of_vocabulary / (self.n_unnamed - k))
         return log_p
 
-    def _log_prior_of_count(self, n: int) -> float:
+    def _log_prior_per_combination(self, n: int) -> float:
         return math.log(self.by_size[n - 1] / math.comb(self.n_named, n) if n else self.clean_mean)
 
     def log_prior_with_unknown(self, names: Names) -> float:

@@ -18,14 +18,14 @@ _CURED_BY = "The fewest extra readings that would help"
 
 def summary_sentence(audit: PlanAudit) -> str:
     """Summarise in at most twenty words: how many effects are fine, aliased or invisible, and what would help."""
-    n_fine, n_aliased = len(audit.seen_as("fine")), len(audit.seen_as("aliased"))
-    n_invisible = len(audit.seen_as("invisible"))
+    n_fine, n_aliased = len(audit.effects_with_detectability("fine")), len(audit.effects_with_detectability("aliased"))
+    n_invisible = len(audit.effects_with_detectability("invisible"))
     said = (
         f"This plan is fine for {n_fine} of {len(audit.effects)} effects; {n_aliased} aliased, {n_invisible} invisible."
     )
     if not audit.cures:
         return said
-    cured = len(audit.seen_as("fine", after=True)) - n_fine
+    cured = len(audit.effects_with_detectability("fine", after=True)) - n_fine
     return f"{said} {count_with_noun(audit.extra_readings, 'more reading')} make {cured} more fine."
 
 

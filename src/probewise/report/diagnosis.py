@@ -502,17 +502,23 @@ def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     def joined_or_none(found: Sequence[str]) -> str:
         return ", ".join(found).replace("_", " ") or "none"
 
-    aliased = [f"{e.name} (with {e.alike[0][0]})" for e in audit.seen_as("aliased")]
+    aliased = [f"{e.name} (with {e.alike[0][0]})" for e in audit.effects_with_detectability("aliased")]
 
     return (
         definition_list(
             (
-                ("fine (detected, and told from every other)", joined_or_none([e.name for e in audit.seen_as("fine")])),
+                (
+                    "fine (detected, and told from every other)",
+                    joined_or_none([e.name for e in audit.effects_with_detectability("fine")]),
+                ),
                 (
                     "aliased (detected, but another effect can imitate it)",
                     joined_or_none(aliased),
                 ),
-                ("invisible (not detected)", joined_or_none([e.name for e in audit.seen_as("invisible")])),
+                (
+                    "invisible (not detected)",
+                    joined_or_none([e.name for e in audit.effects_with_detectability("invisible")]),
+                ),
             )
         ),
         element("details", element("summary", "every effect, with numbers"), audit_table(audit.effects)),

@@ -19,9 +19,9 @@ from probewise.diagnosis.advice.next_scans import (
 )
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, excerpts
-from probewise.diagnosis.light_sensor.scheduling import plan_in_sequence, plan_of_alternatives, postponed
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, excerpts_of_scan
+from probewise.diagnosis.light_sensor.scheduling import plan_in_sequence, plan_of_alternatives, scan_started_after
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
 from probewise.effects import VOCABULARY, Extent
@@ -86,7 +86,7 @@ def rival(name: str, probability: float, settings: list[float], plan: Plan) -> R
 def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
     plan = paper_plan()
     asked = measurement_separating_rivals(
-        [rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan, LightSensor()
+        [rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan, LightSensorApparatus()
     )
     assert asked is not None
     assert len(asked.plan) <= MOST_READINGS
@@ -106,7 +106,7 @@ def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
 def test_lag_against_backlash_wants_the_other_way():
     plan = paper_plan()
     lag, play = rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)
-    asked = measurement_separating_rivals([lag, play], 0.4, plan, LightSensor())
+    asked = measurement_separating_rivals([lag, play], 0.4, plan, LightSensorApparatus())
     assert asked is not None
     assert "backwards" in asked.description or "forth and back" in asked.description
 
@@ -116,7 +116,7 @@ def test_a_plan_that_moves_nowhere_has_no_next_scan():
     rivals = [rival("hysteresis", 0.5, [0.5], paper_plan()), rival("lag", 0.5, [0.5], paper_plan())]
     assert (
         measurement_separating_rivals(
-            [replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan, LightSensor()
+            [replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan, LightSensorApparatus()
         )
         is None
     )
@@ -198,11 +198,11 @@ def test_a_name_that_is_taken_stands_for_something_else():
 def test_excerpts_hold_the_step_and_every_so_many_readings():
     scan = np.arange(100, 201)
     level = np.where(np.arange(101) < 60, 10.0, 50.0) + np.linspace(0, 1, 101)
-    every, fourth, near = excerpts(scan, strides=(1, 4), level=level)
+    every, fourth, near = excerpts_of_scan(scan, strides=(1, 4), level=level)
     assert len(every.rows) == 101
     assert fourth.rows[:3].tolist() == [100, 104, 108]
     assert near.rows[0] <= 159 < 160 <= near.rows[-1]
-    assert len(excerpts(scan, strides=(1, 4), level=np.ones(101))) == 2  # nothing changes anywhere
+    assert len(excerpts_of_scan(scan, strides=(1, 4), level=np.ones(101))) == 2  # nothing changes anywhere
 
 
 def test_a_scan_over_a_new_sheet_takes_longer():
@@ -212,7 +212,7 @@ def test_a_scan_over_a_new_sheet_takes_longer():
     assert new.minutes == pytest.approx(again.minutes + 1.0)
     # In turn, or behind a plan: what the minutes say passes before the first reading.
     end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))
-    later = postponed(new, plan).plan
+    later = scan_started_after(new, plan).plan
     assert later.time_s[-1] - end_s == pytest.approx(60.0 * new.minutes)
     both = plan_in_sequence([again, new], plan)
     assert both.time_s[-1] - end_s == pytest.approx(60.0 * (again.minutes + new.minutes))
@@ -225,7 +225,7 @@ def test_a_battery_is_expected_to_stay_as_it_was():
     assert [len(own) for own in rows] == [101, 101, 102]
     assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     asked = measurement_separating_rivals(
-        [rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor()
+        [rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensorApparatus()
     )
     assert asked is not None
     assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()

@@ -33,7 +33,7 @@ def sights_of(plan: Plan):
     sensor = default_sensor(Extent(10.0, 60.0, plan), 1)
     expected = ExpectedSensor(sensor, np.full(sensor.n_params, 0.1), (10.0, 60.0), 0.5)
     seen = ProjectedTemplates.of(PlanTemplates.of(expected, plan, TWO), np.arange(len(plan)))
-    share, like = seen.shares_and_cosines()["backlash"]
+    share, like = seen.detectable_shares_and_cosines()["backlash"]
     return expected, share, like["edge_misplacement"], seen
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import log_ndtr
 
-from probewise.diagnosis.evidence.detectable import log_probability_detectable
+from probewise.diagnosis.evidence.detectable import log_probability_effects_detectable
 from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
@@ -34,7 +34,7 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
         null, Recording(PLAN, predicted), z[: sensor.n_params], law.with_least_sigma(SD), tolerance=1e-6
     ).residuals
     expected = float(log_ndtr(np.linalg.norm(left) / SD - LEAST_VISIBLE))
-    assert log_probability_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(
+    assert log_probability_effects_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(
         expected, abs=0.1 + 0.02 * abs(expected)
     )
 
@@ -43,4 +43,4 @@ def test_a_fit_without_effects_is_as_it_is():
     model = Model(default_sensor(EXTENT, 1), (), PLAN)
     predicted, slopes = model.predict_and_differentiate(np.zeros(7))
     found = Fit(model, np.zeros(7), predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
-    assert log_probability_detectable(found, white_noise(len(PLAN)), np.arange(len(PLAN))) == 0.0
+    assert log_probability_effects_detectable(found, white_noise(len(PLAN)), np.arange(len(PLAN))) == 0.0

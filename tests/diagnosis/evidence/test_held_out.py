@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise.diagnosis.evidence.held_out import hold_out_each_part
+from probewise.diagnosis.evidence.held_out import mean_gain_over_parts
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 from probewise.recordings import Recording, paper_plan
 
@@ -40,5 +40,5 @@ def test_many_scans_side_by_side_are_kept_back_by_pattern_and_orientation():
     again, names_again = held_out_parts(Recording(a_turn_more, np.zeros(len(many))))
     np.testing.assert_array_equal(again, parts)
     assert names_again == names
-    held = hold_out_each_part(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
+    held = mean_gain_over_parts(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
     assert dict(held.by_scan) == {names[0]: 1.0, names[1]: -1.0}

@@ -55,7 +55,7 @@ def test_a_class_of_aliases_that_holds_half_is_not_told_apart():
 
 
 def test_what_fails_on_held_out_readings_is_withdrawn():
-    judged = Judged("named", ("lag",), 1e-6, (Hypothesis(("lag",), 1.0),)).withdraw()
+    judged = Judged("named", ("lag",), 1e-6, (Hypothesis(("lag",), 1.0),)).with_verdict_withdrawn()
     assert (judged.verdict, judged.combination, judged.withdrawn) == ("cannot_tell", (), True)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, rows_of_distinct_scans
 from probewise.diagnosis.light_sensor.covariates import varying_covariates
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.recordings import two_way_plan
 
 
@@ -21,17 +21,17 @@ def lying(plan):
 
 def test_without_hands_all_scans_are_over_what_lies_there():
     plan = without_controls()
-    offered = LightSensor(hands=False).candidate_measurements(plan)
+    offered = LightSensorApparatus(hands=False).candidate_measurements(plan)
     assert offered
     assert {scan.plan.pattern_names[int(k)] for scan in offered for k in scan.plan.pattern} == {lying(plan)}
     assert "lay" not in {scan.kind for scan in offered}
-    assert len(offered) < len(LightSensor().candidate_measurements(plan))
+    assert len(offered) < len(LightSensorApparatus().candidate_measurements(plan))
 
 
 def test_a_sensor_that_only_a_hand_can_turn_stays_as_it_is():
     plan = without_controls()
     last_rad = plan.orientation_rad[np.argmax(plan.time_s)]
-    for scan in LightSensor(hands=False).candidate_measurements(plan):
+    for scan in LightSensorApparatus(hands=False).candidate_measurements(plan):
         np.testing.assert_allclose(scan.plan.orientation_rad, last_rad)
 
 
@@ -60,7 +60,7 @@ def test_a_sensor_that_the_arm_can_turn_may_be_turned():
     controlled = replace(two_way_plan().instrumentation, controls=("orientation_deg",))
     kinds = {
         scan.kind
-        for scan in LightSensor(hands=False).candidate_measurements(
+        for scan in LightSensorApparatus(hands=False).candidate_measurements(
             replace(without_controls(), instrumentation=controlled)
         )
     }

@@ -96,8 +96,8 @@ def test_a_run_held_out_of_mixed_runs_leaves_the_others_as_they_were():
     _, law = _law(recording)
     out = recording.plan.scan[recording.usable] == 2
     r = np.random.default_rng(4).normal(size=len(out))
-    np.testing.assert_allclose(law.take(~out)(r[~out]), law(r)[~out])
-    np.testing.assert_allclose(law.take(out)(r[out]), law(r)[out])
+    np.testing.assert_allclose(law.take_readings(~out)(r[~out]), law(r)[~out])
+    np.testing.assert_allclose(law.take_readings(out)(r[out]), law(r)[out])
 
 
 def test_without_a_reading_in_between_the_next_has_its_correlation_with_the_one_before():
@@ -109,8 +109,8 @@ def test_without_a_reading_in_between_the_next_has_its_correlation_with_the_one_
     kept[order[[13, 24]]] = False
     r = np.random.default_rng(5).normal(size=len(order))
     found = np.zeros(len(order))
-    found[kept] = law.take(kept)(r[kept])
-    np.testing.assert_allclose(found[order][kept[order]], other.take(kept[order])(r[order][kept[order]]))
+    found[kept] = law.take_readings(kept)(r[kept])
+    np.testing.assert_allclose(found[order][kept[order]], other.take_readings(kept[order])(r[order][kept[order]]))
 
 
 @pytest.mark.parametrize("left_out", ["first", "first two", "from the first on"])
@@ -129,7 +129,7 @@ def test_without_the_first_reading_of_a_run_the_next_is_its_first(left_out):
     cov = np.where(scan[kept][:, None] == scan[kept], rho ** np.abs(own[:, None] - own), 0.0)
     expected = -0.5 * r[kept] @ np.linalg.solve(cov, r[kept]) - 0.5 * np.linalg.slogdet(cov)[1]
     for law, at in ((mixed, np.argsort(order)), (apart, np.arange(len(order)))):
-        taken = law.take(kept[at])
+        taken = law.take_readings(kept[at])
         assert -0.5 * np.sum(taken(r[at][kept[at]]) ** 2) - taken.half_log_det() == pytest.approx(expected)
 
 
@@ -145,7 +145,10 @@ def test_the_memory_of_mixed_runs_is_along_each_run():
     for k, own in enumerate(each):  # route two: the memory of each run, alone in its table
         there = [label == "what was seen before" for label in mixed.labels]
         alone = [label == "what was seen before" for label in own.labels]
-        columns, others = mixed.take(np.flatnonzero(there)).columns, own.take(np.flatnonzero(alone)).columns
+        columns, others = (
+            mixed.take_templates(np.flatnonzero(there)).columns,
+            own.take_templates(np.flatnonzero(alone)).columns,
+        )
         np.testing.assert_array_equal(columns[scan == k], others)
 
 

@@ -84,7 +84,7 @@ def test_pseudo_residuals_say_as_much_as_the_density_does(share, times):
     one = np.ones(1)
     plain, moved = (tail.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
-    assert np.var(plain) == pytest.approx(1 / float(tail.information), rel=0.02)
+    assert np.var(plain) == pytest.approx(1 / float(tail.fisher_information), rel=0.02)
     assert np.abs(plain).max() < 10
 
 
@@ -206,7 +206,7 @@ def test_a_law_of_some_scans_is_that_of_the_whole():
     law = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(found.predicted).laws[20]
     rows = PLAN.scan == 1
     r = np.random.default_rng(7).normal(size=N)
-    np.testing.assert_allclose(law.take(rows)(r[rows]), law(r)[rows])
+    np.testing.assert_allclose(law.take_readings(rows)(r[rows]), law(r)[rows])
 
 
 def test_the_rough_sd_needs_no_model():

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.noise.law import NoiseLaw, stacked_density
 from probewise.diagnosis.noise.models import NoiseModel, least_sd_given_rounding, rough_sd
 from probewise.diagnosis.noise.rounded_normal import RoundedNormal
@@ -70,7 +70,7 @@ def test_pseudo_residuals_say_as_much_as_the_density_does(half):
     flat, one = RoundedNormal(half, 1.0), np.ones(1)
     plain, moved = (flat.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.03)
-    assert np.var(plain) == pytest.approx(1 / float(flat.information), rel=0.02)
+    assert np.var(plain) == pytest.approx(1 / float(flat.fisher_information), rel=0.02)
 
     def squared_score(x: float) -> float:
         density = (norm.cdf(x + half) - norm.cdf(x - half)) / (2 * half)
@@ -78,7 +78,7 @@ def test_pseudo_residuals_say_as_much_as_the_density_does(half):
         return slope**2 / density
 
     wanted = quad(squared_score, -half - 7, half + 7, points=[-half, half], limit=200)[0]
-    assert float(flat.information) == pytest.approx(wanted, rel=1e-4)
+    assert float(flat.fisher_information) == pytest.approx(wanted, rel=1e-4)
 
 
 def test_inside_the_flat_top_a_residual_says_nothing():
@@ -227,7 +227,7 @@ def test_where_no_three_readings_follow_each_other_nothing_says_that_a_step_is_c
 def test_what_rivals_are_told_by_is_the_noise_of_a_reading_rounding_and_all():
     """A whole step of noise and rounding is no less than either: of the normal part alone it would be."""
     recording = as_declared(rounded(0.4, 1))
-    found = search(Prepared(recording, {}, None, LightSensor(), recording), max_order=1)
+    found = search(Prepared(recording, {}, None, LightSensorApparatus(), recording), max_order=1)
     (null,) = found.evidences.fits.values()
     assert null.law.flat > 0
     rms = np.sqrt(np.mean(null.found.residuals**2))

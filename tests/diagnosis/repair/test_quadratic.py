@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.hypothesis_problem import log_likelihood_of_whitened_residuals
+from probewise.diagnosis.evidence.hypothesis_problem import log_likelihood_marginal_over_sigma
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 from probewise.diagnosis.repair.surrogate import SurrogatePosterior
@@ -23,7 +23,7 @@ def curve(z):
 
 
 def predicted(quadratic, e):
-    return quadratic.center + quadratic.amounts_of_changes(e) @ quadratic.changes
+    return quadratic.center + quadratic.change_coefficients(e) @ quadratic.changes
 
 
 CARRY = np.where(np.arange(40) % 20 > 0, 0.4, 0.0)
@@ -78,7 +78,7 @@ def test_the_density_is_that_of_its_predictions():
     e = np.random.default_rng(5).standard_normal((30, 3))
     z = CENTER + e @ STEPS
     residuals = (readings - predicted(quadratic, e)).T
-    expected = log_likelihood_of_whitened_residuals(LAW, LAW(residuals)) - 0.5 * np.sum(z**2, axis=1)
+    expected = log_likelihood_marginal_over_sigma(LAW, LAW(residuals)) - 0.5 * np.sum(z**2, axis=1)
     near = SurrogatePosterior.of(quadratic, CENTER, STEPS, readings, LAW)
     np.testing.assert_allclose(near.log_density(e), expected, rtol=1e-9)
     assert near.log_density(np.full((1, 3), 100.0))[0] == -np.inf
@@ -94,7 +94,7 @@ def test_under_a_tail_the_density_falls_off_as_it_should():
         readings = noisy(0.1, seed, tailed)
         near = SurrogatePosterior.of(quadratic, CENTER, STEPS, readings, tailed)
         true = [
-            log_likelihood_of_whitened_residuals(tailed, tailed((readings - predicted(quadratic, at)).T))
+            log_likelihood_marginal_over_sigma(tailed, tailed((readings - predicted(quadratic, at)).T))
             for at in (e, np.zeros((1, 3)))
         ]
         prior = 0.5 * np.sum((CENTER + e @ STEPS) ** 2, axis=1) - 0.5 * np.sum(CENTER**2)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.repair.repair import Predicted, Repair, repair_of
+from probewise.diagnosis.repair.repair import PredictionAndResiduals, Repair, repair_of
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.recordings import Plan, Recording, Uniform
 
@@ -19,8 +19,8 @@ def repair(absent=None, residuals=(1.0, np.nan)):
         chain=SimpleNamespace(effects=(LAG,)),
         effect_samples=lambda name: np.array([[2.0], [2.0], [0.0], [0.0]]),
     )
-    before = Predicted(np.zeros(2), np.array([1.0, np.nan]))
-    return Repair(model, model, None, before, Predicted(np.zeros(2), np.array(residuals)))
+    before = PredictionAndResiduals(np.zeros(2), np.array([1.0, np.nan]))
+    return Repair(model, model, None, before, PredictionAndResiduals(np.zeros(2), np.array(residuals)))
 
 
 def test_a_repair_that_predicts_the_same_changes_nothing():

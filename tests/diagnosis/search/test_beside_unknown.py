@@ -15,9 +15,9 @@ def test_a_name_stands_beside_what_is_unknown_in_its_share_of_the_evidence():
     more = math.log(3.0) + prior.log_prior_with_unknown(()) - prior.log_prior_with_unknown(("lag",))
     unknown = {(0, (), ()): 10.0, (0, ("lag",), ()): 10.0 + more}
     searched = SimpleNamespace(evidences=Evidences({}, unknown=unknown), prior=prior, certain=())
-    assert Searched.probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
+    assert Searched.effect_probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
 
 
 def test_nothing_stands_beside_what_was_not_weighed():
     searched = SimpleNamespace(evidences=Evidences({}), prior=PriorOdds(), certain=())
-    assert Searched.probabilities_given_unknown(searched) == {}
+    assert Searched.effect_probabilities_given_unknown(searched) == {}

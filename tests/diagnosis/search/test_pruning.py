@@ -38,7 +38,7 @@ class Held:
     def found(self):
         return SimpleNamespace(residuals=np.full(N, self.left))
 
-    def with_factor_and_weights(self, log_share, _):
+    def with_variant_factor_and_weights(self, log_share, _):
         return replace(self, log_z=self.log_z + log_share - self.log_share, log_share=log_share)
 
 

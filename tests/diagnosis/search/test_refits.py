@@ -12,7 +12,7 @@ from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.search import search as searching
 from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.refits import Refits, _amounts_in_residual, is_significant
+from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, is_significantly_better
 from probewise.diagnosis.search.searched import Evidences, posterior_of
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.twins import are_proportional
@@ -79,15 +79,17 @@ def test_effects_of_different_curves_are_no_twins(state):
 
 def test_a_fit_at_a_poor_optimum_is_made_again_from_where_one_more_effect_led(prepared):
     state = _state(prepared)
-    good = state.refit(state.null, "sensitivity:room")
+    good = state.refit_with_effect(state.null, "sensitivity:room")
     bigger = state.refits.refit_with_effect(good, state.effects["offset_drift"])[0]
     state.refit_subset_from(bigger, "offset_drift")
-    assert state.candidates_of(("sensitivity:room",)) == [good]  # as good as from there: it stays
-    poor = replace(good.shifted(-100.0), found=replace(good.found, objective=good.found.objective + 100.0))
-    state.keep(poor)
+    assert state.candidates_of_combination(("sensitivity:room",)) == [good]  # as good as from there: it stays
+    poor = replace(
+        good.with_log_evidence_shifted(-100.0), found=replace(good.found, objective=good.found.objective + 100.0)
+    )
+    state.store_candidate(poor)
     state.refits.replace_fit(good, poor)
     state.refit_subset_from(bigger, "offset_drift")
-    (again,) = state.candidates_of(("sensitivity:room",))
+    (again,) = state.candidates_of_combination(("sensitivity:room",))
     assert again.log_z == pytest.approx(good.log_z, abs=0.02)
     assert again.log_share == good.log_share
     np.testing.assert_allclose(again.found.predicted, good.found.predicted, atol=1e-3)
@@ -101,7 +103,7 @@ def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
     assert weighed.evidence[()].log_z > state.null.evidence[()].log_z + 20
     idle = state.refits.refit_with_effect(state.null, state.effects["input_offset:force"])[0]
     assert idle.evidence.keys() == state.null.evidence.keys()
-    assert not is_significant(idle, state.null)
+    assert not is_significantly_better(idle, state.null)
     assert idle.log_z <= state.null.log_z + 0.02
 
 
@@ -120,7 +122,7 @@ def test_a_second_search_makes_hardly_a_refit_again(prepared, monkeypatch):
     refitted = [names for names in fitted if names]
     assert {len(names) for names in refitted} <= {1}
     assert len(refitted) < len([names for names in made if names]) / 2
-    assert again.posterior.by_mean == pytest.approx(first.posterior.by_mean, abs=1e-6)
+    assert again.posterior.marginal_over_noise == pytest.approx(first.posterior.marginal_over_noise, abs=1e-6)
 
 
 def test_amounts_of_one_value_for_each_run_leave_what_they_have_in_common_to_the_parameter():
@@ -136,14 +138,14 @@ def test_amounts_of_one_value_for_each_run_leave_what_they_have_in_common_to_the
     residual = runs @ values + 6e-3 * trace / np.linalg.norm(trace)
     plain = np.linalg.lstsq(projected, residual)[0]
     assert np.abs(plain - values).max() > 3.0
-    np.testing.assert_allclose(_amounts_in_residual(projected, residual), values, atol=0.02)
+    np.testing.assert_allclose(_amplitudes_in_residual(projected, residual), values, atol=0.02)
 
 
 def test_of_one_column_the_amount_is_that_of_least_squares():
     rng = np.random.default_rng(1)
     column, residual = rng.normal(size=(20, 1)), rng.normal(size=20)
     exact = float(column[:, 0] @ residual / (column[:, 0] @ column[:, 0]))
-    np.testing.assert_allclose(_amounts_in_residual(column, residual), [exact])
+    np.testing.assert_allclose(_amplitudes_in_residual(column, residual), [exact])
 
 
 def test_a_slope_that_differs_from_run_to_run_is_fitted_as_well_as_one_straight_line_for_each():

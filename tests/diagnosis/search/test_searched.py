@@ -15,7 +15,7 @@ PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 class Fit(SimpleNamespace):
     """As much of a weighed fit as its evidence."""
 
-    def shifted(self, by):
+    def with_log_evidence_shifted(self, by):
         return Fit(evidence={k: SimpleNamespace(log_z=e.log_z + by) for k, e in self.evidence.items()})
 
 
@@ -35,7 +35,7 @@ def posterior(evidences=EVIDENCES):
 
 
 def test_probabilities_are_prior_times_evidence_summed_over_orders():
-    by_mean = posterior().by_mean
+    by_mean = posterior().marginal_over_noise
     assert sum(by_mean.values()) == pytest.approx(1.0)
     share = PRIOR.by_size[0] / 2
     assert by_mean["lag",] / by_mean[()] == pytest.approx(share * math.exp(5.0) / (PRIOR.clean_mean * 4.0))
@@ -48,7 +48,7 @@ def test_orders_are_those_of_the_clean_mean_alone():
 
 
 def test_evidence_that_is_moved_moves_what_is_unknown_beside_it():
-    moved = EVIDENCES.shifted({(1, ()): 2.0})
+    moved = EVIDENCES.with_log_evidence_shifted({(1, ()): 2.0})
     assert moved.unknown[1, (), ()] == 3.0
     assert [moved.fits[key].evidence[()].log_z for key in ((1, ()), (1, ("lag",)))] == [2.0, 5.0]
     assert EVIDENCES.unknown[1, (), ()] == 1.0

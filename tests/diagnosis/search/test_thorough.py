@@ -10,7 +10,7 @@ from mixtures import fixed_mixture
 
 from probewise import nested
 from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, weigh_thoroughly
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
@@ -46,7 +46,7 @@ def searched(recording):
     names = ("ambient_step", "hysteresis")
     effects = {name: VOCABULARY[name].for_extent(Extent.of(recording)) for name in names}
     built = {name: effect for name, effect in effects.items() if effect is not None}
-    return search(Prepared(recording, built, LINE, LightSensor(), recording))
+    return search(Prepared(recording, built, LINE, LightSensorApparatus(), recording))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from typing import cast
 import numpy as np
 from heater import runs
 
-from probewise.diagnosis.system.commands import as_alternatives, in_sequence, possible_run_commands
+from probewise.diagnosis.system.commands import plan_in_sequence, plan_of_alternatives, possible_run_commands
 from probewise.systems import RunTable
 
 TABLE = runs()
@@ -45,13 +45,13 @@ def test_time_that_goes_on_is_later_than_all_that_was_recorded():
     time = np.arange(float(len(TABLE)))
     table = TABLE.with_columns({"t_s": time})
     commands = list(offered((), table).values())
-    asked = cast(RunTable, in_sequence(commands[:2], table))
+    asked = cast(RunTable, plan_in_sequence(commands[:2], table))
     assert (np.diff(asked.time_s) > 0).all()
     assert asked.time_s[0] > time[-1]
 
 
 def test_commands_set_behind_each_other_are_runs_of_their_own():
-    together = cast(RunTable, as_alternatives(list(offered().values())[:3], TABLE))
+    together = cast(RunTable, plan_of_alternatives(list(offered().values())[:3], TABLE))
     assert len(together.scan_names) == 3
     assert set(together.like.values()) <= set(TABLE.scan_names)
 

@@ -33,7 +33,7 @@ def _prepared(more, **options):
 def test_covariates_that_are_no_columns_keep_their_values_beside_columns_of_that_name():
     prepared = _prepared({**_OWN, "days": np.repeat([1.0, 2.0], _N // 2)}, run="days")
     predicted = np.linspace(0.0, 1.0, _N) ** 2
-    found = prepared.apparatus.covariates_by_row(predicted)
+    found = prepared.apparatus.covariate_values_by_name(predicted)
     np.testing.assert_array_equal(found["level"], predicted)
     np.testing.assert_array_equal(found["time"], _T)
     np.testing.assert_array_equal(found["run"], np.repeat([0.0, 1.0], _N // 2))
@@ -46,7 +46,7 @@ def test_covariates_that_are_no_columns_keep_their_values_beside_columns_of_that
 @pytest.mark.parametrize("name", ["level", "time", "run", "previous", "scan", "state:s", "room_c"])
 def test_every_effect_of_a_column_shows_in_it(name):
     about = _prepared({name: _OWN[name]}).apparatus.about
-    known = set(_prepared({name: _OWN[name]}).apparatus.covariates_by_row(about.predicted))
+    known = set(_prepared({name: _OWN[name]}).apparatus.covariate_values_by_name(about.predicted))
     for form in (bind_forms(about)[f"sensitivity:{name}"], *(p for p in formula_forms(about) if name in p.name)):
         assert covariate_of_column(name) in form.covariates or "time" in form.covariates
         assert set(form.covariates) <= known

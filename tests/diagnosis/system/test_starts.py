@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.system.diagnose import fit_system, recording_of
+from probewise.diagnosis.system.diagnose import fit_system, recording_from_table
 from probewise.systems import Law, RunTable, Simulator, System
 
 
@@ -24,7 +24,7 @@ def test_a_fit_of_prey_and_hunters_finds_the_period_of_their_swings():
     theta = np.array([[truth[name] for name in system.marginals]])
     noise_free = system.chain(empty, ()).predict(theta, empty)[0]
     readings = noise_free + 0.3 * np.random.default_rng(0).normal(size=80)
-    recording = recording_of(simulator, empty.with_columns({"n": readings}))
+    recording = recording_from_table(simulator, empty.with_columns({"n": readings}))
     _, found, _ = fit_system(System.of(simulator, recording.plan), recording)
     fitted = dict(zip(system.marginals, system.theta(found.z[None, :])[0], strict=True))
     assert fitted == pytest.approx(truth, rel=0.03)

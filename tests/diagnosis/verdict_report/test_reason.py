@@ -66,7 +66,7 @@ SAID = [
         "them for heavy-tailed noise, gives p = 0.0001).",
     ),
     (
-        judged("named", ("lag",)).withdraw(),
+        judged("named", ("lag",)).with_verdict_withdrawn(),
         {},
         "Something is missing (p = 0.0001); lag fits these readings best, but predicts held-out readings far worse "
         "than the oven's law without it.",

@@ -100,10 +100,10 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         telling[name], chosen[name] = templates.columns[best], templates.variant_of_entry(best)
     apparatus = prepared.apparatus
     pairs = collinear_pairs(problem, telling, otherwise=apparatus.words.settles_nothing)
-    return add_separating_plans(pairs, found, chosen, problem.sd, apparatus)
+    return pairs_with_separating_scans(pairs, found, chosen, problem.sd, apparatus)
 
 
-def add_separating_plans(
+def pairs_with_separating_scans(
     pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float, apparatus: Apparatus
 ) -> list[Alias]:
     """Return the pairs, each with the candidate plan that separates it best and the number of readings needed.

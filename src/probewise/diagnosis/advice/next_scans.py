@@ -58,7 +58,7 @@ class Rival:
     root: FloatArray
     probability: float
 
-    def predictive(self, plan: Plan, sd: float) -> PredictiveNormal:
+    def predictive_distribution(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
         mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
         return PredictiveNormal(mean / sd, slopes @ self.root / sd)
@@ -71,7 +71,7 @@ class PredictiveNormal:
     mean: FloatArray
     factor: FloatArray
 
-    def take(self, rows: IntArray) -> PredictiveNormal:
+    def take_readings(self, rows: IntArray) -> PredictiveNormal:
         """Return the predictive distribution of the readings in these rows."""
         return PredictiveNormal(self.mean[rows], self.factor[rows])
 
@@ -102,11 +102,11 @@ def measurement_separating_rivals(
     offered = apparatus.candidate_measurements(plan, strides=_STRIDES, level=level)
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
-    offered = [offered[k] for k in _shortlist_indices(rivals, sd, offered, plan, apparatus)]
+    offered = [offered[k] for k in _shortlisted_command_indices(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
     everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
-    predictives = [rival.predictive(everywhere, sd) for rival in rivals]
+    predictives = [rival.predictive_distribution(everywhere, sd) for rival in rivals]
 
     chosen: list[int] = []
     taken: IntArray = np.zeros(0, dtype=np.int64)
@@ -117,7 +117,9 @@ def measurement_separating_rivals(
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
                 gains[k] = (
-                    mutual_information_lower_bound([predictive.take(together) for predictive in predictives], weights)
+                    mutual_information_lower_bound(
+                        [predictive.take_readings(together) for predictive in predictives], weights
+                    )
                     - told
                 )
         gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
@@ -133,7 +135,9 @@ def measurement_separating_rivals(
         apparatus.plan_in_sequence(scans, plan),
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
-        _log_bayes_factor_over_closest([predictive.take(taken) for predictive in predictives], weights),
+        _expected_log_bayes_factor_over_closest(
+            [predictive.take_readings(taken) for predictive in predictives], weights
+        ),
         tuple(rival.label for rival in rivals),
     )
 
@@ -158,7 +162,7 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
 
 
-def _shortlist_indices(
+def _shortlisted_command_indices(
     rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
 ) -> list[int]:
     """Return the indices of the few scans, for each pair of rivals, in which predictions differ most per minute."""
@@ -176,7 +180,7 @@ def _shortlist_indices(
     return list(kept)
 
 
-def _log_bayes_factor_over_closest(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
+def _expected_log_bayes_factor_over_closest(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
     """Return the expected log Bayes factor of the truth over its closest rival, in nats, averaged over the truth."""
     covariances = [predictive.covariance for predictive in predictives]
     inverse = [np.linalg.inv(covariance) for covariance in covariances]

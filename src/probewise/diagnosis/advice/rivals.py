@@ -30,7 +30,7 @@ def choose_next_measurement(searched: Searched, null: WeighedFit) -> NextMeasure
     If only one is left, its rival is an effect too weak to be detected so far. None if no scan is informative, or only
     one is left and the budget of costly predictions is spent.
     """
-    by_mean = searched.posterior.by_mean
+    by_mean = searched.posterior.marginal_over_noise
     # An unknown effect makes no prediction beyond the null.
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}

@@ -19,7 +19,7 @@ from probewise.diagnosis.audit.detectability import (
 )
 from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans
-from probewise.diagnosis.light_sensor.scheduling import Scan, postponed
+from probewise.diagnosis.light_sensor.scheduling import Scan, scan_started_after
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
@@ -61,16 +61,16 @@ def choose_cure_scans(
         progress("looking for readings that cure", len(chosen), _MOST_SCANS)
         taken = {command.plan.scan_names for command in chosen}
         offered = [c for c in every if c.plan.scan_names not in taken]
-        options = [postponed(command, current) for command in offered]
+        options = [scan_started_after(command, current) for command in offered]
         if not options:
             break
         together = join_plans([current, *(option.plan for option in options)])
         laid = PlanTemplates.of(expected, together, effects, most=_MOST_SETTINGS)
         now = np.arange(len(current))
-        trouble = _total_deficit(laid, now, ailing)
+        trouble = _total_detectability_deficit(laid, now, ailing)
         worth = []
         for start, end in itertools.pairwise(np.cumsum([len(current), *(len(o.plan) for o in options)]).tolist()):
-            gained = trouble - _total_deficit(laid, np.concatenate([now, np.arange(start, end)]), ailing)
+            gained = trouble - _total_detectability_deficit(laid, np.concatenate([now, np.arange(start, end)]), ailing)
             readings = end - start
             worth.append(gained / readings if gained >= max(_WORTHWHILE, _WORTHWHILE_EACH * readings) else 0.0)
         best = int(np.argmax(worth))
@@ -81,9 +81,9 @@ def choose_cure_scans(
     return chosen
 
 
-def _total_deficit(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
+def _total_detectability_deficit(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
     """Return the summed deficit of effects: 0 fine, up to 1 aliased, 1 to 2 invisible."""
-    detectability = ProjectedTemplates.of(laid, rows).shares_and_cosines(ailing)
+    detectability = ProjectedTemplates.of(laid, rows).detectable_shares_and_cosines(ailing)
     total = 0.0
     for name in ailing:
         share, like = detectability.get(name, (0.0, {}))

@@ -147,7 +147,9 @@ class ProjectedTemplates:
             n_points,
         )
 
-    def shares_and_cosines(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
+    def detectable_shares_and_cosines(
+        self, asked: Sequence[str] | None = None
+    ) -> dict[str, tuple[float, dict[str, float]]]:
         """Return, by effect, its detectable share, and its cosine to every other detectable effect, by name.
 
         Both are medians over the effect's settings; the cosine is to the best-imitating setting of the other effect.

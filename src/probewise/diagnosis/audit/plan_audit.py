@@ -37,9 +37,9 @@ from probewise.diagnosis.fitting.sensor_prior import (
     sensor_from_samples,
 )
 from probewise.diagnosis.joining import join_plans
-from probewise.diagnosis.light_sensor.sensor import LightSensor
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
-from probewise.diagnosis.verdict_report.words import with_unit_of_reading
+from probewise.diagnosis.verdict_report.words import substitute_reading_unit
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
@@ -148,13 +148,15 @@ class PlanAudit(ShowsItself):
     cosines: FloatArray
     cures: tuple[Cure, ...]
     after: tuple[EffectAudit, ...]
-    words: Words = LightSensor.words
+    words: Words = LightSensorApparatus.words
     classes: tuple[tuple[str, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cosines", read_only_floats(self.cosines))
 
-    def seen_as(self, detectability: Detectability, *, after: bool = False) -> tuple[EffectAudit, ...]:
+    def effects_with_detectability(
+        self, detectability: Detectability, *, after: bool = False
+    ) -> tuple[EffectAudit, ...]:
         """Return the effects with this detectability, under the plan or the plan with its cures.
 
         Raises
@@ -166,6 +168,8 @@ class PlanAudit(ShowsItself):
         return tuple(
             effect for effect in (self.after if after else self.effects) if effect.detectability == detectability
         )
+
+    seen_as = effects_with_detectability  # its old name
 
     @property
     def cure_plan(self) -> Plan | None:
@@ -189,12 +193,16 @@ class PlanAudit(ShowsItself):
         lines = [
             f"{len(self.plan)} readings in {count_with_noun(self.plan.scan_names, self.words.run)}; {self.assumed}"
         ]
-        lines += _wrapped_lines("fine", [e.name for e in self.seen_as("fine")])
-        lines += _wrapped_lines("aliased", [_name_with_alias(e) for e in self.seen_as("aliased")])
-        lines += _wrapped_lines("invisible", [e.name for e in self.seen_as("invisible")])
+        lines += _wrapped_lines("fine", [e.name for e in self.effects_with_detectability("fine")])
+        lines += _wrapped_lines("aliased", [_name_with_alias(e) for e in self.effects_with_detectability("aliased")])
+        lines += _wrapped_lines("invisible", [e.name for e in self.effects_with_detectability("invisible")])
         lines += _READING_GUIDE
         if not self.cures:
-            cured = "not needed" if len(self.seen_as("fine")) == len(self.effects) else self.words.no_cure
+            cured = (
+                "not needed"
+                if len(self.effects_with_detectability("fine")) == len(self.effects)
+                else self.words.no_cure
+            )
             return "\n".join([*lines, f"cure       {cured}"])
         minutes = "1 minute" if self.extra_minutes < 1.5 else f"{self.extra_minutes:.0f} minutes"
         lines.append(f"cure       {self.extra_readings} more readings, about {minutes}:")
@@ -303,7 +311,7 @@ def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, 
     return fine_since(max(fine_since(len(steps) - 1).values(), default=0))
 
 
-def audit_recorded(
+def audit_plan_of_diagnosis(
     diagnosis: Diagnosis,
     *,
     sensor: SensorPrior | None = None,
@@ -372,7 +380,7 @@ def audits_and_cosines(
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Return the audit of every effect, and the matrix of cosines (row imitated by column)."""
     seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
-    detectability = seen.shares_and_cosines()
+    detectability = seen.detectable_shares_and_cosines()
     names = list(effects)
     cosines = np.zeros((len(names), len(names)))
     out = []
@@ -388,12 +396,12 @@ def audits_and_cosines(
             share, like = detectability[name]
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
-            out.append(_audit_of(effect, share, like, seen.smallest_detectable_amplitudes(effect), unit))
+            out.append(_audit_of_effect(effect, share, like, seen.smallest_detectable_amplitudes(effect), unit))
         cosines[own, own] = out[-1].share
     return tuple(out), cosines
 
 
-def _audit_of(
+def _audit_of_effect(
     effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...], unit: str
 ) -> EffectAudit:
     if share < LEAST_SHARE:
@@ -401,7 +409,7 @@ def _audit_of(
         return EffectAudit(effect.name, "invisible", share, reason=reason)
     alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
     smallest = tuple(
-        DetectableSize(effect.prior.names[k], with_unit_of_reading(effect.units[k], unit), amount)
+        DetectableSize(effect.prior.names[k], substitute_reading_unit(effect.units[k], unit), amount)
         for k, amount in zip(effect.amplitudes, amounts, strict=True)
     )
     return EffectAudit(effect.name, "aliased" if alike else "fine", share, tuple(alike), smallest)

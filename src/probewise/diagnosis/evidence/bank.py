@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence.laplace import Linearised, mix_scales
+from probewise.diagnosis.evidence.laplace import Linearised, average_over_amplitude_scales
 from probewise.diagnosis.noise.law import NoiseLaw
 
 _ABSENT = 1e-9  # share of a template's sum of squares below which its projection is rounding error
@@ -61,7 +61,7 @@ class TemplateBank:
         labels = np.array(self.labels)
         return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
 
-    def take(self, members: IntArray) -> TemplateBank:
+    def take_templates(self, members: IntArray) -> TemplateBank:
         """Return the bank of these templates."""
         at = [self._first_columns[k] + np.arange(self.widths[k]) for k in members]
         columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
@@ -89,14 +89,14 @@ class TemplateBank:
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.widths), own.shape[1]))
         for width, products in whitened.products.items():  # all templates of one width at a time
-            members, at = self._indices_of_width(width)
+            members, at = self._template_and_column_indices(width)
             absorbed = taken[:, at].transpose(1, 0, 2)
             left = products - absorbed.transpose(0, 2, 1) @ absorbed
             gain, axes = _gram_eigensystems(left)
             gain = np.where(gain > _ABSENT * n, gain, 0.0)
             turned = axes.transpose(0, 2, 1) @ along[at]
             explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
-            out[members] = mix_scales(explained, gain, n)
+            out[members] = average_over_amplitude_scales(explained, gain, n)
         return out
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
@@ -106,7 +106,7 @@ class TemplateBank:
         whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._first_columns) for a in (templates, taken))
         return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
 
-    def _indices_of_width(self, width: int) -> tuple[IntArray, IntArray]:
+    def _template_and_column_indices(self, width: int) -> tuple[IntArray, IntArray]:
         """Return the indices of the templates of one width, (n,), and of their columns, (n, width)."""
         members = np.flatnonzero(self.widths == width)
         return members, self._first_columns[members, None] + np.arange(width)
@@ -126,7 +126,7 @@ class TemplateBank:
             whitened *= np.sqrt(len(whitened) / per_column) / np.where(norms > 0, norms, 1.0)
             products = {}
             for width in map(int, np.unique(self.widths)):
-                blocks = whitened[:, self._indices_of_width(width)[1]].transpose(1, 0, 2)
+                blocks = whitened[:, self._template_and_column_indices(width)[1]].transpose(1, 0, 2)
                 products[width] = blocks.transpose(0, 2, 1) @ blocks
             self._whitened[key] = _WhitenedTemplatesAndGrams(whitened, products)
         return self._whitened[key]

@@ -12,7 +12,7 @@ from probewise.errors import NotConvergedError
 _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
 
 
-def checked_finite(found: Fit) -> Fit:
+def checked_finite_fit(found: Fit) -> Fit:
     """Return a fit after checking that its predictions are finite.
 
     Raises
@@ -25,7 +25,7 @@ def checked_finite(found: Fit) -> Fit:
     return found
 
 
-def require_converged(found: Fit, problem: Linearised) -> None:
+def require_converged_fit(found: Fit, problem: Linearised) -> None:
     """Refuse a fit that one more step would still improve much, unless it is at the bounds of its prior.
 
     Raises

@@ -11,7 +11,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw
 
 
-def log_probability_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
+def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
     """Return the log probability that every effect of a fit has a detectable size (lambda).
 
     The size is the norm of the effect's change after a (linearised) refit of all other parameters; its posterior is
@@ -27,11 +27,11 @@ def log_probability_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> f
     usable
         Rows with usable readings, (n_usable,).
     """
-    sd = found.sd / np.sqrt(law.information)
+    sd = found.sd / np.sqrt(law.fisher_information)
     slopes, out = law(found.slopes) / sd, 0.0
     for name in found.model.names:
         rest = np.delete(slopes, found.model.coordinate_slice(name), axis=1)
-        change = law(found.change_by(name, usable)[:, None])[:, 0] / sd
+        change = law(found.change_by_effect(name, usable)[:, None])[:, 0] / sd
         taken = np.linalg.solve(rest.T @ rest + np.eye(rest.shape[1]), rest.T @ change)
         left = float(np.linalg.norm(np.append(change - rest @ taken, taken)))
         out += float(log_ndtr(left - LEAST_VISIBLE))

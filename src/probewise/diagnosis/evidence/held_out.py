@@ -51,7 +51,7 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
         repaired_one, null_one = (_refit_log_densities(f, recording, rows, law, out) for f in (repaired, null))
         return repaired_one - null_one
 
-    return hold_out_each_part(parts, gain_per_reading, names)
+    return mean_gain_over_parts(parts, gain_per_reading, names)
 
 
 def partition_into_blocks(recording: Recording) -> Parts:
@@ -64,7 +64,7 @@ def partition_into_blocks(recording: Recording) -> Parts:
     return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
 
 
-def hold_out_each_part(
+def mean_gain_over_parts(
     scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()
 ) -> HeldOutGain:
     """Hold out one part at a time, at most ten, and average the gains of their readings.
@@ -105,7 +105,7 @@ def _refit_log_densities(
     every model of the mean, is left out.
     """
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
-    rest, own = law.take(~out), law.take(out)
+    rest, own = law.take_readings(~out), law.take_readings(out)
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     asked = np.flatnonzero(rows & recording.usable)
     of_its_own = ~np.any(found.slopes[~out], axis=0) & np.any(found.slopes[out], axis=0)
@@ -114,9 +114,9 @@ def _refit_log_densities(
     # readings may bound them on one side only, as for a ceiling.
     about = np.where(of_its_own, found.z, without.z)
     predicted, slopes = (part[asked] for part in found.model.predict_and_differentiate(about))
-    free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
-    sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_points / free)  # beside rounding it is known
-    curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
+    free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information))
+    sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
+    curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
     miss = recording.readings[asked] - predicted
     if of_its_own.any():
         return _sequential_log_densities(

@@ -82,17 +82,17 @@ class HypothesisProblem:
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
         residuals = (self.recording.readings[usable] - predicted).T
-        nodes, kept = self.noise.nodes, self._kept_nodes
+        nodes, kept = self.noise.nodes, self._kept_node_indices
         laws, log_share = [nodes.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
         terms = [
-            log_weight + log_likelihood_of_whitened_residuals(law, law(residuals))
+            log_weight + log_likelihood_marginal_over_sigma(law, law(residuals))
             for log_weight, law in zip(nodes.log_weights[kept], laws, strict=True)
         ]
         out = np.asarray(logsumexp(terms, axis=0)) + log_share
         return np.where(np.isfinite(out), out, -np.inf)
 
     @cached_property
-    def _kept_nodes(self) -> list[int]:
+    def _kept_node_indices(self) -> list[int]:
         """Indices of the fewest noise nodes that hold 99.9 % of the evidence."""
         order = np.argsort(-self.noise.weights)
         n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1
@@ -100,12 +100,12 @@ class HypothesisProblem:
         return kept
 
 
-def log_likelihood_of_whitened_residuals(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
+def log_likelihood_marginal_over_sigma(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
     """Return the log likelihood of whitened residuals (n_points, n_samples) under one noise distribution: (n_samples,).
 
     Log sigma, with a flat prior, is integrated out by Laplace's method about its peak.
     """
-    n_points = law.n_points
+    n_points = law.n_kept
     sigma = law.likeliest_sigma(whitened)
     curvature = (
         law.whitened_density.log_sigma_curvature(whitened, sigma, n_points)

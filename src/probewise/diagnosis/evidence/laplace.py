@@ -107,7 +107,7 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
 
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under Gaussian noise models, (n_laws,); `joined`: slopes and residual."""
-    p, n_points = joined.shape[1] - 1, np.array([law.n_points for law in laws])
+    p, n_points = joined.shape[1] - 1, np.array([law.n_kept for law in laws])
     if any(law.walk.size or law.before.size for law in laws):
         turned = np.stack([law(joined) for law in laws])
     else:
@@ -137,7 +137,7 @@ def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
 def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under noise models of one whitening with different tails or rounding, (n_laws,)."""
     turned = laws[0](joined)
-    p, n_points = turned.shape[1] - 1, laws[0].n_points
+    p, n_points = turned.shape[1] - 1, laws[0].n_kept
     slopes, residual = turned[:, :p], turned[:, p:]
     gram = slopes.T @ slopes
     tail, least = stacked_density(laws), laws[0].sigma_floor
@@ -145,7 +145,7 @@ def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
     for _ in range(3):
         left = residual - slopes @ steps
         sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
-        variance = sigma**2 / tail.information
+        variance = sigma**2 / tail.fisher_information
         curvature = gram / variance[:, None, None] + np.eye(p)
         downhill = slopes.T @ tail.normal_pseudo_residuals(left, sigma) / variance - found.z[:, None] - steps
         steps += _newton_steps(curvature, downhill.T).T
@@ -197,9 +197,9 @@ class Linearised:
         turned, sigma = law(slopes), law.likeliest_sigma(whitened)
         known = bool(law.flat) or (law.least > 0 and float(sigma[0]) <= law.sigma_floor)
         sigma = np.where(sigma > 0, sigma, found.sd)
-        free = residual_degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
+        free = residual_degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.fisher_information))
         sigma = sigma if known else sigma * math.sqrt(n_points / free)
-        sd = float(sigma[0]) / math.sqrt(law.information)
+        sd = float(sigma[0]) / math.sqrt(law.fisher_information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
         augmented = np.concatenate([law.bounded_pseudo_residuals(whitened, sigma)[:, 0] / sd, -z])
         residual = augmented - basis @ (basis.T @ augmented)
@@ -228,7 +228,9 @@ class Linearised:
         """Return the shift of a fit's coordinates, (n_params,), that absorbs a change of predictions (n_points,)."""
         slopes = self.law(found.slopes) / self.sd
         left = self.law(found.residuals - change)[:, None]
-        normal = self.law.normal_pseudo_residuals(left, np.array([self.sd * math.sqrt(self.law.information)]))[:, 0]
+        normal = self.law.normal_pseudo_residuals(left, np.array([self.sd * math.sqrt(self.law.fisher_information)]))[
+            :, 0
+        ]
         shift = slopes.T @ (normal / self.sd) - found.z
         return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
 
@@ -323,11 +325,11 @@ def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_
     for width in np.unique(widths):  # all blocks of one width at a time
         members = np.flatnonzero(widths == width)
         columns = blocks.starts[members, None] + np.arange(width)
-        out[members] = mix_scales(scores[columns], blocks.gain[columns], n_points)
+        out[members] = average_over_amplitude_scales(scores[columns], blocks.gain[columns], n_points)
     return out
 
 
-def mix_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatArray:
+def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatArray:
     """Average the Bayes factors of templates of one width over the `SCALES` at which each is detectable.
 
     At smaller scales the projected template has an rms lambda below `LEAST_VISIBLE`: the Bayes factor is near one

@@ -29,13 +29,13 @@ def log_mean_exp(scores: FloatArray) -> float:
     return top + math.log(float(np.exp(scores - top).mean())) if math.isfinite(top) else top
 
 
-def score_bank_entries(problem: Linearised, bank: TemplateBank) -> dict[str, FloatArray]:
+def log_bayes_factors_by_label(problem: Linearised, bank: TemplateBank) -> dict[str, FloatArray]:
     """Return the log Bayes factors of the entries of each effect's bank, by name, (n_entries,)."""
     scores = bank.log_bayes_factors(problem)[:, 0]
     return {name: scores[members] for name, members in bank.indices_by_label.items()}
 
 
-def score_pairs(
+def log_bayes_factors_of_pairs(
     problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
 ) -> dict[Names, float]:
     """Return the log Bayes factors of pairs: the sum of singles, corrected by the joint score of their best entries."""

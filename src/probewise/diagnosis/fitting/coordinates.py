@@ -85,12 +85,12 @@ class CalibratedSensor(ABC):
         return False
 
     @abstractmethod
-    def from_natural(self, natural: FloatArray) -> FloatArray:
+    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
         """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
 
     @abstractmethod
-    def to_natural(self, theta: FloatArray) -> FloatArray:
-        """Invert `from_natural`."""
+    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
+        """Invert `theta_from_natural`."""
 
     @property
     def starts(self) -> FloatArray:
@@ -113,11 +113,11 @@ class CalibratedSensor(ABC):
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
-        return self.from_natural(self._natural_from_z(z))
+        return self.theta_from_natural(self._natural_from_z(z))
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Invert `theta`."""
-        return self._z_from_natural(self.to_natural(theta))
+        return self._z_from_natural(self.natural_from_theta(theta))
 
     def _natural_from_z(self, z: FloatArray) -> FloatArray:
         return self.center + z @ self.factor.T
@@ -170,12 +170,12 @@ class GaussianMixtureSensor(CalibratedSensor):
         """Its number of Gaussians, in words."""
         return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
 
-    def from_natural(self, natural: FloatArray) -> FloatArray:
+    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
         """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max: one column more."""
         return natural_to_theta(natural, self.n_gaussians)
 
-    def to_natural(self, theta: FloatArray) -> FloatArray:
-        """Invert `from_natural`."""
+    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
+        """Invert `theta_from_natural`."""
         return theta_to_natural(theta, self.n_gaussians)
 
     def permuted(self, z: FloatArray, order: Sequence[int]) -> FloatArray:

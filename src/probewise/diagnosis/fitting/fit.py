@@ -119,7 +119,7 @@ class Fit:
     objective: float
     settled: bool = False
 
-    def change_by(self, name: str, usable: IntArray) -> FloatArray:
+    def change_by_effect(self, name: str, usable: IntArray) -> FloatArray:
         """Return the predictions minus those without one of its effects, other parameters fixed, (n_usable,)."""
         without, stay = self.model.model_and_mask_without(name)
         return np.asarray(self.predicted - without.predict(self.z[None, stay])[0, usable])
@@ -169,7 +169,7 @@ def fit_each_start(
 
     If predictions broadcast, the fits run in parallel, in batches that fit a processor's cache.
     """
-    walks = [_minimisation(model, recording, start, law, max_steps, tolerance) for start in starts]
+    walks = [_fit_coroutine(model, recording, start, law, max_steps, tolerance) for start in starts]
     at_once = 1
     if model.sensor.predicts_in_bulk:
         at_once = max(_AT_ONCE // (len(_DAMPINGS) * (model.n_params + 1) * len(recording.readings)), 1)
@@ -188,7 +188,7 @@ def fit_each_start(
     return [found[k] for k in range(len(walks))]
 
 
-def _minimisation(
+def _fit_coroutine(
     model: Model, recording: Recording, start: FloatArray, law: NoiseLaw, max_steps: int, tolerance: float
 ) -> Generator[FloatArray, FloatArray, Fit]:
     """Minimise from one start: yields points to predict, (n, n_params), and is sent predictions, (n, n_points)."""
@@ -217,7 +217,7 @@ def _minimisation(
     for _ in range(max_steps):
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
         sigma = law.likeliest_sigma(whitened)
-        variance = float(sigma[0]) ** 2 / law.information
+        variance = float(sigma[0]) ** 2 / law.fisher_information
         curvature = turned.T @ turned / variance + eye
         downhill = turned.T @ law.normal_pseudo_residuals(whitened, sigma)[:, 0] / variance - z
         tries = _damped_steps(curvature, downhill)

@@ -62,17 +62,17 @@ class FreeFormSensor(CalibratedSensor):
         """The words for a free form."""
         return "an SSF of free form"
 
-    def from_natural(self, natural: FloatArray) -> FloatArray:
+    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
         """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
         one = natural_to_theta(natural[:, :-N_BENDS], 1)
         return np.concatenate([free_form_parameters(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
 
-    def to_natural(self, theta: FloatArray) -> FloatArray:
-        """Invert `from_natural`."""
-        return free_form_to_natural(theta)
+    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
+        """Invert `theta_from_natural`."""
+        return theta_to_free_form_natural(theta)
 
 
-def free_form_to_natural(theta: FloatArray) -> FloatArray:
+def theta_to_free_form_natural(theta: FloatArray) -> FloatArray:
     """Map theta, (n_samples, 6 N + 2), to a free form's natural coordinates, (n_samples, 7 + N_BENDS)."""
     # The amplitude of the first does not enter its natural coordinates.
     one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)

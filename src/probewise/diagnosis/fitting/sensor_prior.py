@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_like
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.fitting.coordinates import CalibratedSensor, GaussianMixtureSensor, theta_to_natural
-from probewise.diagnosis.fitting.free_form import FreeFormSensor, free_form_to_natural
+from probewise.diagnosis.fitting.free_form import FreeFormSensor, theta_to_free_form_natural
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor import is_free_form
@@ -40,11 +40,11 @@ def sensor_from_posterior(
     mean = np.asarray(mean, dtype=np.float64)[at]
     cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
     free = is_free_form(mean[None, :-2])
-    to_natural = free_form_to_natural if free else partial(theta_to_natural, n_gaussians=n_gaussians)
-    center = to_natural(mean[None, :])[0]
+    natural_from_theta = theta_to_free_form_natural if free else partial(theta_to_natural, n_gaussians=n_gaussians)
+    center = natural_from_theta(mean[None, :])[0]
     steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
-    up = to_natural(mean + np.diag(steps))
-    down = to_natural(mean - np.diag(steps))
+    up = natural_from_theta(mean + np.diag(steps))
+    down = natural_from_theta(mean - np.diag(steps))
     slope = ((up - down) / (2 * steps[:, None])).T
     natural_cov = slope @ cov @ slope.T
     floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)

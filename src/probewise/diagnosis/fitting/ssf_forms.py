@@ -21,19 +21,19 @@ class SsfForms:
 
     extent: Extent
 
-    def one_gaussian_start(self) -> Start:
+    def one_gaussian_and_starts(self) -> Start:
         """Return one Gaussian, starting typical, narrow and wide."""
         one = default_sensor(self.extent, 1)
         return one, starts_of_one_gaussian(one)
 
-    def free_form_start(self, found: Fit) -> Start:
+    def free_form_and_starts(self, found: Fit) -> Start:
         """Return the free form, starting from the fit of one Gaussian."""
         one = found.model.sensor
         assert isinstance(one, GaussianMixtureSensor)
         free = FreeFormSensor.from_one_gaussian(one)
         return free, free.start_from_one_gaussian(found.z)
 
-    def more_gaussians_start(self, found: Fit, order: int) -> Start:
+    def more_gaussians_and_starts(self, found: Fit, order: int) -> Start:
         """Return `order` Gaussians, one more than the fit has, starting from splits of its heaviest."""
         wanted = default_sensor(self.extent, order)
         return wanted, starts_with_more_gaussians(found.model.sensor, found.z, wanted)

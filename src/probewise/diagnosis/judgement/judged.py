@@ -69,9 +69,11 @@ class Judged:
     too_little: bool = False
     withdrawn: bool = False
 
-    def withdraw(self) -> Judged:
+    def with_verdict_withdrawn(self) -> Judged:
         """Return the verdict `cannot_tell` in place of the effects it named."""
         return replace(self, verdict="cannot_tell", combination=(), withdrawn=True)
+
+    withdraw = with_verdict_withdrawn  # its old name
 
     @property
     def unknown_probability(self) -> float:
@@ -106,7 +108,7 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
     def aliased_combinations(combination: Names) -> frozenset[Names]:
         """Return the combinations with the same noise whose effects on the mean are aliased with these."""
         noise = prepared.noise_effect_names & {*combination}
-        others = searched.aliased_with(tuple(name for name in combination if name not in noise))
+        others = searched.combinations_aliased_with(tuple(name for name in combination if name not in noise))
         return frozenset(tuple(sorted({*names, *noise})) for names in others)
 
     verdict, combination = (
@@ -221,7 +223,7 @@ def verdict_from_probabilities(
         if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
             return "cannot_tell", top
         return ("noise" if set(top) <= noise_names else "named"), top
-    of_class = _alias_class_of_combination(top, aliases)
+    of_class = _combination_and_alias_swaps(top, aliases)
     if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
         return "cannot_tell", top
     if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
@@ -229,7 +231,7 @@ def verdict_from_probabilities(
     return ("noise" if set(top) <= noise_names else "named"), top
 
 
-def _alias_class_of_combination(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
+def _combination_and_alias_swaps(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
     """Return a combination and those that differ from it by one effect swapped for its alias."""
     both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
     return {names} | {tuple(sorted({*names} - {name} | {other})) for name, other in both_ways if name in names}

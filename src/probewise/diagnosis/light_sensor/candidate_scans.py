@@ -36,7 +36,9 @@ class Excerpt:
     stride: int = 1
 
 
-def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Excerpt]:
+def excerpts_of_scan(
+    scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
+) -> list[Excerpt]:
     """Return the parts of a scan that could be scans of their own.
 
     Parameters
@@ -83,12 +85,12 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
     for scan in rows_of_distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
         degrees = math.degrees(float(plan.orientation_rad[scan[0]]))
-        for part in excerpts(scan, strides=strides, level=None if level is None else level[scan]):
+        for part in excerpts_of_scan(scan, strides=strides, level=None if level is None else level[scan]):
             rows, every, label = part.rows, part.words, f"{name}{part.suffix}"
             once = rows_as_new_scan(plan, rows, start_s, gap_s, label)
             both = np.concatenate([rows[: MOST_READINGS // 2 * 2 : 2], rows[: MOST_READINGS // 2 * 2 : 2][::-1]])
             out += [
-                Scan("repeat", f"take scan {name} again{every}", _with_name_suffix(once, "again")),
+                Scan("repeat", f"take scan {name} again{every}", _with_scan_name_suffix(once, "again")),
                 Scan(
                     "reverse",
                     f"take scan {name} backwards{every}",
@@ -103,11 +105,11 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
             if "orientation_deg" in controls:
                 turned = replace(once, orientation_rad=once.orientation_rad + math.radians(_TURN_DEG))
                 words = f"take scan {name} with the sensor turned to {degrees + _TURN_DEG:.0f} degrees{every}"
-                out.append(Scan("rotate", words, _with_name_suffix(turned, "turned")))
+                out.append(Scan("rotate", words, _with_scan_name_suffix(turned, "turned")))
             if "led" in controls:
                 dark = _with_commanded_value(once, "led", 0.0)
                 out.append(
-                    Scan("relight", f"take scan {name} with the LED off{every}", _with_name_suffix(dark, "dark"))
+                    Scan("relight", f"take scan {name} with the LED off{every}", _with_scan_name_suffix(dark, "dark"))
                 )
             if "height_mm" in controls and height_mm is not None:
                 commanded_mm = once.covariates.get("height_mm", np.full(len(once), np.nan))
@@ -115,11 +117,11 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
                 where = f"{high_mm[0]:.4g} mm" if np.ptp(high_mm) == 0.0 else f"{_RAISE:g} times its height"
                 raised = replace(once, covariates={**once.covariates, "height_mm": high_mm})
                 words = f"take scan {name} with the sensor at {where}{every}"
-                out.append(Scan("raise", words, _with_name_suffix(raised, "raised")))
+                out.append(Scan("raise", words, _with_scan_name_suffix(raised, "raised")))
     return out
 
 
-def rows_that_need_no_hand(plan: Plan) -> IntArray:
+def rows_repeatable_without_hands(plan: Plan) -> IntArray:
     """Return the rows that can be repeated with the sheet in place and the sensor as mounted."""
     last = int(np.argmax(plan.time_s))
     same_sheet = plan.pattern == plan.pattern[last]
@@ -149,7 +151,7 @@ def _faster_scan_words(part: Excerpt) -> str:
     return f"at {2 * part.stride} times the speed (every {2 * part.stride}th reading)"
 
 
-def _with_name_suffix(plan: Plan, how: str) -> Plan:
+def _with_scan_name_suffix(plan: Plan, how: str) -> Plan:
     return replace(plan, scan_names=(f"{plan.scan_names[0]}_{how}",))
 
 

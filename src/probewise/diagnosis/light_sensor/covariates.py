@@ -68,10 +68,10 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
         out.append(Covariate("orientation", degrees, everything, groups=True))
     if len(np.unique(scan)) > 1:
         out.append(Covariate("scan", scan.astype(np.float64), everything, groups=True))
-    return out + _places_along_scans(plan, usable)
+    return out + _place_covariates_along_scans(plan, usable)
 
 
-def _places_along_scans(plan: Plan, usable: IntArray) -> list[Covariate]:
+def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariate]:
     """List the places along all scans in the longer direction, and along each long scan."""
     x_mm, y_mm, scan = plan.x_mm[usable], plan.y_mm[usable], plan.scan[usable]
     by_scan = [np.flatnonzero(scan == k) for k in range(len(plan.scan_names))]
@@ -88,7 +88,7 @@ def _places_along_scans(plan: Plan, usable: IntArray) -> list[Covariate]:
     return out
 
 
-def covariate_of(
+def covariate_of_effect(
     effect: NamedEffect[Any], change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
 ) -> Covariate | None:
     """Return the first of an effect's covariates that varies here; None if none varies, or nothing changes.
@@ -115,10 +115,10 @@ def covariate_of(
         return None
     if name == "level":
         return replace(pooled[name], values=without[pooled[name].rows])
-    return (_places_along_larger_change(change, plan) if name == "place" else None) or pooled[name]
+    return (_place_covariate_of_larger_change(change, plan) if name == "place" else None) or pooled[name]
 
 
-def _places_along_larger_change(change: FloatArray, plan: Plan) -> Covariate | None:
+def _place_covariate_of_larger_change(change: FloatArray, plan: Plan) -> Covariate | None:
     """Return the places along X or Y, for readings approached along it, whichever has the larger change."""
     along_x, along_y = (np.flatnonzero(plan.direction_of_motion[:, k] != 0) for k in (0, 1))
     strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]

@@ -60,7 +60,7 @@ def plan_in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
     """
     out: list[Scan] = []
     for scan in scans:
-        out.append(_started_at(scan, earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])))
+        out.append(_scan_started_at(scan, earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])))
     return _with_last_known_covariates(_joined_plan(out), after)
 
 
@@ -75,12 +75,12 @@ def _joined_plan(scans: Sequence[Scan]) -> Plan:
     return join_plans([scan.plan for scan in scans])
 
 
-def postponed(scan: Scan, plan: Plan) -> Scan:
+def scan_started_after(scan: Scan, plan: Plan) -> Scan:
     """Move a scan to after a plan, with time to lay its sheet."""
-    return _started_at(scan, earliest_start_s(plan))
+    return _scan_started_at(scan, earliest_start_s(plan))
 
 
-def _started_at(scan: Scan, start_s: float) -> Scan:
+def _scan_started_at(scan: Scan, start_s: float) -> Scan:
     """Start a scan at a time, plus the time to lay its sheet."""
     delay_s = start_s + scan.sheet_laying_s - float(scan.plan.time_s[0])
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))

@@ -13,8 +13,8 @@ from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.ssf_forms import SsfForms
-from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, rows_that_need_no_hand
-from probewise.diagnosis.light_sensor.covariates import covariate_of, slope_along_motion, varying_covariates
+from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, rows_repeatable_without_hands
+from probewise.diagnosis.light_sensor.covariates import covariate_of_effect, slope_along_motion, varying_covariates
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure_slopes
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 from probewise.diagnosis.light_sensor.scheduling import Scan, plan_in_sequence, plan_of_alternatives
@@ -26,7 +26,7 @@ from probewise.recordings.plan import Plan, Recording
 
 
 @dataclass(frozen=True)
-class LightSensor:
+class LightSensorApparatus:
     """A light sensor that an arm moves over patterns; `vocabulary` holds its possible effects, by name.
 
     The vocabulary is a plain dict, which can be pickled. `hands`: a person can exchange or turn sheets; otherwise the
@@ -76,14 +76,14 @@ class LightSensor:
         """Return the forms of its SSF."""
         return SsfForms(Extent.of(recording))
 
-    def covariates_and_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
+    def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
         """Return the covariates that vary, and the slope of the readings along the direction of motion."""
         usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
         slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
     prior_odds = staticmethod(PriorOdds.for_effects)
-    covariate_of = staticmethod(covariate_of)
+    covariate_of_effect = staticmethod(covariate_of_effect)
     held_out_parts = staticmethod(held_out_parts)
     plan_of_alternatives = staticmethod(plan_of_alternatives)
     plan_in_sequence = staticmethod(plan_in_sequence)
@@ -98,5 +98,5 @@ class LightSensor:
         """List the scans that the arm can take, and with `hands` those over an exchanged or turned target."""
         if self.hands:
             return [*candidate_scans(plan, strides=strides, level=level), *target_swaps(plan)]
-        rows = rows_that_need_no_hand(plan)
+        rows = rows_repeatable_without_hands(plan)
         return candidate_scans(plan.take(rows), strides=strides, level=None if level is None else level[rows])

@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.light_sensor.candidate_scans import (
-    excerpts,
+    excerpts_of_scan,
     median_reading_interval_s,
     rows_as_new_scan,
     rows_of_distinct_scans,
@@ -47,7 +47,7 @@ def target_swaps(plan: Plan) -> list[Scan]:
             Scan("lay", f"scan a plain {colour} surface", _with_pattern(flat, f"plain_{colour}", Uniform(albedo)))
         )
     name = plan.scan_names[int(plan.scan[first[0]])]
-    for part in excerpts(first, strides=(_STRIDE // 2, _STRIDE)):
+    for part in excerpts_of_scan(first, strides=(_STRIDE // 2, _STRIDE)):
         across = _rotated_scan(_rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
         out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
     edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
@@ -58,7 +58,7 @@ def target_swaps(plan: Plan) -> list[Scan]:
 def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     """List scans over an edge turned by 180 or 90 degrees or moved, and over stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
-    beyond = _distance_inside_mm(plan, scan, edge)
+    beyond = _distance_inside_edge_mm(plan, scan, edge)
     length = float(np.ptp(beyond))
     if length < _LEAST_CROSSED * math.hypot(np.ptp(plan.x_mm[scan]), np.ptp(plan.y_mm[scan])):
         return []
@@ -84,15 +84,15 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
     out = []
     for label, words, whole, pattern in laid:
         rows = np.arange(len(whole))
-        seen = ndtr(_distance_inside_mm(whole, rows, pattern) / (_FOOTPRINT * length))
-        for part in excerpts(rows, strides=(_STRIDE,), level=seen):
+        seen = ndtr(_distance_inside_edge_mm(whole, rows, pattern) / (_FOOTPRINT * length))
+        for part in excerpts_of_scan(rows, strides=(_STRIDE,), level=seen):
             taken = _with_pattern(_rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
-        for part in excerpts(scan, strides=(_STRIDE // 2, _STRIDE)):
+        for part in excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE)):
             taken = _with_pattern(_rows_as_next_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     return out
@@ -133,6 +133,6 @@ def _rotated_scan_and_edge(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane
     return _rotated_scan(scan), replace(edge, normal_rad=normal_rad, offset_mm=float(edge.offset_mm + moved_mm))
 
 
-def _distance_inside_mm(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
+def _distance_inside_edge_mm(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
     """Return the signed distance of places inside an edge, in mm."""
     return plan.x_mm[rows] * math.cos(edge.normal_rad) + plan.y_mm[rows] * math.sin(edge.normal_rad) - edge.offset_mm

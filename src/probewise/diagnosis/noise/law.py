@@ -98,7 +98,7 @@ class NoiseLaw:
         object.__setattr__(self, "kept", 1.0 - self.lost)
 
     @property
-    def n_points(self) -> int:
+    def n_kept(self) -> int:
         """Number of readings that are not lost."""
         return len(self.sd) - int(self.lost.sum())
 
@@ -126,11 +126,11 @@ class NoiseLaw:
         return bool(self.walk.size or np.any(self.carry))
 
     @property
-    def information(self) -> float:
+    def fisher_information(self) -> float:
         """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
-        return float(self.whitened_density.information)
+        return float(self.whitened_density.fisher_information)
 
-    def take(self, rows: BoolArray) -> NoiseLaw:
+    def take_readings(self, rows: BoolArray) -> NoiseLaw:
         """Return the distribution of some readings: exact for whole scans, else as if those left out between were not.
 
         A reading then has its correlation with the one taken before it, and none where all of those before it with
@@ -218,7 +218,7 @@ class NoiseLaw:
     @cached_property
     def _smallest_conditional_sd(self) -> float:
         """Smallest sd of a reading given those before it, in units of sigma; 1 if all are lost."""
-        if not self.n_points:
+        if not self.n_kept:
             return 1.0
         if self.walk.size:
             return float(self._difference_covariance_root[0].min())
@@ -242,14 +242,14 @@ class NoiseLaw:
 
         For rounded noise it is the known one.
         """
-        return self.whitened_density.likeliest_sigma(whitened, self.n_points, floor=self.sigma_floor)
+        return self.whitened_density.likeliest_sigma(whitened, self.n_kept, floor=self.sigma_floor)
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return minus the log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
 
         Without n/2 log 2 pi.
         """
-        return self.whitened_density.minus_log_likelihood(whitened, sigma, self.n_points)
+        return self.whitened_density.minus_log_likelihood(whitened, sigma, self.n_kept)
 
     def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Convert whitened residuals, (n_points, k), to equally informative normal ones, of the same shape."""
@@ -271,7 +271,7 @@ class NoiseLaw:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
             if self.flat:
                 eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
-            eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.information)
+            eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.fisher_information)
         return eps * self.kept[:, None]
 
 
@@ -291,7 +291,7 @@ class Tail:
         return bool(np.all(np.asarray(self.share) == 0))
 
     @cached_property
-    def information(self) -> FloatArray:
+    def fisher_information(self) -> FloatArray:
         """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
         return np.asarray(np.vectorize(_fisher_information, otypes=[np.float64])(self.share, self.times))
 
@@ -332,7 +332,7 @@ class Tail:
         """
         if self.is_normal:
             return whitened
-        return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.information)
+        return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.fisher_information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return minus the second derivative of the log likelihood by log sigma, (k,)."""

@@ -69,7 +69,7 @@ class NoiseModel:
         """Return the columns of one effect's settings."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
-    def thinned_nodes(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+    def coarse_nodes_by_effect(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Return every third node and its log weight, of each effect with one parameter and over twelve nodes."""
         out = {}
         for effect in self.effects:
@@ -102,7 +102,7 @@ class NoiseModel:
         if self.rounding:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
-            halves, beside = _sd_nodes_with_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
+            halves, beside = _sd_nodes_with_rounding(law(residuals), 0.5 * self.rounding, law.n_kept)
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
             return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
         return NoiseNodes(settings, laws, log_weights)
@@ -152,10 +152,10 @@ class NoiseModel:
         if lost_share > 0:
             n_lost, cells = (
                 int(lost.sum()),
-                max(float(np.ptp(self._usable_readings)) / self._lost_reading_resolution, 1.0),
+                max(float(np.ptp(self._usable_readings)) / self._lost_value_resolution, 1.0),
             )
             # Each lost reading has that value to within a cell.
-            log_extra = n_lost * math.log(lost_share / self._lost_reading_resolution)
+            log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
             log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
         return NoiseLaw(
@@ -201,7 +201,7 @@ class NoiseModel:
         return self.recording.relative_sd[self.recording.usable]
 
     @cached_property
-    def _lost_reading_resolution(self) -> float:
+    def _lost_value_resolution(self) -> float:
         """Resolution of a lost reading's value, in reading units."""
         return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 

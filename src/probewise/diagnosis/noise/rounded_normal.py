@@ -32,7 +32,7 @@ class RoundedNormal:
     is_normal = False
 
     @cached_property
-    def information(self) -> FloatArray:
+    def fisher_information(self) -> FloatArray:
         """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
         return np.asarray(np.vectorize(_fisher_information, otypes=[np.float64])(self.half))
 
@@ -52,7 +52,7 @@ class RoundedNormal:
 
     def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Convert residuals to equally informative normal ones, of sd sigma / sqrt(information) and the same shape."""
-        return np.asarray(sigma * self._score(whitened / sigma) / self.information)
+        return np.asarray(sigma * self._score(whitened / sigma) / self.fisher_information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return the curvature for which the integral over log sigma is 1, (k,), since sigma is known."""

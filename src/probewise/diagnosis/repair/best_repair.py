@@ -64,7 +64,9 @@ def judged_and_best_repair(
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
         leading = searched.leading_out_of_vocabulary()
-        fit = (searched.best_refit_of(leading, noise) if leading else searched.likeliest_beside_unknown(noise)) or null
+        fit = (
+            searched.best_refit_of(leading, noise) if leading else searched.likeliest_fit_beside_unknown(noise)
+        ) or null
         return judged, BestRepair.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
     on_noise = searched.prepared.noise_effect_names
     if judged.verdict in ("named", "noise", "clean"):
@@ -75,5 +77,5 @@ def judged_and_best_repair(
     if judged.verdict == "named" and predicts_far_worse(
         best.improvement
     ):  # a fit that fails on held-out readings is no repair
-        return judged.withdraw(), BestRepair.of(searched, test, null, noise, rng=rng)
+        return judged.with_verdict_withdrawn(), BestRepair.of(searched, test, null, noise, rng=rng)
     return judged, best

@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.held_out import HeldOutGain, hold_out_each_part, partition_into_blocks
+from probewise.diagnosis.evidence.held_out import HeldOutGain, mean_gain_over_parts, partition_into_blocks
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
@@ -71,7 +71,7 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
             found, problem, plain, out
         )
 
-    return Correction(change, columns, hold_out_each_part(scan, gain_per_reading))
+    return Correction(change, columns, mean_gain_over_parts(scan, gain_per_reading))
 
 
 def improvement_and_correction(
@@ -126,7 +126,7 @@ def improvement_and_correction(
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
             rms_after=float(np.sqrt(np.mean(found.residuals**2))),
             p_value_after=bayes_factor_p_value(
-                problem, searched.banks_for_test(best.fit.found), problem.draw_null_residuals(N_DRAWS, rng=rng)
+                problem, searched.template_banks_for_test(best.fit.found), problem.draw_null_residuals(N_DRAWS, rng=rng)
             ),
         )
         if gain.p_value_after >= ALARM or not held.by_scan:

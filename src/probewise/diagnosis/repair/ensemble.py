@@ -129,7 +129,7 @@ def draw_models(
     if judged.verdict == "unknown":
         doubt = _DOUBT_BESIDE
         if best.out_of_vocabulary:
-            doubt = max(1 - searched.posterior.by_mean[best.out_of_vocabulary], _LEAST_DOUBT)
+            doubt = max(1 - searched.posterior.marginal_over_noise[best.out_of_vocabulary], _LEAST_DOUBT)
         model = cached.averaged_over_hypotheses(fit, {fit.names: 1 - doubt, (): doubt})
     elif judged.verdict in ("named", "cannot_tell") and fit.names:
         model = cached.averaged_over_hypotheses(fit, cached.compatible_probabilities(fit))
@@ -142,7 +142,7 @@ def _average_of_named_and_null(
     cached: HypothesisSamples, searched: Searched, test: GlobalTest, noise: Names
 ) -> ModelSamples:
     """Average over named hypotheses by probability, and the null for the rest; used if the verdict names none."""
-    by_mean = searched.posterior.by_mean
+    by_mean = searched.posterior.marginal_over_noise
     named = [names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)]
     fit = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
     if fit.names and predicts_far_worse(BestRepair.of(searched, test, fit, noise, rng=cached.rng).improvement):

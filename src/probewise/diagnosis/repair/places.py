@@ -42,8 +42,8 @@ def locate_effects_and_residuals(
     scans = next((c for c in covariates if c.name == "scan"), None)
     named: list[Place] = []
     for effect in sorted(found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
-        change = found.change_by(effect.name, prepared.usable_rows)
-        shows_in = prepared.apparatus.covariate_of(effect, change, found.predicted - change, plan, covariates)
+        change = found.change_by_effect(effect.name, prepared.usable_rows)
+        shows_in = prepared.apparatus.covariate_of_effect(effect, change, found.predicted - change, plan, covariates)
         if shows_in is not None:
             size = sizes.get(effect.name, 0.0)
             named += places_of_effect(

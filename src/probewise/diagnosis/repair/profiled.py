@@ -63,7 +63,7 @@ class ProfiledDensity:
         None if there is no such coordinate, or none whose slices can be fitted.
         """
         slopes = law(found.slopes)
-        sd = max(float(law.likeliest_sigma(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.information)
+        sd = max(float(law.likeliest_sigma(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.fisher_information)
         covariance = np.linalg.inv(slopes.T @ slopes / sd**2 + np.eye(len(found.z)))
         tried = [
             cls._of_coordinate(found, law, recording, at, covariance, float(sd)) for at in _nonlinear_coordinates(found)
@@ -108,12 +108,12 @@ class ProfiledDensity:
                 tried = state[0].copy()
                 tried[:, rest] += np.clip(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0], -1.0, 1.0)
                 tried = np.clip(tried, -FARTHEST, FARTHEST)
-                state = _higher_of_each_slice(state, (tried, *heights_and_slopes(tried)))
+                state = _better_fit_of_each_slice(state, (tried, *heights_and_slopes(tried)))
             # A slice that went astray begins again from its neighbour's fit, towards the middle.
             towards = np.arange(n) - np.sign(np.arange(n) - int(np.argmax(state[1])))
             tried = state[0][towards]
             tried[:, at] = nodes
-            state = _higher_of_each_slice(state, (tried, *heights_and_slopes(tried)))
+            state = _better_fit_of_each_slice(state, (tried, *heights_and_slopes(tried)))
         z, height, joined = state
         there = _near_best_mask(height)
         if there.sum() < len(_NODES) // 2:
@@ -196,7 +196,7 @@ Slices = tuple[FloatArray, FloatArray, FloatArray]
 """Coordinates (n_nodes, n_params), log posteriors (n_nodes,), whitened derivatives with residuals."""
 
 
-def _higher_of_each_slice(old: Slices, new: Slices) -> Slices:
+def _better_fit_of_each_slice(old: Slices, new: Slices) -> Slices:
     """Return, of each slice, the fit with the higher log posterior."""
     higher = new[1] > old[1]
     return (

@@ -18,7 +18,7 @@ _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at 
 
 @dataclass(frozen=True, eq=False)
 class QuadraticPredictions:
-    """Quadratic predictions at steps `e` from a point: `center` + `amounts_of_changes(e)` @ `changes`.
+    """Quadratic predictions at steps `e` from a point: `center` + `change_coefficients(e)` @ `changes`.
 
     `center` (n_points,) are the predictions at the point, `changes` (n_changes, n_points) orthonormal changes of them.
     Their amounts are the steps and the products of `pairs` of steps (n_terms in all), times `shares` (n_terms,
@@ -57,7 +57,7 @@ class QuadraticPredictions:
         root = np.sqrt(lengths[kept])
         return cls(y[0], (first, second), axes[:, kept] * root, (axes[:, kept] / root).T @ terms)
 
-    def amounts_of_changes(self, e: FloatArray) -> FloatArray:
+    def change_coefficients(self, e: FloatArray) -> FloatArray:
         """Return the amount of each change at steps `e`, (n_samples, n_params) -> (n_samples, n_changes)."""
         first, second = self.pairs
         return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)

@@ -22,7 +22,7 @@ from probewise.effects.vocabulary import sentence_from_samples
 
 
 @dataclass(frozen=True, eq=False)
-class Predicted:
+class PredictionAndResiduals:
     """A model's predicted readings of every row, and residuals, NaN without a usable reading: (n_points,) each."""
 
     readings: FloatArray
@@ -52,8 +52,8 @@ class Repair:
     null: ModelSamples
     model: ModelSamples
     improvement: Improvement
-    before: Predicted
-    after: Predicted
+    before: PredictionAndResiduals
+    after: PredictionAndResiduals
     by_rows: bool = False
 
     @property
@@ -112,11 +112,13 @@ def repair_of(
         plain, repaired = (
             replace(found.model, plan=everything.plan).predict(found.z[None, :])[0] for found in (null, fit)
         )
-        before = Predicted(plain, readings - plain)
-        after = Predicted(repaired + by_rows, readings - repaired - by_rows)
+        before = PredictionAndResiduals(plain, readings - plain)
+        after = PredictionAndResiduals(repaired + by_rows, readings - repaired - by_rows)
     else:
-        before = Predicted(_predictions_of_all_rows(null), prepared.expand_to_all_rows(null.residuals))
-        after = Predicted(_predictions_of_all_rows(fit) + by_rows, prepared.expand_to_all_rows(fit.residuals - change))
+        before = PredictionAndResiduals(_predictions_of_all_rows(null), prepared.expand_to_all_rows(null.residuals))
+        after = PredictionAndResiduals(
+            _predictions_of_all_rows(fit) + by_rows, prepared.expand_to_all_rows(fit.residuals - change)
+        )
     return Repair(drawn.null, drawn.repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
 
 

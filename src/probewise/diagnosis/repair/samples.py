@@ -149,7 +149,7 @@ def sample_model(
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
     residuals = recording.readings[recording.usable] - predicted
     sigma = law.likeliest_sigma(law(residuals.T))
-    noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, n_samples))
+    noise_sd = sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, n_samples))
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
     effects = (*found.model.effects, *on_noise)
@@ -163,7 +163,9 @@ def sample_model(
     }
     theta = found.model.joined_theta(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
-    theta = np.concatenate([theta, *(_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
+    theta = np.concatenate(
+        [theta, *(_uniform_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1
+    )
     names = tuple(effect.name for effect in chain.effects)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
     for i in of_lattice:
@@ -174,7 +176,7 @@ def sample_model(
         each = [own.sigma * (1.0 if of_lattice else own.sd_factor_of_rounding) for own in noise.nodes.laws]
         noise_sd = np.array(each)[nodes]
     else:
-        noise_sd = _sd_without_rounding(noise_sd, rounding, law.n_points)
+        noise_sd = _sd_without_rounding(noise_sd, rounding, law.n_kept)
     return ModelSamples(
         chain, theta, noise_sd, names, null.n_gaussians, nuisance=null.nuisance_names, exchangeable=null.exchangeable
     )
@@ -193,7 +195,7 @@ def _posterior_draws(
     law, model = noise.likeliest_law, found.model
     whitened, turned = law(found.residuals)[:, None], law(found.slopes)
     sigma = law.likeliest_sigma(whitened)
-    sd = max(float(sigma[0]) / math.sqrt(law.information), 1e-150)
+    sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), 1e-150)
     curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
     # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps leave
     # the SSF's geometry unchanged, which speeds up vectorised predictions.
@@ -243,7 +245,7 @@ def _sd_without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> Flo
     return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
 
 
-def _draws_about_nodes(
+def _uniform_draws_about_nodes(
     effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw a noise effect's parameters uniformly about drawn nodes, half way to the next: (n_samples, n_params).

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.hypothesis_problem import log_likelihood_of_whitened_residuals
+from probewise.diagnosis.evidence.hypothesis_problem import log_likelihood_marginal_over_sigma
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
@@ -52,6 +52,6 @@ class SurrogatePosterior:
     def log_density(self, e: FloatArray) -> FloatArray:
         """Return the unnormalised log posterior at steps e, (n_samples,); minus infinity beyond six prior sds."""
         z = self.center + e @ self.steps
-        whitened = self.residual[:, None] - self.changes @ self.quadratic.amounts_of_changes(e).T
-        height = log_likelihood_of_whitened_residuals(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
+        whitened = self.residual[:, None] - self.changes @ self.quadratic.change_coefficients(e).T
+        height = log_likelihood_marginal_over_sigma(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)

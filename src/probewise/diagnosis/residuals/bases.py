@@ -68,12 +68,12 @@ def bank_of_unknown_effects(
     along_axis = slope * np.where(sign == 0, 1.0, sign)
     ways = _BasisMultipliers(np.ones(len(signal)), signal, along_axis, sign, len(starts))
     found = [
-        (_family_name(covariate, template), template)
+        (_basis_family_name(covariate, template), template)
         for covariate in covariates
         for template in _bases_of_covariate(covariate, ways)
     ]
     found += [("what was seen before", template[back]) for template in _memory_bases(signal[order], starts)]
-    found += [("ends of scans", template[back]) for template in _end_transients(len(signal), starts)]
+    found += [("ends of scans", template[back]) for template in _scan_end_bases(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
     return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 
@@ -87,15 +87,15 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
     single = np.flatnonzero(bases.widths == 1)
     if single.size == 0 or named.widths.size == 0:
         return bases
-    alone = bases.take(single).columns
+    alone = bases.take_templates(single).columns
     own = OrthonormalBlocks.of(problem, list(alone.T[:, :, None])).u
     blocks = OrthonormalBlocks.of(problem, [named[k] for k in range(len(named.widths))])
     cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own) ** 2, blocks.starts, axis=0))
     like = single[cosines.max(axis=0, initial=0.0) >= _LIKE]
-    return bases.take(np.setdiff1d(np.arange(len(bases.widths)), like))
+    return bases.take_templates(np.setdiff1d(np.arange(len(bases.widths)), like))
 
 
-def _family_name(covariate: Covariate, template: FloatArray) -> str:
+def _basis_family_name(covariate: Covariate, template: FloatArray) -> str:
     """Return the label of a template's family; a covariate's many local bases form a family apart from smooth ones."""
     name = covariate.published_name
     where = name if covariate.scan is None else f"{name} within scans"
@@ -173,7 +173,7 @@ def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
     yield held[:, -1:]
 
 
-def _end_transients(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
+def _scan_end_bases(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
     """Yield pairs of columns: decay from a scan's start, growth towards its end, over 2 and over 8 readings.
 
     A pair is the same in all scans; with up to 24 scans, there are also bases of one pair per scan.

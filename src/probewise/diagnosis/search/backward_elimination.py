@@ -26,9 +26,9 @@ def eliminate_backward(state: SearchState) -> None:
         others = tuple(name for name in names if name != left_out)
         if others not in state.refitted_combinations | state.undetected:
             state.refit_stepwise(others)
-        for candidate in state.candidates_of(names):
+        for candidate in state.candidates_of_combination(names):
             state.refit_subset_from(candidate, left_out)
-        held = state.candidates_of(others)
+        held = state.candidates_of_combination(others)
         if held:
             _refit_leading_extensions(state, max(held, key=lambda c: c.log_z), names)
 
@@ -39,4 +39,4 @@ def _refit_leading_extensions(state: SearchState, held: WeighedFit, names: Names
     chosen = [names, *promising_combinations(state, proposals, width=SWAPPED, behind=STEERING)[:SWAPPED]]
     for added in [proposals[key].added for key in chosen if key in proposals]:
         if (held, added) not in state.extended:
-            state.refit(held, added)
+            state.refit_with_effect(held, added)

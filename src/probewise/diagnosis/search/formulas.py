@@ -11,7 +11,7 @@ from typing import Any
 
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.screening import log_mean_exp, score_bank_entries
+from probewise.diagnosis.evidence.screening import log_bayes_factors_by_label, log_mean_exp
 from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.search.noises import WITH_MEMORY
 from probewise.diagnosis.search.search import search
@@ -74,7 +74,7 @@ def _log_evidence_by_formula(searched: Searched, proposals: Mapping[str, NamedEf
     bank: TemplateBank = memory.coarse_bank(null.found, list(proposals.values()))
     for parent in parents:
         for _, evidence in parent.leading_noises():
-            scores = score_bank_entries(Linearised.of(parent.found, evidence.likeliest_law), bank)
+            scores = log_bayes_factors_by_label(Linearised.of(parent.found, evidence.likeliest_law), bank)
             for name, own in scores.items():
                 value = evidence.log_z + searched.prior.log_prior_on_mean(parent.names) + log_mean_exp(own)
                 out[name] = max(value, out.get(name, value))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.screening import log_mean_exp, score_pairs
+from probewise.diagnosis.evidence.screening import log_bayes_factors_of_pairs, log_mean_exp
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import (
     ABSORBED,
@@ -23,7 +23,7 @@ from probewise.diagnosis.search.constants import (
     SINGLES,
     STEERING,
 )
-from probewise.diagnosis.search.state import SearchState, rivals_of
+from probewise.diagnosis.search.state import SearchState, competing_candidates
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
 from probewise.effects import AGAIN, name_of_first_copy
 
@@ -56,7 +56,7 @@ def select_forward(state: SearchState, *, depth: int) -> None:
         for k, proposal in enumerate(asked):
             state.progress(f"refitting effects, {size} at a time", k, len(asked))
             parent = state.candidates[proposal.parent.n_gaussians, ()] if proposal.parent is null else proposal.parent
-            found = state.refit(parent, proposal.added)
+            found = state.refit_with_effect(parent, proposal.added)
             refitted.append(found)
             if size == 1 and found is not None and state.refits.sensor is not None:
                 state.refit_subset_from(found, proposal.added)
@@ -64,7 +64,9 @@ def select_forward(state: SearchState, *, depth: int) -> None:
         kept = list({c.names: c for c in refitted if c is not None}.values())
         if not kept:
             break
-        parents = [c for c in kept if c.log_z > max(r.log_z for r in rivals_of(c.names, kept)) - EXTENDED_WITHIN]
+        parents = [
+            c for c in kept if c.log_z > max(r.log_z for r in competing_candidates(c.names, kept)) - EXTENDED_WITHIN
+        ]
 
 
 def _proposals_to_refit(
@@ -76,9 +78,9 @@ def _proposals_to_refit(
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
         alone = [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
-        return [*alone[:1], *_proposals_under_plain_noise(state, null), *alone[1:]]
+        return [*alone[:1], *_proposals_under_simplest_noise(state, null), *alone[1:]]
     if size == 2:
-        proposals = _with_scores_raised(state, proposals)
+        proposals = _with_larger_pair_scores(state, proposals)
     chosen = promising_combinations(state, proposals, width=BEAM, behind=STEERING)
     chosen += [
         names for names in _pairs_of_repeatable_effects(state, null) if names in proposals and names not in chosen
@@ -96,7 +98,9 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
             continue
         singles = {name: singles[name] for name in ranked}
         templates = {name: state.templates.templates_of(null.found, state.effects[name]) for name in ranked}
-        for pair, value in score_pairs(Linearised.of(null.found, evidence.likeliest_law), templates, singles).items():
+        for pair, value in log_bayes_factors_of_pairs(
+            Linearised.of(null.found, evidence.likeliest_law), templates, singles
+        ).items():
             state.about_null[pair, noise] = evidence.log_z + value
 
 
@@ -143,7 +147,8 @@ def promising_combinations(
     return [
         names
         for names in [*named[:width], *rest[:MOST_OUT_OF_VOCABULARY]]
-        if odds[names] >= max(state.log_posterior(c) for c in rivals_of(names, state.candidates.values())) - behind
+        if odds[names]
+        >= max(state.log_posterior(c) for c in competing_candidates(names, state.candidates.values())) - behind
     ]
 
 
@@ -176,19 +181,20 @@ def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[N
         (first, again)
         for first, again in pairs
         if any(
-            c.evidence[plain].log_z > null.evidence[plain].log_z + PAIRED_FROM for c in state.candidates_of((first,))
+            c.evidence[plain].log_z > null.evidence[plain].log_z + PAIRED_FROM
+            for c in state.candidates_of_combination((first,))
         )
     ]
 
 
-def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
+def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
     """Propose the effects that lead about the given null, refitted under the simplest noise.
 
     Where noise with memory (a random walk, a correlation) leads, it absorbs a missing effect, and the effect may be
     undetectable about the null that was fitted under it. None are proposed elsewhere, nor if the refit predicts the
     same.
     """
-    plain = state.refits.null_under_plain_noise(null)
+    plain = state.refits.null_under_simplest_noise(null)
     if plain is None:
         return []
     scores = state.log_bayes_factors_by_effect(plain, plain.law, plain)
@@ -201,7 +207,7 @@ def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[P
     return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_prior_on_mean(())]
 
 
-def _with_scores_raised(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
+def _with_larger_pair_scores(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
     """Return the proposals, each with the larger of its score and that of its combination by pairs about the null."""
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():

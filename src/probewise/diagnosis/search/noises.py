@@ -104,7 +104,7 @@ class NoiseModels:
                 both = tuple(sorted({*first, *other}))
                 if len(self._uncertain_names(both)) != size + 1 or set(both) >= WITH_MEMORY:
                     continue
-                model = self._build_model(both, likely | self.models[other].thinned_nodes())
+                model = self._build_model(both, likely | self.models[other].coarse_nodes_by_effect())
                 own = laplace_evidence(found, model)
                 if own.log_z + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
                     self.models[both], known[both] = model, own

@@ -27,22 +27,24 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
         state.progress("fitting the sensor alone", len(state.sensors), n_forms)
         sensor, starts = form
         state.sensors[sensor.n_gaussians] = sensor
-        return state.keep(refits.fit_and_weigh(Model(sensor, (), plan), starts, law))
+        return state.store_candidate(refits.fit_and_weigh(Model(sensor, (), plan), starts, law))
 
     if null is not None:
         fit_and_keep((null, null.starts), law)
     else:
         forms = prepared.apparatus.null_forms(recording)
-        last = fit_and_keep(forms.one_gaussian_start(), law)
+        last = fit_and_keep(forms.one_gaussian_and_starts(), law)
         if max_order > 1:
-            best = max(fit_and_keep(forms.free_form_start(last.found), refits.likeliest_law(last)).log_z, last.log_z)
+            best = max(
+                fit_and_keep(forms.free_form_and_starts(last.found), refits.likeliest_law(last)).log_z, last.log_z
+            )
             for n in range(2, max_order + 2):
                 # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
                 if n > 2 and last.log_z < best - STEERING:
                     break
-                last = fit_and_keep(forms.more_gaussians_start(last.found, n), refits.likeliest_law(last))
+                last = fit_and_keep(forms.more_gaussians_and_starts(last.found, n), refits.likeliest_law(last))
                 best = max(best, last.log_z)
     if noises.add_significant_pairs(state.null.found, state.null.evidence):
         state.progress("weighing pairs of noises")
         for candidate in state.nulls:
-            state.keep(candidate.with_evidence(noises.evidence_by_noise(candidate.found)))
+            state.store_candidate(candidate.with_evidence(noises.evidence_by_noise(candidate.found)))

@@ -9,7 +9,7 @@ import numpy as np
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import MOST_AT_OTHER_ORDERS, REFITTED_AT_OTHER_ORDERS, REFITTED_WITHIN
-from probewise.diagnosis.search.refits import is_significant
+from probewise.diagnosis.search.refits import is_significantly_better
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
@@ -23,7 +23,7 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
     for k, names in enumerate(leaders[:MOST_AT_OTHER_ORDERS]):
         state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), MOST_AT_OTHER_ORDERS))
-        held = state.candidates_of(names)
+        held = state.candidates_of_combination(names)
         if held and by_mean[names] >= REFITTED_AT_OTHER_ORDERS * known:
             source = max(held, key=lambda c: c.log_z)
             for n in _orders_to_refit(state, source):
@@ -59,6 +59,6 @@ def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
         + state.complexity_penalty(source.ssf_degrees_of_freedom)
         - state.complexity_penalty(sensor.effective_n_gaussians)
     )
-    candidate = candidate.with_factor_and_weights(log_share, source.weights)
-    if is_significant(candidate, null):
-        state.keep(candidate)
+    candidate = candidate.with_variant_factor_and_weights(log_share, source.weights)
+    if is_significantly_better(candidate, null):
+        state.store_candidate(candidate)

@@ -41,5 +41,5 @@ def prune_out_of_vocabulary(
         ahead = average_log_evidence(candidate) - max((average_log_evidence(c) for c in rivals), default=-np.inf)
         if 0 < ahead < ALIASED_NATS:
             for key in [key for key in stay if key[1] == names]:
-                stay[key] = stay[key].with_factor_and_weights(stay[key].log_share - ahead, stay[key].weights)
+                stay[key] = stay[key].with_variant_factor_and_weights(stay[key].log_share - ahead, stay[key].weights)
     return {key: c for key, c in stay.items() if key[1] not in pruned}, pruned

@@ -11,10 +11,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.convergence import checked_finite
-from probewise.diagnosis.evidence.detectable import log_probability_detectable
+from probewise.diagnosis.evidence.convergence import checked_finite_fit
+from probewise.diagnosis.evidence.detectable import log_probability_effects_detectable
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
-from probewise.diagnosis.evidence.screening import log_mean_exp, score_bank_entries
+from probewise.diagnosis.evidence.screening import log_bayes_factors_by_label, log_mean_exp
 from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateCache
 from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.fitting.null import Null
@@ -55,7 +55,7 @@ class Refits:
         """Return the log Bayes factors of a bank's templates about a fit, by label; one per template."""
         key = found, law, bank
         if key not in self.scored:
-            self.scored[key] = score_bank_entries(Linearised.of(found, law), bank)
+            self.scored[key] = log_bayes_factors_by_label(Linearised.of(found, law), bank)
         return self.scored[key]
 
     def likeliest_law(self, candidate: WeighedFit) -> NoiseLaw:
@@ -89,9 +89,11 @@ class Refits:
             found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
         else:
             evidence = self.noises.evidence_by_noise(found)
-        return WeighedFit.of(found, law, evidence, log_probability_detectable(found, law, self.templates.usable))
+        return WeighedFit.of(
+            found, law, evidence, log_probability_effects_detectable(found, law, self.templates.usable)
+        )
 
-    def fits_better_at(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
+    def fits_better_at_z(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
         """Return whether a candidate's model, its effects in any order, fits better at z (n_params,) than its fit."""
         found, law = candidate.found, candidate.law
         readings = found.predicted + found.residuals
@@ -99,7 +101,7 @@ class Refits:
         there = float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0]) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 
-    def null_under_plain_noise(self, null: WeighedFit) -> WeighedFit | None:
+    def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit | None:
         """Return the given null refitted under the simplest noise.
 
         None if that predicts the same, if the most probable noise has no memory, or if no null is given.
@@ -126,7 +128,7 @@ class Refits:
         """
         key = parent, effect, against
         if key not in self.known:
-            twin = self._taken_from_twin(parent, effect, against) or self._taken_from_twin_of_parent(
+            twin = self._refit_taken_from_twin(parent, effect, against) or self._refit_taken_from_parents_twin(
                 parent, effect, against
             )
             self.known[key] = twin or self._refit_likely_variants(parent, effect, against)
@@ -136,7 +138,7 @@ class Refits:
         """Replace a refit with one more effect by a better fit of the same combination, for later calls."""
         self.known.update({key: (better, scores) for key, (fit, scores) in self.known.items() if fit is held})
 
-    def _taken_from_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
+    def _refit_taken_from_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
         """Return an earlier refit of the parent with a twin of this effect, the effect in its place; None: no twin."""
         own = self.templates.templates_of(parent.found, effect)
         for (held, other, less), (candidate, scores) in list(self.known.items()):
@@ -152,7 +154,7 @@ class Refits:
                     return twin, scores
         return None
 
-    def _taken_from_twin_of_parent(
+    def _refit_taken_from_parents_twin(
         self, parent: WeighedFit, effect: NamedEffect[Any], against: float
     ) -> Extended | None:
         """Return an earlier refit of this effect beside a twin of the parent's last effect, swapped; None: no twin."""
@@ -168,7 +170,7 @@ class Refits:
         own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
 
         def log_bayes_factors_about(problem: Linearised) -> FloatArray:
-            return score_bank_entries(problem, own)[effect.name]
+            return log_bayes_factors_by_label(problem, own)[effect.name]
 
         by_noise = {
             noise: log_mean_exp(log_bayes_factors_about(Linearised.of(parent.found, evidence.likeliest_law)))
@@ -202,7 +204,9 @@ class Refits:
                 log_bayes_factors_about(Linearised.of(parent.found, law)) if later is None else later
             )
             weights = later if int(np.argmax(later)) == tried[best] else weights
-        return refitted[best].with_factor_and_weights(log_share, {**parent.weights, effect.name: weights}), by_noise
+        return refitted[best].with_variant_factor_and_weights(
+            log_share, {**parent.weights, effect.name: weights}
+        ), by_noise
 
     def _fit_from_best_start(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
         """Fit a few steps from each start, (n_starts, n_params), then to convergence from the best."""
@@ -210,9 +214,9 @@ class Refits:
         if len(starts) > 1:
             best = min(fit_each_start(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
             if best.settled:
-                return checked_finite(best)
+                return checked_finite_fit(best)
             starts = best.z[None, :]
-        return checked_finite(fit(model, recording, starts[0], law, max_steps=max_steps))
+        return checked_finite_fit(fit(model, recording, starts[0], law, max_steps=max_steps))
 
     def _refit_variant(
         self,
@@ -230,7 +234,7 @@ class Refits:
         starts: list[FloatArray] = []
         for about, at in chosen:
             columns = templates.columns[at]
-            amount = _amounts_in_residual(about.project(columns), about.residual)
+            amount = _amplitudes_in_residual(about.project(columns), about.residual)
             setting = effect.start(templates.settings[at], amount)
             # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
             # one.
@@ -257,7 +261,7 @@ class Refits:
         return [] if plain.is_practically_equal(problem.law) else [Linearised.of(parent.found, plain)]
 
 
-def _amounts_in_residual(projected: FloatArray, residual: FloatArray) -> FloatArray:
+def _amplitudes_in_residual(projected: FloatArray, residual: FloatArray) -> FloatArray:
     """Return the amounts, (n_columns,), of projected columns, (n_rows, n_columns), in a residual.
 
     Several columns have a normal prior. An effect of one value per run is collinear in its sum with a parameter: by
@@ -274,7 +278,7 @@ def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:
     return {noise: evidence.log_z for noise, evidence in candidate.evidence.items()}
 
 
-def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
+def is_significantly_better(candidate: WeighedFit, parent: WeighedFit) -> bool:
     """Return whether a candidate fits significantly better than its parent: twice the log likelihood gains over 3."""
     return _improves_fit(candidate.found, parent.found, candidate.law)
 

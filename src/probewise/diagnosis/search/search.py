@@ -99,7 +99,7 @@ def search(
     else:
         state.sensors |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
-    unknown = _unknown_effects_of(state, prepared, after)
+    unknown = _build_unknown_effects(state, prepared, after)
     misfit_templates = MisfitTemplates(templates, state.null.found, unknown.bases, unknown.covariates)
 
     def evidences() -> Evidences:
@@ -113,14 +113,14 @@ def search(
         _refit_null_from_effects(state)
     eliminate_backward(state)
     # With a form of the SSF that the readings reject, an unknown effect would only stand in for the form.
-    unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
+    unknown.weigh_beside([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
     _refit_favoured_by_screening(state, posterior, progress)
     if prepared.null is None:
-        refit_at_other_orders(state, posterior().by_mean)
+        refit_at_other_orders(state, posterior().marginal_over_noise)
     state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, noises)
     progress("weighing what has no name")
     refitted = [c for c in state.candidates.values() if c.names]
-    unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
+    unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
     unknown.drop_superfluous(state.candidates.values())
     return Searched(
         prepared,
@@ -152,7 +152,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
     shortfalls: list[float] = []
     for k in range(MOST_REFITTED_LATE):
         progress("refitting what screening believes in", k, MOST_REFITTED_LATE)
-        by_mean = posterior().by_mean
+        by_mean = posterior().marginal_over_noise
         settled = {(), ("unknown",)} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
         if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
@@ -174,10 +174,10 @@ def _refit_null_from_effects(state: SearchState) -> None:
         start = candidate.found.z[: null.found.model.sensor.n_params]
         again = state.refits.fit_and_weigh(null.found.model, start[None, :], candidate.law)
         if again.log_z > state.null.log_z + SAME_MODE:
-            state.keep(again)
+            state.store_candidate(again)
 
 
-def _unknown_effects_of(state: SearchState, prepared: Prepared, after: Searched | None) -> UnknownEffects:
+def _build_unknown_effects(state: SearchState, prepared: Prepared, after: Searched | None) -> UnknownEffects:
     """Build the evidence of unknown effects, with bases about the best null, or those of the search `after`."""
     named = [effect for name, effect in state.effects.items() if not effects_out_of_vocabulary((name,))]
     if after is None:
@@ -199,7 +199,7 @@ def _unknown_bases_and_covariates(
     state: SearchState, prepared: Prepared, named: Sequence[NamedEffect[Any]]
 ) -> tuple[TemplateBank, tuple[Covariate, ...]]:
     null, recording = state.null, prepared.recording
-    covariates, slope = prepared.apparatus.covariates_and_slope(null.found, recording)
+    covariates, slope = prepared.apparatus.covariates_and_predicted_slope(null.found, recording)
     level = null.found.predicted
     scan = recording.plan.scan[recording.usable]
     bases = bank_of_unknown_effects(covariates, level - level.min(), slope, scan)

@@ -107,12 +107,12 @@ class Evidences:
         """Return a combination's largest log evidence over SSF orders and noise models; minus infinity: no refit."""
         return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
 
-    def shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
+    def with_log_evidence_shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
         """Return them with the log evidence of fits, and of unknown effects beside them, shifted by `gaps` in nats.
 
         `gaps` is by (SSF order, mean), the same under every noise model.
         """
-        fits = {key: fit.shifted(gaps[key]) if key in gaps else fit for key, fit in self.fits.items()}
+        fits = {key: fit.with_log_evidence_shifted(gaps[key]) if key in gaps else fit for key, fit in self.fits.items()}
         unknown = {(n, mean, noise): v + gaps.get((n, mean), 0.0) for (n, mean, noise), v in self.unknown.items()}
         return replace(self, fits=fits, unknown=unknown)
 
@@ -125,7 +125,7 @@ class Posterior:
     order_probabilities: Mapping[int, float]
 
     @property
-    def by_mean(self) -> dict[Names, float]:
+    def marginal_over_noise(self) -> dict[Names, float]:
         """Probability of each hypothesis on the mean, marginalised over noise models."""
         out: dict[Names, float] = {}
         for (mean, _), p in self.probabilities.items():
@@ -246,7 +246,7 @@ class Searched:
         options = [fit for (_, key), fit in self.evidences.fits.items() if key == names]
         return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
 
-    def aliased_with(self, names: Names) -> frozenset[Names]:
+    def combinations_aliased_with(self, names: Names) -> frozenset[Names]:
         """Return the combinations aliased with this one: expected to differ by less than three nats at any SSF order.
 
         The combination () has none.
@@ -259,7 +259,7 @@ class Searched:
             if expected_log_bayes_factor(fits[n, names], other) < ALIASED_NATS
         )
 
-    def likeliest_beside_unknown(self, noise: Names) -> WeighedFit | None:
+    def likeliest_fit_beside_unknown(self, noise: Names) -> WeighedFit | None:
         """Return the fit beside which an unknown effect is most probable under a noise model; None: not weighed."""
         scores = {
             (n, names): value + self.prior.log_prior_with_unknown(names)
@@ -268,7 +268,7 @@ class Searched:
         }
         return self.evidences.fits[max(scores, key=lambda key: scores[key])] if scores else None
 
-    def probabilities_given_unknown(self) -> dict[str, float]:
+    def effect_probabilities_given_unknown(self) -> dict[str, float]:
         """Return the probability of each effect that stands beside an unknown effect, given that there is one."""
         scores = {
             (names, noise): value
@@ -285,7 +285,7 @@ class Searched:
                 out[name] = out.get(name, 0.0) + weight / sum(weights.values())
         return out
 
-    def banks_for_test(self, found: Fit) -> list[TemplateBank]:
+    def template_banks_for_test(self, found: Fit) -> list[TemplateBank]:
         """Return the two banks by which a fit is tested: of the effects that it lacks, and of unknown effects."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]
         missing = [effect for effect in on_mean if effect.name not in found.model.names]
@@ -314,7 +314,7 @@ class Searched:
 
     def leading_out_of_vocabulary(self) -> Names:
         """Return the most probable combination out of vocabulary if it beats an unknown effect of bases; else ()."""
-        by_mean = self.posterior.by_mean
+        by_mean = self.posterior.marginal_over_noise
         own = {names: p for names, p in by_mean.items() if effects_out_of_vocabulary(names)}
         refitted = {names for _, names in self.evidences.fits}
         leader = max(own, key=lambda names: own[names], default=())
@@ -325,7 +325,7 @@ class Searched:
 
         They sum to one, if any has a probability.
         """
-        by_mean = self.posterior.by_mean
+        by_mean = self.posterior.marginal_over_noise
         unknown = by_mean.get(("unknown",), 0.0)
         shares = {family: unknown * p for family, p in self.evidences.unknown_shares.items()}
         for names, p in by_mean.items():

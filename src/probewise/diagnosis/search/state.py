@@ -19,7 +19,7 @@ from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.constants import SAME_MODE
 from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.refits import Refits, is_significant
+from probewise.diagnosis.search.refits import Refits, is_significantly_better
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
 from probewise.effects import NamedEffect
 from probewise.errors import NotConvergedError
@@ -92,7 +92,7 @@ class SearchState:
         """The combinations that were refitted, at any SSF order."""
         return {names for _, names in self.candidates}
 
-    def candidates_of(self, names: Names) -> list[WeighedFit]:
+    def candidates_of_combination(self, names: Names) -> list[WeighedFit]:
         """List the candidates of one combination, one per SSF order."""
         return [c for (_, key), c in self.candidates.items() if key == names]
 
@@ -129,12 +129,12 @@ class SearchState:
             logsumexp(log_z) - logsumexp(log_z - (self.prior.complexity_penalty if each is None else each) * spared)
         )
 
-    def keep(self, candidate: WeighedFit) -> WeighedFit:
+    def store_candidate(self, candidate: WeighedFit) -> WeighedFit:
         """Store a candidate in place of an earlier one of the same SSF order and effects, and return it."""
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
-    def refit(self, parent: WeighedFit, added: str) -> WeighedFit | None:
+    def refit_with_effect(self, parent: WeighedFit, added: str) -> WeighedFit | None:
         """Refit a candidate with one more effect; store the fit if the effect is significant.
 
         Otherwise the combination is recorded as undetected. Nothing is refitted once the share of the budget is spent.
@@ -145,7 +145,11 @@ class SearchState:
         """
         against = 0.0 if parent.names else self.complexity_penalty(parent.ssf_degrees_of_freedom)
         if self.share_is_spent(self.share):
-            return max(self.candidates_of(tuple(sorted((*parent.names, added)))), key=lambda c: c.log_z, default=None)
+            return max(
+                self.candidates_of_combination(tuple(sorted((*parent.names, added)))),
+                key=lambda c: c.log_z,
+                default=None,
+            )
         self.extended.add((parent, added))
         try:
             candidate, scores = self.refits.refit_with_effect(parent, self.effects[added], against)
@@ -155,8 +159,8 @@ class SearchState:
             self.undetected.add(names)
             return None
         known = self.candidates.get((candidate.n_gaussians, candidate.names), candidate)
-        if is_significant(candidate, parent):
-            return self.keep(max(known, candidate, key=lambda c: c.log_z))
+        if is_significantly_better(candidate, parent):
+            return self.store_candidate(max(known, candidate, key=lambda c: c.log_z))
         if known is not candidate:
             return known
         # Laplace fails where an effect is too small to be significant and the closed form does not; but the
@@ -176,14 +180,14 @@ class SearchState:
         """
         model, stay = candidate.found.model.model_and_mask_without(left_out)
         start = candidate.found.z[stay]
-        for held in self.candidates_of(tuple(name for name in candidate.names if name != left_out)):
+        for held in self.candidates_of_combination(tuple(name for name in candidate.names if name != left_out)):
             alike = held.n_gaussians == candidate.n_gaussians and set(model.effects) == set(held.found.model.effects)
-            if alike and self.refits.fits_better_at(model, start, held):
-                again = self.refits.fit_and_weigh(model, start[None, :], candidate.law).with_factor_and_weights(
+            if alike and self.refits.fits_better_at_z(model, start, held):
+                again = self.refits.fit_and_weigh(model, start[None, :], candidate.law).with_variant_factor_and_weights(
                     held.log_share, held.weights
                 )
                 if again.log_z > held.log_z + SAME_MODE:
-                    self.keep(again)
+                    self.store_candidate(again)
                     self.refits.replace_fit(held, again)
 
     def refit_stepwise(self, names: Names) -> None:
@@ -194,7 +198,7 @@ class SearchState:
         parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
         held = max(parts, key=lambda c: (len(c.names), c.log_z))
         for added in [n for n in names if n not in held.names]:
-            extended = self.refit(held, added)
+            extended = self.refit_with_effect(held, added)
             if extended is None:
                 self.undetected.add(names)
                 for noise, evidence in held.evidence.items():
@@ -214,7 +218,7 @@ class SearchState:
         for (names, noise), value in self.about_null.items():
             parts = [p for p in itertools.combinations(names, len(names) - 1) if p in refitted]
             gains = [
-                max(c.evidence[noise].log_z for c in self.candidates_of(part))
+                max(c.evidence[noise].log_z for c in self.candidates_of_combination(part))
                 - self.about_null.get((part, noise), np.inf)
                 for part in parts
             ]
@@ -232,10 +236,10 @@ class SearchState:
         It is that of the refits or, if there are none, that by screening; minus infinity if there is neither.
         """
         screened = (value for (own, _), value in self.screened_log_evidences().items() if own == names)
-        return max([c.log_z for c in self.candidates_of(names)] or screened, default=-np.inf)
+        return max([c.log_z for c in self.candidates_of_combination(names)] or screened, default=-np.inf)
 
 
-def rivals_of(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
+def competing_candidates(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
     """List the candidates with which a combination competes.
 
     These are all candidates if it has an effect out of vocabulary, otherwise only those without one.

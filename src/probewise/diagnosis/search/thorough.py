@@ -92,7 +92,7 @@ def weigh_thoroughly(
         return searched, told
     common = next((w.gap for (_, names), w in weighings.items() if not names), 0.0)
     return searched.with_evidences(
-        searched.evidences.shifted({key: w.gap - common for key, w in weighings.items()})
+        searched.evidences.with_log_evidence_shifted({key: w.gap - common for key, w in weighings.items()})
     ), told
 
 
@@ -101,7 +101,7 @@ def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
 
     Each is at its SSF order of largest evidence; the null, if it is not among them, at that of the first.
     """
-    merged = searched.posterior.by_mean
+    merged = searched.posterior.marginal_over_noise
     out: list[tuple[WeighedFit, Names]] = []
     for mean in sorted(merged, key=lambda names: -merged[names]):
         if len(out) == _MOST or (len(out) >= _LEAST and merged[mean] < _LEAST_PROBABILITY):
@@ -134,7 +134,7 @@ def _weigh_by_nested_sampling(
     evidence = candidate.evidence[noise]
     effects = tuple(sorted((*candidate.names, *noise_effects_in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
-    problem = _joint_problem(candidate, noise, searched)
+    problem = _hypothesis_problem(candidate, noise, searched)
     once = fold_problem(problem, candidate.found.z)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
@@ -149,14 +149,14 @@ def _weigh_by_nested_sampling(
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # warnings of the last run are reported
         explored = run(once)
 
-        def weigh_near(theta: FloatArray) -> Weighing:
+        def weighing_from_samples(theta: FloatArray) -> Weighing:
             found = _evidence_near_posterior(theta, once, run, rng)
             log_z = found.log_z + candidate.log_prior_factor
             return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
 
-        told = weigh_near(explored.samples(_N_SAMPLES, rng=rng))
+        told = weighing_from_samples(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
-            told = max(told, weigh_near(_draw_from_laplace(candidate, rng)), key=lambda own: own.nested)
+            told = max(told, weighing_from_samples(_draw_from_laplace(candidate, rng)), key=lambda own: own.nested)
     more = explored.log_z + candidate.log_prior_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:
@@ -165,7 +165,7 @@ def _weigh_by_nested_sampling(
     return replace(told, doubts=(*told.doubts, doubt))
 
 
-def _joint_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> HypothesisProblem:
+def _hypothesis_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> HypothesisProblem:
     return HypothesisProblem(candidate.found.model, searched.prepared.recording, candidate.evidence[noise])
 
 
@@ -175,7 +175,7 @@ def _least_and_most_minutes(
     """Estimate the least and the most minutes of all runs, from the measured time of an evaluation."""
     seconds = 0.0
     for candidate, noise in leaders:
-        problem = _joint_problem(candidate, noise, searched)
+        problem = _hypothesis_problem(candidate, noise, searched)
         n_params, z = problem.model.n_params, candidate.found.z
         theta = np.clip(z + 1e-3 * rng.standard_normal((_TIMED, len(z))), -FARTHEST, FARTHEST)
         began = time.perf_counter()
@@ -240,7 +240,7 @@ def _evidence_near_posterior(
 def _draw_from_laplace(candidate: WeighedFit, rng: np.random.Generator) -> FloatArray:
     """Draw coordinates from Laplace's approximation, (_N_SAMPLES, n_params)."""
     found = candidate.found
-    root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.information)
+    root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.fisher_information)
     draws = rng.standard_normal((_N_SAMPLES, len(found.z)))
     return np.clip(found.z + draws @ root.T, -FARTHEST, FARTHEST)
 

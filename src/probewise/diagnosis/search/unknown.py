@@ -53,7 +53,7 @@ class UnknownEffects:
     """Share of each family of bases, beside the null with the largest evidence of an unknown effect."""
     log_n_choices: Callable[[Names], float] = lambda names: 0.0
 
-    def weigh(self, candidates: Iterable[WeighedFit]) -> None:
+    def weigh_beside(self, candidates: Iterable[WeighedFit]) -> None:
         """Compute and store the log evidence of an unknown effect beside each candidate."""
         best = -np.inf
         for candidate in candidates:
@@ -98,7 +98,7 @@ class UnknownEffects:
             if believed[candidate] < most - ALIASED_NATS:
                 return False
             if self._log_evidence_with_unknown(candidate) == -np.inf:
-                self.weigh([candidate])
+                self.weigh_beside([candidate])
             if (
                 self._log_evidence_with_unknown(candidate) - self._log_evidence_without_unknown(candidate)
                 < ALIASED_NATS

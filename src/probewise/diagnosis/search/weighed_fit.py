@@ -44,13 +44,13 @@ class WeighedFit:
 
     def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
         """Return it with new evidence, by noise model: `plain`, that of its parameters alone, plus its prior factor."""
-        return replace(self, evidence=plain).shifted(self.log_prior_factor)
+        return replace(self, evidence=plain).with_log_evidence_shifted(self.log_prior_factor)
 
-    def with_factor_and_weights(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
+    def with_variant_factor_and_weights(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
         """Return it with another log prior factor of its effects' variants, and the variants' weights, by effect."""
-        return replace(self.shifted(log_share - self.log_share), log_share=log_share, weights=weights)
+        return replace(self.with_log_evidence_shifted(log_share - self.log_share), log_share=log_share, weights=weights)
 
-    def shifted(self, by: float) -> WeighedFit:
+    def with_log_evidence_shifted(self, by: float) -> WeighedFit:
         """Return it with its log evidence shifted by these nats under every noise model."""
         return replace(self, evidence={noise: replace(e, log_z=e.log_z + by) for noise, e in self.evidence.items()})
 

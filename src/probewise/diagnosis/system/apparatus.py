@@ -15,7 +15,12 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.system.commands import RunCommand, as_alternatives, in_sequence, possible_run_commands
+from probewise.diagnosis.system.commands import (
+    RunCommand,
+    plan_in_sequence,
+    plan_of_alternatives,
+    possible_run_commands,
+)
 from probewise.effects import (
     CorrelatedNoise,
     DriftingNoise,
@@ -146,14 +151,14 @@ class SimulatorApparatus:
         """Raise NotImplementedError: the only null is the simulator."""
         raise NotImplementedError("a simulator is its own null")
 
-    def covariates_and_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
+    def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
         """Return the covariates that vary, and the predicted change since the previous row, (n_usable,).
 
         Covariates are time or row, level, columns, states, that change, and the run.
         """
         table = cast(RunTable, recording.plan)
         usable = np.flatnonzero(recording.usable)
-        by_row = self.covariates_by_row(found.model.predict(found.z[None, :])[0])
+        by_row = self.covariate_values_by_name(found.model.predict(found.z[None, :])[0])
         pooled = {name: values[usable] for name, values in by_row.items() if name != "run"}
         out = []
         for name, values in pooled.items():
@@ -164,7 +169,7 @@ class SimulatorApparatus:
             out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))
         return out, pooled["previous"]
 
-    def covariates_by_row(self, predicted: FloatArray) -> dict[str, FloatArray]:
+    def covariate_values_by_name(self, predicted: FloatArray) -> dict[str, FloatArray]:
         """Return every covariate by name at each row, (n_points,), for predictions (n_points,); the run is last."""
         table, own = self.about.table, self.system.simulator
         out = {"time" if table.has_varying_time else "row": table.time_s, "level": predicted}
@@ -175,7 +180,7 @@ class SimulatorApparatus:
         out["run"] = table.scan.astype(np.float64)
         return out
 
-    def covariate_of(
+    def covariate_of_effect(
         self,
         effect: NamedEffect[Any],
         change: FloatArray,
@@ -214,8 +219,8 @@ class SimulatorApparatus:
         own = self.system.simulator
         return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
-    plan_of_alternatives = staticmethod(as_alternatives)
-    plan_in_sequence = staticmethod(in_sequence)
+    plan_of_alternatives = staticmethod(plan_of_alternatives)
+    plan_in_sequence = staticmethod(plan_in_sequence)
 
 
 def _differences_within_runs(values: FloatArray, table: RunTable) -> FloatArray:

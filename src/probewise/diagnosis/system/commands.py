@@ -61,7 +61,7 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
         name = table.scan_names[int(table.scan[rows[0]])]
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
         of = f"run {name}" if table.run is not None else "the rows"
-        for kind, words, columns, slower in _changes_of_run(table, kept, ends, of):
+        for kind, words, columns, slower in _variations_of_run(table, kept, ends, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
             made = _planned_run(table, kept, columns, reading, called, name, slower)
             out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
@@ -72,7 +72,7 @@ Change = tuple[str, str, Mapping[str, FloatArray], float]
 """Kind, words, the columns that are set, and how many times as long the run takes."""
 
 
-def _changes_of_run(
+def _variations_of_run(
     table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], of: str
 ) -> Iterator[Change]:
     own = {name: table.covariates[name][rows] for name in ends}
@@ -149,13 +149,13 @@ def _next_start_time(table: RunTable) -> float:
     return float(table.time_s.max()) + (float(np.median(apart)) if apart else 10 * gap)
 
 
-def as_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
+def plan_of_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
     """Concatenate alternative runs, each timed as if it came next, to predict all of them at once."""
     first, *more = (command.table for command in commands)
     return cast(Plan, append_tables(first, more))
 
 
-def in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
+def plan_in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
     """Concatenate runs to be recorded in sequence: each begins after the last, unless time restarts with each run."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []

@@ -118,7 +118,7 @@ def prepare_system(
     with_effects: bool = True,
 ) -> Prepared:
     """Fit the simulator, and build what the engine needs; effects are scaled to the fit, none unless `with_effects`."""
-    recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
+    recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
     plan, recording = recording.plan, without_unpredictable_readings(system, recording)
     if recording.plan is not plan:
@@ -239,7 +239,7 @@ def _notes_on_integration(tally: IntegrationTally) -> Iterator[str]:
         yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"
 
 
-def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
+def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     """Return a table with its predicted column as readings, of which about 2,400 are used, in stretches of six.
 
     The simulator still predicts every row.

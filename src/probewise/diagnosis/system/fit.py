@@ -144,7 +144,7 @@ def fit_simulator(
             else "all equal"
         )
         raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
-    null, noise = _weighed_null(prepared)
+    null, noise = _null_fit_and_evidence(prepared)
     samples = sample_model(null.found, noise, prepared.recording, weights={}, rng=rng)
     evidence = Evidence(
         noise.log_z + null.log_prior_factor, 0.0, "the Laplace approximation", _reason_against_sampling(prepared)
@@ -161,7 +161,7 @@ def fit_simulator(
     return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
 
 
-def _weighed_null(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
+def _null_fit_and_evidence(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
     """Fit the simulator without effects under white noise; return the fit and its evidence."""
     prior = PriorOdds.for_effects({})
     noises, templates = NoiseModels(prepared.recording, {}, prior), TemplateCache(prepared.usable_rows)
@@ -177,12 +177,12 @@ def _reason_against_sampling(prepared: Prepared) -> str:
         return f"nested sampling of {system.n_params} parameters would take too many calls"
     if system.caller is not None and not system.caller.broadcasts:
         return "nested sampling would take too many calls of simulate, which takes one sample at a time"
-    if _most_calls(prepared) < _LEAST_CALLS:
+    if _most_affordable_calls(prepared) < _LEAST_CALLS:
         return f"nested sampling would take too long with {len(prepared.recording)} rows"
     return ""
 
 
-def _most_calls(prepared: Prepared) -> int:
+def _most_affordable_calls(prepared: Prepared) -> int:
     each = 1 if cast(SimulatorApparatus, prepared.apparatus).system.simulator.law is None else 2
     return _MOST_NUMBERS // (each * len(prepared.recording))
 
@@ -213,8 +213,8 @@ def _nested_samples_and_evidence(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # the reason is reported below
         found = nested.run(
-            problem, rng=rng, n_live=n_live, max_calls=_most_calls(prepared), progress=_sampling_progress(progress),
-            max_cost=1.0, return_interrupted=False,
+            problem, rng=rng, n_live=n_live, max_calls=_most_affordable_calls(prepared),
+            progress=_sampling_progress(progress), max_cost=1.0, return_interrupted=False,
         )  # fmt: skip
     if found.warnings:
         return samples, replace(otherwise, reason=f"nested sampling: {found.warnings[0]}")
@@ -222,7 +222,7 @@ def _nested_samples_and_evidence(
     law, usable = noise.likeliest_law, prepared.recording.usable
     residuals = prepared.recording.readings[usable] - null.found.model.predict(z)[:, usable]
     sigma = law.likeliest_sigma(law(residuals.T))
-    noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, N_SAMPLES))
+    noise_sd = sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, N_SAMPLES))
     theta = cast(Any, null.found.model.sensor).theta(z)
     evidence = Evidence(found.log_z + null.log_prior_factor, found.log_z_error, method)
     return replace(samples, theta=theta, noise_sd=noise_sd), evidence

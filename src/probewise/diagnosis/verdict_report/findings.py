@@ -18,7 +18,7 @@ from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
-from probewise.diagnosis.verdict_report.words import with_unit_of_reading
+from probewise.diagnosis.verdict_report.words import substitute_reading_unit
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.effects.vocabulary import sentence_from_samples
 from probewise.recordings.plan import Plan
@@ -86,7 +86,7 @@ def effects_found(
     prepared = searched.prepared
     out, plan = [], prepared.recording.plan
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
-    beside = searched.probabilities_given_unknown() if unknown >= _IS_UNKNOWN else {}
+    beside = searched.effect_probabilities_given_unknown() if unknown >= _IS_UNKNOWN else {}
     unit = plan.instrumentation.unit
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)
@@ -185,7 +185,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
     sigma = float(law.likeliest_sigma(law(found.residuals)[:, None])[0])
     refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)
-    return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.information)
+    return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.fisher_information)
 
 
 def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
@@ -215,7 +215,7 @@ def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) ->
     """
     fixed = getattr(effect, "fixed", ())
     return tuple(
-        _parameter_found(name, with_unit_of_reading(own, unit), values[:, k])
+        _parameter_found(name, substitute_reading_unit(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
         if name not in fixed
     )

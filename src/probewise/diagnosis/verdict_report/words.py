@@ -10,6 +10,6 @@ def p_in_words(p_value: float) -> str:
     return f"p = {p_value:.2g}" if p_value >= _LEAST_P else f"p < {_LEAST_P:g}"
 
 
-def with_unit_of_reading(own: str, unit: str) -> str:
+def substitute_reading_unit(own: str, unit: str) -> str:
     """Return a parameter's unit `own` with the reading's `unit` in place of a leading "reading"."""
     return own.replace("reading", unit or "reading") if own.startswith("reading") else own

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of, shipped_geometry_path
+from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of_readings, shipped_geometry_path
 from probewise.cli._bench import SimulatedBench
 from probewise.cli._plans import plan_for_lego_arm
 from probewise.diagnosis import diagnose
@@ -40,7 +40,7 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
         readings = list(
             carry_out(arm, plan, origin_mm=origin_mm, ask=partial(bench.carry_out_request, plan.patterns, origin_mm))
         )
-    found = recording_of(plan, readings)
+    found = recording_of_readings(plan, readings)
     off = np.array(
         [
             (x - stand.x_mm + origin_mm[0], y - stand.y_mm + origin_mm[1], stand.height_mm - geometry.read_height_mm)

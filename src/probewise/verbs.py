@@ -217,7 +217,7 @@ def explore(
         prior.
     arm
         The instrument, used as a context manager; by default the simulated arm. Your own needs only a method
-        `measure(pose)` that returns a number or a dict; see `probewise.arm.instrument_of`. Of a `LegoArm` whose
+        `measure(pose)` that returns a number or a dict; see `probewise.arm.as_instrument`. Of a `LegoArm` whose
         geometry was fitted to marks, the arm's own error is part of the sds, and of the stopping rule.
     field
         Width and height of the field; by default those of the paper.
@@ -301,7 +301,7 @@ def explore(
         require_rng,
     )
     from probewise._progress import progress_or_bar
-    from probewise.arm import LegoArm, instrument_of
+    from probewise.arm import LegoArm, as_instrument
     from probewise.calibration.sensor_file import require_sensor
     from probewise.errors import ParameterError
     from probewise.scene import Field
@@ -347,7 +347,7 @@ def explore(
         )
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
-    instrument = instrument_of(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")
+    instrument = as_instrument(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")
     with instrument, progress_or_bar(progress) as told:
         told("taking the first readings")
 

@@ -56,7 +56,7 @@ def test_counts_that_no_converter_gives_are_refused(raw):
 
 def test_a_reading_that_is_not_valid_yet_is_left_out(brick, paper_brick):
     """For a while after a change of type the brick shows the old value; here it is 1000 counts."""
-    light = brick.light(1)
+    light = brick.light_sensor(1)
     light.set_led()
     assert light.read().raw_counts == 500
     assert paper_brick.input[:2] == [5, 0]
@@ -66,12 +66,12 @@ def test_a_reading_that_is_not_valid_yet_is_left_out(brick, paper_brick):
 
 
 def test_the_led_is_on_unless_it_was_switched_off(brick, paper_brick):
-    assert brick.light(1).read().normalized == 582
+    assert brick.light_sensor(1).read().normalized == 582
     assert paper_brick.input[:2] == [5, 0]
 
 
 def test_a_sensor_that_a_program_has_reset_is_set_up_again(brick, paper_brick, clock):
-    light = brick.light(1)
+    light = brick.light_sensor(1)
     light.set_led(False)
     paper_brick.input = [0, 0, 0.0]
     assert light.read().raw_counts == 500
@@ -95,7 +95,7 @@ def changed(at, byte):
 @pytest.mark.parametrize("at", range(3, 16))
 @pytest.mark.parametrize("byte", [0x03, 0x7F, 0xFF])
 def test_a_byte_of_a_reading_that_was_changed_on_its_way_changes_no_reading(brick, paper_brick, at, byte):
-    light = brick.light(1)
+    light = brick.light_sensor(1)
     assert light.read().raw_counts == 500
     paper_brick.alter[len(paper_brick.commands)] = changed(at, byte)
     assert light.read().normalized == normalized_from_counts(500)
@@ -104,7 +104,7 @@ def test_a_byte_of_a_reading_that_was_changed_on_its_way_changes_no_reading(bric
 def test_a_sensor_beyond_its_converter_s_range_is_a_link_error(brick, paper_brick, clock):
     """It keeps the run: see `test_runs`. The question is asked three times, then given up."""
     paper_brick.raw_counts = 1024
-    light = brick.light(1)
+    light = brick.light_sensor(1)
     light.set_led()
     clock.sleep(1.0)
     before = len([body for body in paper_brick.commands if body[1] == 0x07])
@@ -121,7 +121,7 @@ def test_a_sensor_whose_values_disagree_is_a_link_error(brick, paper_brick, cloc
         return answer[:-2] + b"\0\0" if opcode == 0x07 else answer
 
     paper_brick.carry_out = disagreeing
-    light = brick.light(1)
+    light = brick.light_sensor(1)
     light._type = 5
     paper_brick.input = [5, 0, 0.0]
     with pytest.raises(TelegramError, match="500 counts, and converted 582, 582 and 0; allowed: 582 three times"):
@@ -168,19 +168,19 @@ def test_a_battery_below_6_volts_is_warned_of_once(brick, paper_brick):
 def test_the_brick_says_who_it_is_and_what_runs_on_it(brick, paper_brick):
     assert brick.name() == "ARM1"
     assert (brick.version().firmware_major, brick.version().firmware_minor) == (1, 31)
-    assert brick.program() is None
+    assert brick.running_program() is None
     paper_brick.statuses = {}
-    assert brick.program() == "dance.rxe"
+    assert brick.running_program() == "dance.rxe"
     paper_brick.statuses = {0x11: 0xFB}
     with pytest.raises(BrickError, match="out of memory"):
-        brick.program()
+        brick.running_program()
 
 
 def test_leaving_the_block_stops_and_releases_the_motors_and_switches_the_led_off(brick, paper_brick):
     """Each once without an answer, which needs nothing to be heard, and once to be sure."""
     with brick:
         brick.motor(0).move_to(500, 1)
-        brick.light(2).set_led()
+        brick.light_sensor(2).set_led()
     dark = bytes.fromhex("05 02 00 00")
     ends = [(body[0], body[1:]) for body in paper_brick.commands[-4:]]
     assert ends == [(0x80, ALL_COAST), (0x80, dark), (0x00, ALL_COAST), (0x00, dark)]
@@ -193,7 +193,7 @@ def test_leaving_the_block_stops_and_releases_the_motors_and_switches_the_led_of
 def test_a_refusal_of_one_end_keeps_nothing_from_the_other(brick, paper_brick, refused):
     def run():
         with brick:
-            brick.light(2).set_led()
+            brick.light_sensor(2).set_led()
             paper_brick.motors[1].command(100.0, 50, 0x20, 0)
             paper_brick.statuses = {refused: 0xDE}
 
@@ -209,7 +209,7 @@ def test_motors_and_led_are_off_also_where_no_answer_comes(brick, paper_brick):
 
     def run():
         with brick:
-            brick.light(2).set_led()
+            brick.light_sensor(2).set_led()
             paper_brick.motors[1].command(100.0, 50, 0x20, 0)
             paper_brick.lose = dict.fromkeys(range(len(paper_brick.commands), 10**3), "answer")
 

@@ -15,7 +15,7 @@ from probewise.arm import (
     carry_out,
     read_geometry,
     readings_of_recording,
-    recording_of,
+    recording_of_readings,
     shipped_geometry_path,
 )
 from probewise.arm.carry_out import duration_s
@@ -81,7 +81,7 @@ def test_every_row_has_its_place_and_the_orientation_nearest_to_the_planned(told
     told_mm = np.array([(r.pose.x_mm, r.pose.y_mm) for r in readings])
     away_mm = np.abs(told_mm - np.stack([plan.x_mm, plan.y_mm], axis=-1))
     assert 0.01 < away_mm.max() < 0.5
-    np.testing.assert_array_equal(recording_of(plan, readings).plan.x_mm, told_mm[:, 0])
+    np.testing.assert_array_equal(recording_of_readings(plan, readings).plan.x_mm, told_mm[:, 0])
     off = np.array([r.pose.orientation_rad for r in readings]) - plan.orientation_rad
     off = np.degrees(np.angle(np.exp(1j * off)))
     # The arm is 320 mm away: over 50 mm to either side its sensor turns by atan(50 / 320).
@@ -134,7 +134,7 @@ def test_a_recording_says_what_was_read_and_comes_back_from_its_file(tmp_path):
         )
         for k in range(5)
     ]
-    write_recording(recording_of(plan, readings), tmp_path / "r.csv")
+    write_recording(recording_of_readings(plan, readings), tmp_path / "r.csv")
     back = read_recording(tmp_path / "r.csv")
     np.testing.assert_array_equal(back.readings, [20, 21, 22, 23, 24])
     np.testing.assert_array_equal(back.plan.time_s, 2.5 * np.arange(5))
@@ -148,5 +148,5 @@ def test_what_a_plan_commands_stays_in_rows_that_are_read_after_a_resumption():
     rows = paper_plan().take(np.arange(4))
     plan = dataclasses.replace(rows, covariates={"led": np.ones(4)})
     readings = [Reading(40.0, Pose(0.0, 0.0), float(k)) for k in range(4)]
-    resumed = [*readings_of_recording(recording_of(plan, readings[:2])), *readings[2:]]
-    assert recording_of(plan, resumed).plan.covariates["led"].tolist() == [1.0] * 4
+    resumed = [*readings_of_recording(recording_of_readings(plan, readings[:2])), *readings[2:]]
+    assert recording_of_readings(plan, resumed).plan.covariates["led"].tolist() == [1.0] * 4

@@ -10,7 +10,7 @@ from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.fitting import MarksDisagreeError, fit_geometry
 from probewise.arm.geometry_file import text_with_fitted_values
 from probewise.arm.mark_file import TouchedMark, read_turns_and_places, write_marks
-from probewise.arm.marks import choose_mark_places
+from probewise.arm.marks import spread_mark_places
 from probewise.errors import FileError, ParameterError, ShapeError
 
 GEOMETRY = read_geometry(shipped_geometry_path())
@@ -38,7 +38,7 @@ def homes(geometry):
 
 
 def touched(true, *, noise_mm=0.0, rng=None, marks=None):
-    marks = choose_mark_places(GEOMETRY) if marks is None else marks
+    marks = spread_mark_places(GEOMETRY) if marks is None else marks
     turned = true.angles_rad(marks, BLOCK_MM) - homes(true)
     places = np.column_stack([marks, np.full(len(marks), BLOCK_MM)])
     if noise_mm:
@@ -126,7 +126,7 @@ def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
     (tmp_path / "arm.toml").write_text(text_with_fitted_values(text, fitted), encoding="utf-8")
     back = read_geometry(tmp_path / "arm.toml")
     assert "# shoulder to elbow" in (tmp_path / "arm.toml").read_text(encoding="utf-8")
-    assert back.accuracy.marks == len(choose_mark_places(GEOMETRY))
+    assert back.accuracy.marks == len(spread_mark_places(GEOMETRY))
     np.testing.assert_allclose(homes(back), homes(fitted), atol=1e-6)
     np.testing.assert_allclose(
         [*back.links_mm, *back.axis_mm, *back.shoulder_mm],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.arm.nxt import BrickError, Drive, Link, Motor, MotorError, NoAnswerError
+from probewise.arm.nxt import BrickError, DriveParameters, Link, Motor, MotorError, NoAnswerError
 from probewise.errors import LinkError, ParameterError, ReachError
 
 
@@ -92,7 +92,7 @@ def test_a_telegram_that_gets_lost_while_the_target_is_sought_does_no_harm(clock
 
 def test_a_reset_makes_the_place_zero_and_the_target_is_still_known(motor, paper_brick):
     motor.move_to(500, 1)
-    motor.reset()
+    motor.reset_counter()
     assert abs(motor.counts()) == 0
     before = paper_brick.n_sought
     assert abs(motor.move_to(100, 1) - 100) <= 1
@@ -186,7 +186,7 @@ def test_a_motor_that_runs_away_is_held(motor, paper_brick):
 
 def test_a_motor_that_slips_is_given_up_after_some_moves(clock, paper_brick):
     paper_brick.motors[0].coast = 7.0
-    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock, drive=Drive(n_moves=2))
+    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock, drive=DriveParameters(n_moves=2))
     with pytest.raises(MotorError, match="after 2 moves; is something in its way"):
         motor.move_to(500, 1)
 
@@ -269,4 +269,4 @@ WRONG = [
 @pytest.mark.parametrize("wrong", WRONG, ids=str)
 def test_a_drive_without_sense_is_refused(wrong):
     with pytest.raises(ParameterError):
-        Drive(**wrong)
+        DriveParameters(**wrong)

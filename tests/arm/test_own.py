@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import OwnInstrument, Pose, Reading, SimulatedArm, carry_out, instrument_of, recording_of
+from probewise.arm import OwnInstrument, Pose, Reading, SimulatedArm, as_instrument, carry_out, recording_of_readings
 from probewise.errors import FileError, LinkError, ParameterError, ReachError, ShapeError
 from probewise.recordings import HalfPlane, Plan, Quadrant, read_recording, write_recording
 
@@ -149,7 +149,7 @@ def test_what_it_says_of_time_is_checked(seconds):
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
 def test_an_instrument_is_closed_once_whatever_ends_it(error):
     own = Own()
-    with contextlib.suppress(RuntimeError, KeyboardInterrupt), instrument_of(own):
+    with contextlib.suppress(RuntimeError, KeyboardInterrupt), as_instrument(own):
         if error:
             raise error
     assert own.closed == 1
@@ -167,7 +167,7 @@ def test_one_that_is_a_context_manager_is_entered_and_left_as_such():
             log.append(kind)
 
     own = Guarded()
-    with pytest.raises(ValueError, match="x"), instrument_of(own):
+    with pytest.raises(ValueError, match="x"), as_instrument(own):
         raise ValueError("x")
     assert log == ["in", ValueError]
     assert own.closed == 0
@@ -180,18 +180,18 @@ def test_an_error_in_closing_does_not_hide_what_went_wrong_before():
     with (
         pytest.warns(RuntimeWarning, match="may not be at rest: the port is gone"),
         pytest.raises(ValueError, match="first"),
-        instrument_of(Own(close=stuck)),
+        as_instrument(Own(close=stuck)),
     ):
         raise ValueError("first")
-    with pytest.raises(OSError, match="the port is gone"), instrument_of(Own(close=stuck)):
+    with pytest.raises(OSError, match="the port is gone"), as_instrument(Own(close=stuck)):
         pass
 
 
 def test_the_arms_of_this_package_are_taken_as_they_are():
     arm = SimulatedArm(lambda pose, time_s, height_mm: 3.0)
-    assert instrument_of(arm) is arm
-    own = instrument_of(Own())
-    assert instrument_of(own) is own
+    assert as_instrument(arm) is arm
+    own = as_instrument(Own())
+    assert as_instrument(own) is own
 
 
 def file_of(folder, text):
@@ -272,7 +272,7 @@ def plan(**changes):
 
 
 def taken(own, asked, plan, **options):
-    with instrument_of(own) as arm:
+    with as_instrument(own) as arm:
         return list(carry_out(arm, plan, origin_mm=(100.0, 50.0), ask=asked.append, **options))
 
 
@@ -285,7 +285,7 @@ def test_a_plan_is_carried_out_with_a_person_who_lays_patterns_and_turns_the_sen
         "lay sheet 'corner'",
     ]
     assert own.asked[2] == Pose(110.0, 50.0, math.pi / 3)
-    write_recording(recording_of(plan(), readings), tmp_path / "r.csv")
+    write_recording(recording_of_readings(plan(), readings), tmp_path / "r.csv")
     back = read_recording(tmp_path / "r.csv")
     assert back.plan.x_mm.tolist() == [-10.0, 0.0, 10.0, 10.0]
     assert back.readings.tolist() == [180.0, 200.0, 220.0, 220.0]
@@ -299,7 +299,7 @@ def turns_asked(asked):
 
 def test_a_sensor_that_an_earlier_plan_left_turned_is_turned_back():
     asked, own = [], Own()
-    with instrument_of(own) as arm:
+    with as_instrument(own) as arm:
         for _ in range(2):
             list(carry_out(arm, plan(), origin_mm=(100.0, 50.0), ask=asked.append))
     assert turns_asked(asked) == [60, 0, 60]
@@ -310,7 +310,7 @@ def test_a_sensor_that_the_rows_taken_before_may_have_left_turned_is_turned_back
     angles = [0.0, math.pi / 3, 0.0, 0.0]
     taken(Own(), asked, plan(orientation_rad=angles), first=2)
     assert turns_asked(asked) == [0]
-    with instrument_of(Own()) as arm:  # all rows of the first plan were taken in an earlier session
+    with as_instrument(Own()) as arm:  # all rows of the first plan were taken in an earlier session
         for first in (4, 0):
             list(carry_out(arm, plan(orientation_rad=angles), origin_mm=(0.0, 0.0), ask=asked.append, first=first))
     assert turns_asked(asked) == [0, 0, 60, 0]

@@ -163,8 +163,8 @@ def test_the_scale_can_be_finer_or_none():
     assert SimulatedArm(flat(133.37), scale=ReadingScale(step=None)).measure(HERE).value == 100
     assert SimulatedArm(flat(133.37), scale=None).measure(HERE).value == 133.37
     assert math.isnan(SimulatedArm(flat(math.nan)).measure(HERE).value)
-    assert ReadingScale(0.0, 10.0, 3.0).convert(10.0) == 9.0
-    assert ReadingScale(0.0, 11.0, 3.0).convert(11.0) == 11.0
+    assert ReadingScale(0.0, 10.0, 3.0).clip_and_round(10.0) == 9.0
+    assert ReadingScale(0.0, 11.0, 3.0).clip_and_round(11.0) == 11.0
 
 
 def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():

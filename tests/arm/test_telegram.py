@@ -18,7 +18,7 @@ LED_ON, LED_OFF = t.SensorType.LIGHT_ACTIVE, t.SensorType.LIGHT_INACTIVE
 VECTORS = [
     (t.SetInputMode(1, LED_ON, 0x80), False, "05 00 80 05 01 05 80", None, None),
     (t.SetInputMode(1, LED_ON, 0x80), True, "05 00 00 05 01 05 80", "03 00 02 05 00", t.Done()),
-    (t.SetInputMode(1, LED_OFF, t.Mode.RAW), False, "05 00 80 05 01 06 00", None, None),
+    (t.SetInputMode(1, LED_OFF, t.SensorMode.RAW), False, "05 00 80 05 01 06 00", None, None),
     (
         t.GetInputValues(1),
         True,

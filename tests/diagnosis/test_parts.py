@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from probewise.arm import readings_of_recording, recording_of
+from probewise.arm import readings_of_recording, recording_of_readings
 from probewise.diagnosis.advice.aliases import Alias, projected_cosine
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import (
@@ -450,7 +450,7 @@ def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tm
     assert join_plans([joined.plan, more]).sessions == (0, 0, 1, 1, 2)
     assert join_plans([more, more]).sessions == ()
     readings = readings_of_recording(joined)
-    assert recording_of(joined.plan, readings).plan.sessions == ()
+    assert recording_of_readings(joined.plan, readings).plan.sessions == ()
 
 
 def test_joined_recordings_keep_their_patterns_where_a_third_is_joined_to_them():

@@ -11,8 +11,14 @@ from scipy.special import ndtr
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.fitting import fit_geometry
 from probewise.arm.geometry import Accuracy
-from probewise.arm.marks import choose_mark_places
-from probewise.arm.uncertainty import FITTED, RULER_SDS, places_at_values, slopes_mm, values_of_fitted
+from probewise.arm.marks import spread_mark_places
+from probewise.arm.uncertainty import (
+    FITTED,
+    RULER_SDS,
+    fitted_parameter_values,
+    place_jacobian,
+    places_at_parameters,
+)
 from probewise.errors import FileError, ParameterError
 from probewise.experiment import FittedArm, explore, found_shape, result_json, run, samples_csv
 from probewise.experiment.arm_error import arm_error_in_posterior
@@ -67,7 +73,7 @@ def test_the_shape_moves_with_the_arm_as_an_inference_anew_says(found, name):
     claimed = with_arm_error(found, only(name, sd))
     places = np.array([(r.pose.x_mm, r.pose.y_mm) for r in found.readings])
     middle = np.array([ARM.field_mm]) / 2
-    off = sd * slopes_mm(ARM, np.concatenate([places, middle]))[:, :, FITTED.index(name)]
+    off = sd * place_jacobian(ARM, np.concatenate([places, middle]))[:, :, FITTED.index(name)]
     share = 0.3  # of one sd: there all is linear
     ends = [
         mean_on_a_grid(found, way * share * off[:-1, :2], way * share * (off[:-1, 2] - off[-1, 2])) for way in (1, -1)
@@ -181,10 +187,10 @@ def test_a_journal_is_not_continued_with_an_arm_that_is_known_otherwise(small_fo
 
 def built_and_fitted(rng):
     """Build an arm as a ruler leaves it, touch marks with it to 1 mm, fit it: the geometry, and what is true."""
-    marks = choose_mark_places(ARM)
-    turned = ARM.angles_rad(marks, 32.0) - values_of_fitted(ARM)[:3]
-    true = values_of_fitted(ARM) + RULER_SDS * rng.standard_normal(9)
-    met = places_at_values(ARM, true, turned) + rng.standard_normal((len(marks), 3))
+    marks = spread_mark_places(ARM)
+    turned = ARM.angles_rad(marks, 32.0) - fitted_parameter_values(ARM)[:3]
+    true = fitted_parameter_values(ARM) + RULER_SDS * rng.standard_normal(9)
+    met = places_at_parameters(ARM, true, turned) + rng.standard_normal((len(marks), 3))
     return fit_geometry(ARM, turned, met).geometry, true
 
 
@@ -210,8 +216,8 @@ def test_two_hundred_fitted_arms_miss_the_circle_by_what_is_claimed(found):
     with_arm, without = [], []
     for _ in range(200):
         fitted, true = built_and_fitted(rng)
-        turned = fitted.angles_rad(np.concatenate([told, middle]), 14.0) - values_of_fitted(fitted)[:3]
-        stands = places_at_values(ARM, true, turned)
+        turned = fitted.angles_rad(np.concatenate([told, middle]), 14.0) - fitted_parameter_values(fitted)[:3]
+        stands = places_at_parameters(ARM, true, turned)
         height_mm = 14.0 + stands[:-1, 2] - stands[-1, 2]
         seen = ndtr((TRUE[2] - np.hypot(*(stands[:-1, :2] - TRUE[:2]).T)) / 8.0)
         values = DARK + 50.0 * (14.0 / height_mm) ** 2 * seen + rng.standard_normal(len(told))

@@ -39,10 +39,10 @@ def test_a_step_that_does_not_divide_the_scale_leaves_the_masses_those_of_the_se
     scale, rounded = ReadingScale(low, high, step), Rounded(sd * step, step, low, high)
     noise = norm.ppf((np.arange(4000) + 0.5) / 4000) * sd * step
     predicted = np.concatenate([low + step * np.linspace(-2.0, 3.0, 7), high + step * np.linspace(-3.0, 2.0, 7)])
-    possible = np.unique([scale.convert(v) for v in np.linspace(low - 5 * step, high + 5 * step, 3001)])
+    possible = np.unique([scale.clip_and_round(v) for v in np.linspace(low - 5 * step, high + 5 * step, 3001)])
     masses = np.exp([rounded.log_prob(np.array([r]), predicted[:, None]) for r in possible])
     for mass, level in zip(masses.T, predicted, strict=True):
-        read = np.array([scale.convert(v) for v in level + noise])
+        read = np.array([scale.clip_and_round(v) for v in level + noise])
         shares = [(np.abs(read - r) < 1e-9).mean() for r in possible]
         np.testing.assert_allclose(mass, shares, atol=1e-3)
         assert mass.sum() == pytest.approx(1.0, abs=1e-3)

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
-from probewise.arm.own_instrument import Measures, OwnInstrument, instrument_of
+from probewise.arm.own_instrument import Measures, OwnInstrument, as_instrument
 from probewise.arm.reach import ReachablePlaces, require_within_reach
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
@@ -64,7 +64,7 @@ def carry_out(
     Parameters
     ----------
     arm
-        The arm, entered already; or any object with a `measure(pose)`, see `instrument_of`.
+        The arm, entered already; or any object with a `measure(pose)`, see `as_instrument`.
     plan
         The plan.
     origin_mm
@@ -86,9 +86,9 @@ def carry_out(
     ParameterError
         If the plan needs what this arm lacks: another height, the LED off.
     """
-    arm = instrument_of(arm, name="arm")
+    arm = as_instrument(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
-    require_within_reach(reach_of(arm), places, "row of the plan", way_out="; move the plan's origin")
+    require_within_reach(reachable_places_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
     row_measurer = _LegoRowMeasurer(arm) if isinstance(arm, LegoArm) else _OwnRowMeasurer(arm)
     turns = row_measurer.hand_turns_rad(plan, places)
@@ -174,7 +174,7 @@ class _OwnRowMeasurer:
 
     def __init__(self, arm: OwnInstrument | SimulatedArm) -> None:
         self._arm = arm
-        self._turns, self._lifts = _can_turn(arm), _can_lift(arm)
+        self._turns, self._lifts = _can_turn_sensor(arm), _can_lift_sensor(arm)
 
     def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
         """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
@@ -190,17 +190,17 @@ class _OwnRowMeasurer:
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
 
-def _can_turn(arm: OwnInstrument | SimulatedArm) -> bool:
+def _can_turn_sensor(arm: OwnInstrument | SimulatedArm) -> bool:
     """Return whether an arm can turn its sensor."""
     return isinstance(arm, SimulatedArm) or arm.can_turn
 
 
-def _can_lift(arm: OwnInstrument | SimulatedArm) -> bool:
+def _can_lift_sensor(arm: OwnInstrument | SimulatedArm) -> bool:
     """Return whether an arm can read at a requested height."""
     return isinstance(arm, SimulatedArm) or arm.can_lift
 
 
-def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
+def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
     """Build a recording of the plan's first rows with true places, orientations, times, battery voltage and heights.
 
     A covariate that a reading lacks is the planned one, or NaN if none is planned. The sessions of a plan that was read
@@ -234,7 +234,7 @@ def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
 
 
 def readings_of_recording(recording: Recording) -> list[Reading]:
-    """Return a recording's readings, each with its pose, time and covariates: the inverse of `recording_of`."""
+    """Return a recording's readings, each with pose, time and covariates: the inverse of `recording_of_readings`."""
     rows = recording.plan
     return [
         Reading(
@@ -247,7 +247,7 @@ def readings_of_recording(recording: Recording) -> list[Reading]:
     ]
 
 
-def reach_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> ReachablePlaces:
+def reachable_places_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> ReachablePlaces:
     """Return the object whose `contains` says which places an arm can reach.
 
     It is the LEGO arm's geometry, the simulated arm's `reach`, or a user's instrument itself.
@@ -266,7 +266,7 @@ def _require_feasible_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan
     there = {"led": 1.0}
     if isinstance(arm, LegoArm):
         there["height_mm"] = arm.geometry.read_height_mm
-    elif not _can_lift(arm) and plan.instrumentation.height_mm is not None:
+    elif not _can_lift_sensor(arm) and plan.instrumentation.height_mm is not None:
         there["height_mm"] = plan.instrumentation.height_mm
     for name, value in there.items():
         wanted = plan.covariates.get(name, np.empty(0))

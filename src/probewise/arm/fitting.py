@@ -16,7 +16,13 @@ from scipy.special import chdtrc
 from probewise._arrays import FloatArray, floats
 from probewise.arm.geometry import Accuracy, Geometry
 from probewise.arm.marks import LEAST_MARKS
-from probewise.arm.uncertainty import FITTED, RULER_SDS, places_at_values, slopes_mm, values_of_fitted
+from probewise.arm.uncertainty import (
+    FITTED,
+    RULER_SDS,
+    fitted_parameter_values,
+    place_jacobian,
+    places_at_parameters,
+)
 from probewise.errors import ParameterError, ProbewiseError, ShapeError
 
 LEAST_P = 1e-3  # p-value below which the marks disagree
@@ -105,11 +111,11 @@ def fit_geometry(
         raise ParameterError("touch_mm", touch_mm, "greater than 0")
     if len(marks) < LEAST_MARKS:
         raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
-    before = values_of_fitted(geometry)
+    before = fitted_parameter_values(geometry)
     values, total, jacobian = _least_squares_fit(geometry, before, turned, marks, touch_mm)
     n = int(np.isfinite(marks).sum())
     p_value = float(chdtrc(n, total))
-    residuals = marks - places_at_values(geometry, values, turned)
+    residuals = marks - places_at_parameters(geometry, values, turned)
     if p_value < LEAST_P:
         raise MarksDisagreeError(_disagreement_message(geometry, before, turned, marks, touch_mm, residuals))
     covariance: FloatArray = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
@@ -135,7 +141,7 @@ def _least_squares_fit(
     known = np.isfinite(marks)
 
     def scaled_residuals(scaled: FloatArray) -> FloatArray:
-        off = (places_at_values(geometry, before + RULER_SDS * scaled, turned) - marks)[known] / touch_mm
+        off = (places_at_parameters(geometry, before + RULER_SDS * scaled, turned) - marks)[known] / touch_mm
         return np.concatenate([off, scaled])
 
     found = least_squares(scaled_residuals, np.zeros(len(before)), method="lm", xtol=1e-12, ftol=1e-12)
@@ -157,7 +163,7 @@ def _disagreement_message(
         others = np.arange(len(marks)) != k
         values, total, _ = _least_squares_fit(geometry, before, turned[others], marks[others], touch_mm)
         if chdtrc(int(np.isfinite(marks[others]).sum()), total) >= LEAST_P:
-            away = float(np.sqrt(np.nansum((marks[k] - places_at_values(geometry, values, turned[[k]])[0]) ** 2)))
+            away = float(np.sqrt(np.nansum((marks[k] - places_at_parameters(geometry, values, turned[[k]])[0]) ** 2)))
             return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"
     return (
         f"{off}; allowed: a sheet at true scale, gears that do not slip, gear_ratio as built, no joint that is loose; "
@@ -170,7 +176,7 @@ def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -
     places = geometry.reachable_grid_mm
     if not len(places):
         raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
-    slopes = slopes_mm(geometry, places)
+    slopes = place_jacobian(geometry, places)
     variances = np.einsum("nik,kl,nil->ni", slopes, covariance, slopes)
     # Scale error of the whole field: the mean radial displacement from its centre.
     arms = places - places.mean(axis=0)

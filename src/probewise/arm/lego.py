@@ -33,21 +33,21 @@ COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.6
 
 
 @dataclass(frozen=True)
-class Goal:
+class JointTarget:
     """Target of a joint: the count of its motor, and the direction of approach (1 upwards)."""
 
     counts: int
     side: Side
 
 
-def in_lego_units(percent: float, geometry: Geometry) -> float:
+def percent_to_lego_units(percent: float, geometry: Geometry) -> float:
     """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, 1 to 100, as in recordings.
 
     They are whole numbers where the geometry has `whole_percent`; NaN stays NaN.
     """
     if geometry.whole_percent and math.isfinite(percent):
         percent = math.floor(percent)  # the brick truncates fractions
-    return ReadingScale(step=1.0 if geometry.whole_percent else None).convert(percent)
+    return ReadingScale(step=1.0 if geometry.whole_percent else None).clip_and_round(percent)
 
 
 class LegoArm:
@@ -217,7 +217,7 @@ class LegoArm:
         for _ in range(N_RISES):
             if self.position_mm[2] >= self.geometry.travel_height_mm - NEAR_TRAVEL_MM:
                 break
-            ways = [way for joint in (SHOULDER, ELBOW) if (way := self._plan_rise_by_link(joint)) is not None]
+            ways = [way for joint in (SHOULDER, ELBOW) if (way := self._plan_raise_by_one_link(joint)) is not None]
             if not ways:
                 stand = np.degrees(self.angles_rad).round(1).tolist()
                 raise ReachError("joints", stand, "angles from which the sensor can rise; bring the arm home by hand")
@@ -248,7 +248,7 @@ class LegoArm:
                 stopped.append(joint)
         self.raise_sensor()
         goals = [
-            Goal(0, side)
+            JointTarget(0, side)
             for side in self._approach_sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))
         ]
         self._turn_joint_to(BASE, goals[BASE])
@@ -267,7 +267,7 @@ class LegoArm:
 
     def read_here(self) -> float:
         """Read the sensor at its current place, in LEGO units, as in recordings."""
-        return in_lego_units(self._machine.read_percent(), self.geometry)
+        return percent_to_lego_units(self._machine.read_percent(), self.geometry)
 
     def brightness(self) -> float:
         """Read the sensor at its current place, in percent, 0 to 100, at its full resolution."""
@@ -296,16 +296,16 @@ class LegoArm:
         standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
         return Pose(float(x_mm), float(y_mm), float(wrapped_to_pi(standing)))
 
-    def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[Goal]:
+    def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[JointTarget]:
         """Return the joints' goals for the sensor at a place and height; raise ReachError if it is out of reach."""
         angles = self.geometry.angles_rad(np.array([[x_mm, y_mm]]), height_mm)[0]
         if not np.isfinite(angles).all():
             raise ReachError("the place (mm)", (round(x_mm, 1), round(y_mm, 1)), self.geometry.sentence())
         return self._goals_at_angles(angles)
 
-    def _goals_at_angles(self, angles_rad: FloatArray) -> list[Goal]:
+    def _goals_at_angles(self, angles_rad: FloatArray) -> list[JointTarget]:
         return [
-            Goal(joint.counts_at(float(angle), side), side)
+            JointTarget(joint.counts_at(float(angle), side), side)
             for joint, angle, side in zip(
                 self.geometry.joints, angles_rad, self._approach_sides_of(angles_rad), strict=True
             )
@@ -320,7 +320,7 @@ class LegoArm:
         _, shoulder, elbow = self.geometry.height_slopes_mm_rad(angles_rad[None, :])[0]
         return 1, (-1 if shoulder > 0 else 1), (-1 if elbow > 0 else 1)
 
-    def _choose_link_order(self, goals: Sequence[Goal]) -> tuple[int, int]:
+    def _choose_link_order(self, goals: Sequence[JointTarget]) -> tuple[int, int]:
         """Return in which order to move the two links, so that the sensor stays as high as possible.
 
         The sensor is far down while the lower link swings through the vertical. If neither order leaves enough room,
@@ -344,7 +344,7 @@ class LegoArm:
             counts[joint] = goal
         return np.concatenate(heights)
 
-    def _plan_rise_by_link(self, joint: int) -> tuple[int, int, int] | None:
+    def _plan_raise_by_one_link(self, joint: int) -> tuple[int, int, int] | None:
         """Return how one link alone can raise the sensor: counts to turn, joint, target count; None if it cannot."""
         mechanics, stand = self.geometry.joints[joint], self.angles_rad
         up = mechanics.low_rad if self._approach_sides_of(stand)[joint] > 0 else mechanics.high_rad
@@ -360,7 +360,7 @@ class LegoArm:
         end = sorted(mechanics.counts_at(angle) - here for angle in (mechanics.low_rad, mechanics.high_rad))
         return abs(way), joint, here + min(max(far, end[0]), end[1])
 
-    def _turn_joint_to(self, joint: int, goal: Goal) -> None:
+    def _turn_joint_to(self, joint: int, goal: JointTarget) -> None:
         with_gears = self.geometry.joints[joint].gear_ratio > 0
         side: Side = 1 if (goal.side > 0) == with_gears else -1
         self._machine.move_to(joint, goal.counts, side)

@@ -15,7 +15,7 @@ _COLUMNS, _ROWS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.12, 0.45, 0.75)
 _STEP_MM = 10.0
 
 
-def choose_mark_places(geometry: Geometry) -> FloatArray:
+def spread_mark_places(geometry: Geometry) -> FloatArray:
     """Choose places spread over the arm's reach on the field, in whole steps of 10 mm.
 
     Returns

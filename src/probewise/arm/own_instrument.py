@@ -33,7 +33,7 @@ _TAKEN = ("reading", "scan", "pattern", "orientation_deg")  # names of a recordi
 
 
 class Measures(Protocol):
-    """The minimal interface of a user's own instrument; see `instrument_of` for optional methods."""
+    """The minimal interface of a user's own instrument; see `as_instrument` for optional methods."""
 
     def measure(self, pose: Pose, /) -> Any:
         """Move to a pose and read; return a number, or a dict with "value" and further numbers."""
@@ -234,7 +234,7 @@ class OwnInstrument:
         return f"{where}: {what} raises {type(error).__name__}: {error_on_one_line(error)}".rstrip(": ")
 
 
-def instrument_of(
+def as_instrument(
     own: Instrument | Measures, *, start_s: float = 0.0, name: str = "instrument"
 ) -> OwnInstrument | LegoArm | SimulatedArm:
     """Adapt any object with `measure(pose)` to an Instrument; instruments of this package are returned unchanged.

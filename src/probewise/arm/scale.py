@@ -25,7 +25,7 @@ class ReadingScale:
         if self.step is not None and not self.step > 0:
             raise ParameterError("step", self.step, "greater than 0, or None")
 
-    def convert(self, value: float) -> float:
+    def clip_and_round(self, value: float) -> float:
         """Clip a value to the scale and round it to a step, within the scale; NaN, a missing reading, stays NaN."""
         if math.isnan(value):
             return value
@@ -34,3 +34,5 @@ class ReadingScale:
             value = round(value / self.step) * self.step
         # A step that does not divide the range may have rounded past its end.
         return min(max(value, self.low), self.high)
+
+    convert = clip_and_round  # its old name

@@ -152,7 +152,7 @@ class SimulatedArm:
         self._time_s += float(self.travel_s(self._pose, place)[0])
         self._pose = pose
         value = checked_number("what light returned", self._light(pose, self._time_s, height_mm))
-        value = value if self._scale is None else self._scale.convert(value)
+        value = value if self._scale is None else self._scale.clip_and_round(value)
         return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": height_mm})
 
 

@@ -17,13 +17,13 @@ RULER_SDS = np.array([*np.radians([5.0, 5.0, 5.0]), 5.0, 5.0, 10.0, 10.0, 10.0, 
 """Prior sd of each, as measured with a ruler and by eye."""
 
 
-def values_of_fitted(geometry: Geometry) -> FloatArray:
+def fitted_parameter_values(geometry: Geometry) -> FloatArray:
     """Return the values of the parameters `FITTED`, (9,)."""
     homes = [joint.home_rad for joint in geometry.joints]
     return np.array([*homes, *geometry.links_mm, *geometry.axis_mm, *geometry.shoulder_mm])
 
 
-def places_at_values(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
+def places_at_parameters(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
     """Return the sensor's places and heights, (n, 3), from values of `FITTED` and joint turns from home, (n, 3)."""
     return forward_kinematics_mm(
         values[:3] + turned_rad,
@@ -35,7 +35,7 @@ def places_at_values(geometry: Geometry, values: FloatArray, turned_rad: FloatAr
     )
 
 
-def slopes_mm(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
+def place_jacobian(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
     """Return the derivatives of the sensor's true place and height with respect to each parameter `FITTED`.
 
     Parameters
@@ -49,14 +49,13 @@ def slopes_mm(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
     -------
     Shape (n, 3, 9): x, y and height by the parameters of `FITTED`; NaN at a place out of reach.
     """
-    values = values_of_fitted(geometry)
+    values = fitted_parameter_values(geometry)
     turned = geometry.angles_rad(places_mm, geometry.read_height_mm) - values[:3]
     slopes = np.empty((len(turned), 3, len(values)))
     for k, step in enumerate(RULER_SDS * 1e-4):
         up, down = values.copy(), values.copy()
         up[k] += step
         down[k] -= step
-        slopes[:, :, k] = (places_at_values(geometry, up, turned) - places_at_values(geometry, down, turned)) / (
-            2 * step
-        )
+        above, below = places_at_parameters(geometry, up, turned), places_at_parameters(geometry, down, turned)
+        slopes[:, :, k] = (above - below) / (2 * step)
     return slopes

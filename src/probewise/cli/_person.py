@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probewise.arm import Pose
-from probewise.arm.carry_out import RequestToPerson, reach_of
+from probewise.arm.carry_out import RequestToPerson, reachable_places_of
 from probewise.cli._arm import prompter_for_answer
 from probewise.cli._bench import shifted_pattern
 from probewise.cli._common import print_warning
@@ -89,7 +89,7 @@ class PersonAtBench:
 
     def _complaint_after_reading_sheet(self, name: str) -> str | None:
         """Read over the sheet's white and over its black; return a complaint if a reading is wrong, else None."""
-        bounds, origin = reach_of(self._arm), np.array(self._origin)
+        bounds, origin = reachable_places_of(self._arm), np.array(self._origin)
         values = {}
         for is_white, place in self._sheet_check.white_and_black_places(
             name, lambda places: bounds.contains(places + origin)

@@ -264,18 +264,18 @@ def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry
 
 def _report_brick_state(port: str, geometry: Geometry) -> None:
     """Print the brick's name, firmware, battery and light; raise LinkError if a program runs on it. Nothing moves."""
-    from probewise.arm import in_lego_units
+    from probewise.arm import percent_to_lego_units
 
     with open_brick(port) as brick:
         version = brick.version()
         firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
         print_result(f"brick        {brick.name()}, firmware {firmware}, battery {brick.battery_mv() / 1000:.2f} V")
-        light = brick.light(geometry.sensor_port).read()
-        value = in_lego_units(light.fine_percent, geometry)
+        light = brick.light_sensor(geometry.sensor_port).read()
+        value = percent_to_lego_units(light.fine_percent, geometry)
         print_result(
             f"light        {value:g} {UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts"
         )
-        program = brick.program()
+        program = brick.running_program()
         if program is not None:
             raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
 
@@ -354,7 +354,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     """Bring the sensor to one mark after another as a person directs; save each at once to the file `kept`."""
     from probewise.arm import LegoArm
     from probewise.arm.mark_file import TouchedMark, read_turns_and_places, write_marks
-    from probewise.arm.marks import choose_mark_places
+    from probewise.arm.marks import spread_mark_places
     from probewise.cli._marks import bring_to_mark
 
     chosen = parse_arm(arguments.arm)
@@ -367,7 +367,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
         rows = zip(*(array.tolist() for array in read_turns_and_places(kept)), strict=True)
         taken = [TouchedMark(tuple(turned), tuple(place)) for turned, place in rows]
     done = {mark.place_mm[:2] for mark in taken}
-    marks = [(x, y) for x, y in choose_mark_places(geometry).tolist()]
+    marks = [(x, y) for x, y in spread_mark_places(geometry).tolist()]
     arguments.scene = arguments.sensor = arguments.seed = None
     instrument, bench = _open_instrument(arguments, geometry)
     assert isinstance(instrument, LegoArm)
@@ -402,7 +402,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
 
     from probewise.arm import LegoArm, require_within_reach
     from probewise.arm.height_check import HeightReading, check_heights
-    from probewise.arm.marks import choose_mark_places
+    from probewise.arm.marks import spread_mark_places
 
     if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
         raise ParameterError("--arm", arguments.arm, "nxt:PORT, or emulator:TRUE.toml")
@@ -410,7 +410,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
         raise ParameterError("--readings", arguments.readings, f"up to {_MOST_READINGS}")
     width, height = geometry.field_mm
     places = [parse_place("X,Y", text) for text in arguments.places]
-    places = places or [(width / 2, height / 2), *((x, y) for x, y in choose_mark_places(geometry).tolist())]
+    places = places or [(width / 2, height / 2), *((x, y) for x, y in spread_mark_places(geometry).tolist())]
     if len(places) < 2:
         raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
     require_within_reach(geometry, np.array(places), "place")
@@ -474,7 +474,7 @@ def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
     from probewise.arm import LegoArm, Pose, require_within_reach
-    from probewise.arm.carry_out import reach_of
+    from probewise.arm.carry_out import reachable_places_of
 
     start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
     if arguments.readings > _MOST_READINGS:
@@ -486,7 +486,7 @@ def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     instrument, _ = _open_instrument(arguments, geometry)
     _warn_and_confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
-        require_within_reach(reach_of(arm), places, "reading of the scan")
+        require_within_reach(reachable_places_of(arm), places, "reading of the scan")
         if isinstance(arm, LegoArm):
             print_result(",".join((_COLUMNS, *names)))
         for k, ((x_mm, y_mm), standing) in enumerate(zip(places, arm.orientation_rad(places), strict=True)):
@@ -501,7 +501,7 @@ def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise._progress import progress_shown
-    from probewise.arm import carry_out, recording_of
+    from probewise.arm import carry_out, recording_of_readings
     from probewise.arm.carry_out import BY_HAND_S, duration_s
     from probewise.cli._person import PersonAtBench, is_pty
     from probewise.cli._sheet_check import SheetCheck
@@ -556,7 +556,7 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 taken.append(reading)
                 progress("readings", len(taken), len(plan))
                 if not arguments.dry_run:
-                    write_recording(recording_of(plan, taken), out)
+                    write_recording(recording_of_readings(plan, taken), out)
     if not arguments.dry_run:
         print_result(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 

@@ -20,7 +20,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.geometry import Accuracy, Geometry
 from probewise.arm.instrument import Reading
-from probewise.arm.uncertainty import FITTED, slopes_mm
+from probewise.arm.uncertainty import FITTED, place_jacobian
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.fitted_arm import FittedArm
@@ -110,7 +110,7 @@ def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accura
     The result is (n_points, 4, n_errors). Raises ParameterError for a place out of the arm's reach.
     """
     root = _covariance_factor(np.array(accuracy.covariance))
-    place = slopes_mm(geometry, places_mm) @ root
+    place = place_jacobian(geometry, places_mm) @ root
     if not np.isfinite(place).all():
         raise ParameterError("readings", "a place out of the arm's reach", "readings of this arm")
     turned = np.broadcast_to(root[FITTED.index("base home")], place[:, :1].shape)

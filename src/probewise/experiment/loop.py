@@ -18,7 +18,7 @@ import numpy as np
 
 from probewise._kinds import checked_path, checked_whole, require_callable, require_kind, require_rng
 from probewise.arm.instrument import Instrument, Reading
-from probewise.arm.own_instrument import Measures, instrument_of, require_measures
+from probewise.arm.own_instrument import Measures, as_instrument, require_measures
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
 from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_readings_and_utilities
 from probewise.experiment.aligned_angles import with_aligned_angles
@@ -242,7 +242,7 @@ def explore(
     ----------
     instrument
         The instrument, already entered (`with arm:`), or your own object with `measure(pose)`, see
-        `probewise.arm.instrument_of`.
+        `probewise.arm.as_instrument`.
     experiment
         The experiment: shape, sensor model, stopping rule.
     rng
@@ -290,7 +290,7 @@ def explore(
                 "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
             )
     start_s = before.readings[-1].time_s if before is not None and before.entries else 0.0
-    instrument = instrument_of(instrument, start_s=start_s)
+    instrument = as_instrument(instrument, start_s=start_s)
     return _yield_steps(instrument, experiment, seed, max_readings, path, before, settings)
 
 

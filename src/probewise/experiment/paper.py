@@ -260,7 +260,7 @@ def naive_levels_from_world(
     black, white = (
         np.array(
             [
-                scale.convert(world.read(UniformPattern(albedo), 0.0, 0.0, time_s=float(k), rng=rng))
+                scale.clip_and_round(world.read(UniformPattern(albedo), 0.0, 0.0, time_s=float(k), rng=rng))
                 for k in range(n_each)
             ]
         )

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Geometry
-from probewise.arm.marks import choose_mark_places
+from probewise.arm.marks import spread_mark_places
 from probewise.effects import orientation_deg
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
@@ -205,7 +205,7 @@ def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
 
 def marks_sheet(geometry: Geometry) -> Sheet:
     """Make the sheet of crosses that `arm fit-geometry` uses."""
-    marks = choose_mark_places(geometry)
+    marks = spread_mark_places(geometry)
     lines = (
         f"{len(marks)} crosses for `probewise arm fit-geometry`, numbered",
         "its lower left corner is the field's; its long sides run along the field's x axis",

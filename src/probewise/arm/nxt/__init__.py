@@ -8,7 +8,7 @@ from probewise.arm.nxt.brick import Brick
 from probewise.arm.nxt.light import LightReading, LightSensor, SensorError, normalized_from_counts
 from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, Timing
 from probewise.arm.nxt.machine import BrickMachine
-from probewise.arm.nxt.motor import Drive, Guard, Motor, MotorError
+from probewise.arm.nxt.motor import DriveParameters, Guard, Motor, MotorError
 from probewise.arm.nxt.serial_port import SerialPort
 from probewise.arm.nxt.status import BrickError
 from probewise.arm.nxt.telegram import Reply, Request, decode, encode, framed
@@ -19,7 +19,7 @@ __all__ = [
     "BrickError",
     "BrickMachine",
     "ByteStream",
-    "Drive",
+    "DriveParameters",
     "Guard",
     "LightReading",
     "LightSensor",
@@ -44,3 +44,6 @@ normalized_of = normalized_from_counts
 
 Light = LightSensor
 """The old name of `LightSensor`."""
+
+Drive = DriveParameters
+"""The old name of `DriveParameters`."""

@@ -11,7 +11,7 @@ from probewise._signals import defer_signals
 from probewise.arm.basics import Clock
 from probewise.arm.nxt.light import LightSensor
 from probewise.arm.nxt.link import Link
-from probewise.arm.nxt.motor import Drive, Guard, Motor
+from probewise.arm.nxt.motor import DriveParameters, Guard, Motor
 from probewise.arm.nxt.serial_port import SerialPort
 from probewise.arm.nxt.status import BrickError
 from probewise.arm.nxt.telegram import (
@@ -85,13 +85,15 @@ class Brick:
             finally:
                 self.link.close()
 
-    def motor(self, port: int, *, guard: Guard | None = None, drive: Drive | None = None) -> Motor:
+    def motor(self, port: int, *, guard: Guard | None = None, drive: DriveParameters | None = None) -> Motor:
         """Make the motor at port 0 to 2; see `Motor`."""
         return Motor(self.link, port, guard=guard, drive=drive, clock=self._clock)
 
-    def light(self, port: int) -> LightSensor:
+    def light_sensor(self, port: int) -> LightSensor:
         """Return the light sensor at input 0 to 3, the same object at every call; see `LightSensor`."""
         return self._lights.setdefault(port, LightSensor(self.link, port, clock=self._clock))
+
+    light = light_sensor  # its old name
 
     def battery_mv(self) -> int:
         """Read the battery's voltage, in mV; warn once if it is low.
@@ -135,7 +137,7 @@ class Brick:
         """Return the versions of its firmware and protocol."""
         return self.link.ask(GetFirmwareVersion())
 
-    def program(self) -> str | None:
+    def running_program(self) -> str | None:
         """Return the program running on it, which could interfere with motors and sensors, or None."""
         try:
             return self.link.ask(GetCurrentProgramName()).file
@@ -143,6 +145,8 @@ class Brick:
             if error.status == NO_PROGRAM:
                 return None
             raise
+
+    program = running_program  # its old name
 
     def _switch_off_motors_and_leds(self) -> None:
         """Release the motors and switch the LEDs off, each even if another fails.

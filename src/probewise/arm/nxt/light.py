@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from probewise.arm.basics import Clock
 from probewise.arm.nxt.link import Link
-from probewise.arm.nxt.telegram import GetInputValues, InputValues, Mode, SensorType, SetInputMode
+from probewise.arm.nxt.telegram import GetInputValues, InputValues, SensorMode, SensorType, SetInputMode
 from probewise.arm.nxt.wire import TelegramError
 from probewise.errors import LinkError, ParameterError
 
@@ -77,7 +77,7 @@ class LightSensor:
     def set_led(self, lit: bool = True) -> None:
         """Switch the LED on (`lit`) or off, and set the input to raw readings."""
         self._type = SensorType.LIGHT_ACTIVE if lit else SensorType.LIGHT_INACTIVE
-        self._link.ask(SetInputMode(self.port, self._type, Mode.RAW))
+        self._link.ask(SetInputMode(self.port, self._type, SensorMode.RAW))
 
     light_up = set_led  # its old name
 
@@ -96,7 +96,7 @@ class LightSensor:
         deadline = self._clock.monotonic() + self._valid_s
         for number in itertools.count(1):
             values = self._link.ask(GetInputValues(self.port), check=_require_consistent)
-            as_set = (values.type, values.mode) == (self._type, Mode.RAW)
+            as_set = (values.type, values.mode) == (self._type, SensorMode.RAW)
             # An invalid reading still holds the old values.
             if as_set and values.valid:
                 return LightReading(values.raw)
@@ -112,7 +112,7 @@ class LightSensor:
     @property
     def off_command(self) -> SetInputMode:
         """The command that switches the LED off and unconfigures the input."""
-        return SetInputMode(self.port, SensorType.NONE, Mode.RAW)
+        return SetInputMode(self.port, SensorType.NONE, SensorMode.RAW)
 
     off = off_command  # its old name
 
@@ -127,7 +127,7 @@ def _require_consistent(values: InputValues) -> None:
             f"input {values.port + 1} says valid {values.valid}, calibrated {values.calibrated}, {values.raw} counts; "
             f"allowed: 0 or 1, 0, 0 to {AD_MAX}"
         )
-    is_light = values.type in (SensorType.LIGHT_ACTIVE, SensorType.LIGHT_INACTIVE) and values.mode == Mode.RAW
+    is_light = values.type in (SensorType.LIGHT_ACTIVE, SensorType.LIGHT_INACTIVE) and values.mode == SensorMode.RAW
     if (
         values.valid
         and is_light

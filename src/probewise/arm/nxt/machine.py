@@ -35,7 +35,7 @@ class BrickMachine:
             brick.motor(joint.port, guard=partial(self._require_allowed_move, k))
             for k, joint in enumerate(self._joints)
         ]
-        self._light = brick.light(geometry.sensor_port)
+        self._light = brick.light_sensor(geometry.sensor_port)
 
     def __enter__(self) -> Self:
         self.brick.__enter__()
@@ -84,7 +84,7 @@ class BrickMachine:
     def reset(self, joints: Sequence[int]) -> None:
         """Set the counters of these joints' motors to 0."""
         for joint in joints:
-            self._motors[joint].reset()
+            self._motors[joint].reset_counter()
             self._zeros[joint] = 0
             self.limits.record_present_count(joint, 0)
 

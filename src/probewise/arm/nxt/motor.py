@@ -46,7 +46,7 @@ class MotorError(LinkError):
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveParameters:
     """Parameters of driving a motor; counts are degrees of its shaft.
 
     Parameters
@@ -123,10 +123,16 @@ class Motor:
     """
 
     def __init__(
-        self, link: Link, port: int, *, guard: Guard | None = None, drive: Drive | None = None, clock: Clock = time
+        self,
+        link: Link,
+        port: int,
+        *,
+        guard: Guard | None = None,
+        drive: DriveParameters | None = None,
+        clock: Clock = time,
     ) -> None:
         self._link, self.port, self._guard, self._clock = link, port, guard, clock
-        self.drive = Drive() if drive is None else drive
+        self.drive = DriveParameters() if drive is None else drive
         self.last_counts = 0
         self._target: int | None = None  # the firmware's target, in rotation counts; None: unknown
         self._offsets: tuple[int, int] | None = None  # tacho counter minus rotation and minus block counter
@@ -143,13 +149,15 @@ class Motor:
         """Read the rotation counter."""
         return self._read_confirmed_state().rotation_counts
 
-    def reset(self) -> None:
+    def reset_counter(self) -> None:
         """Set its counter to 0."""
         state = self._read_confirmed_state()
         self._link.ask(ResetMotorPosition(self.port, 0))
         if self._target is not None:
             self._target -= state.rotation_counts
         self._offsets = state.tacho_counts, state.tacho_counts - state.block_counts
+
+    reset = reset_counter  # its old name
 
     def hold(self) -> None:
         """Hold its position against a load."""
@@ -183,14 +191,14 @@ class Motor:
         here = self.counts()
         for _ in range(self.drive.n_moves):
             if self._target is None:
-                here = self._synchronise_target()
+                here = self._find_firmware_target()
             ahead = side * (goal - here)
             if abs(ahead) <= self.drive.tolerance_counts and self._arrived == side:
                 return here
             here = (
-                self._approach(goal, side, here)
+                self._approach_goal(goal, side, here)
                 if ahead >= self.drive.lead_counts
-                else self._back_off(goal, side, here)
+                else self._back_off_behind_goal(goal, side, here)
             )
         raise MotorError(
             f"motor {self.letter} stands at {here} counts, not within {self.drive.tolerance_counts} of {goal}, after "
@@ -202,7 +210,7 @@ class Motor:
         here = self.counts()
         side: Side = 1 if goal >= here else -1
         if self._target is None:
-            here = self._synchronise_target()
+            here = self._find_firmware_target()
         target = goal - side * self._coast_counts(self.drive.fast_power, side)
         if min(side * (target - here), side * (target - self._checked_target)) > 0:
             here = self._make_limited_move(target, side, self.drive.fast_power, here)
@@ -227,11 +235,11 @@ class Motor:
         MotorError
             If nothing stops it.
         """
-        start = self._synchronise_target()
+        start = self._find_firmware_target()
         power = side * self.drive.seek_power
         gently = SetOutputState(self.port, power, BRAKED, run_state=RunState.RUNNING, limit_counts=farthest)
-        while not self._try_start(start + side * farthest, side, gently):
-            start = self._synchronise_target()
+        while not self._try_to_start_limited_move(start + side * farthest, side, gently):
+            start = self._find_firmware_target()
         trouble = self._await_idle_or_trouble(
             start, side * (farthest + self.drive.runaway_counts), start + side * farthest
         )
@@ -250,13 +258,13 @@ class Motor:
             raise MotorError(f"motor {self.letter}: its counters jumped; did a program start on the brick?")
         return self._target
 
-    def _approach(self, goal: int, side: Side, here: int) -> int:
+    def _approach_goal(self, goal: int, side: Side, here: int) -> int:
         """Move towards the goal, fast to well short of it or slowly all the way; return the count."""
         fast, slow = self.drive.fast_power, self.drive.slow_power
         target = goal - side * self._coast_counts(slow, side)
         if side * self._checked_target >= side * target:
             here = (
-                self._synchronise_target()
+                self._find_firmware_target()
             )  # a target left by a move in the other direction would lead beyond the goal
         least = max(side * here, side * self._checked_target) + 1  # a target behind this position causes no motion
         short = goal - side * (2 * self.drive.lead_counts + self._coast_counts(fast, side))
@@ -264,7 +272,7 @@ class Motor:
             return self._make_limited_move(short, side, fast, here)
         return self._make_limited_move(side * max(side * target, least), side, slow, here)
 
-    def _back_off(self, goal: int, side: Side, here: int) -> int:
+    def _back_off_behind_goal(self, goal: int, side: Side, here: int) -> int:
         """Back off behind the goal, far enough for a slow move to start and take up the play; return the count."""
         back: Side = 1 if side == -1 else -1
         fast, slow = self.drive.fast_power, self.drive.slow_power
@@ -284,7 +292,9 @@ class Motor:
         stop = target + side * self._coast_counts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
-        if not self._try_start(target, side, self._drive_command(side * power, side * (target - self._checked_target))):
+        if not self._try_to_start_limited_move(
+            target, side, self._drive_command(side * power, side * (target - self._checked_target))
+        ):
             return self.stop_and_settle()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
         trouble = self._await_idle_or_trouble(here, stop + side * self.drive.runaway_counts - here, target)
@@ -302,7 +312,7 @@ class Motor:
         self._coast[power, side] = (learned + ran_on) / 2
         return here
 
-    def _try_start(self, target: int, side: Side, command: SetOutputState) -> bool:
+    def _try_to_start_limited_move(self, target: int, side: Side, command: SetOutputState) -> bool:
         """Command a limited move, exactly once; return whether the brick accepted it.
 
         Raises
@@ -325,7 +335,7 @@ class Motor:
         self._arrived = side
         return True
 
-    def _synchronise_target(self) -> int:
+    def _find_firmware_target(self) -> int:
         """Find the firmware's target, which follows a motor that is driven without a limit; stop and return the count.
 
         The motor is driven with too little power to turn, so that a lost connection or a repeated command does no harm.

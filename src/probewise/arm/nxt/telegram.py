@@ -14,7 +14,7 @@ from enum import IntEnum, IntFlag
 from typing import ClassVar, Generic, TypeVar, cast
 
 from probewise.arm.nxt.status import OK, BrickError
-from probewise.arm.nxt.wire import Answer, Fields, IntegerField, TelegramError, in_hex, packed_field
+from probewise.arm.nxt.wire import Answer, CommandFields, IntegerField, TelegramError, in_hex, packed_field
 
 A_co = TypeVar("A_co", bound=Answer, covariant=True)
 
@@ -36,7 +36,7 @@ class SensorType(IntEnum):
     LIGHT_INACTIVE = 0x06  # its LED off
 
 
-class Mode(IntEnum):
+class SensorMode(IntEnum):
     """Reading mode of an input."""
 
     RAW = 0x00
@@ -71,7 +71,7 @@ class Done(Answer):
 
 
 @dataclass(frozen=True)
-class Request(Fields, Generic[A_co]):
+class Request(CommandFields, Generic[A_co]):
     """A command; `A_co` is the type of a successful answer."""
 
     OPCODE: ClassVar[int]

@@ -38,7 +38,7 @@ def packed_field(kind: IntegerField, default: Any = dataclasses.MISSING) -> Any:
 
 
 @dataclass(frozen=True)
-class Fields:
+class CommandFields:
     """Body of a command: successive integers, each within its bounds."""
 
     def __post_init__(self) -> None:

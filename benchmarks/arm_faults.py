@@ -27,7 +27,7 @@ from tqdm import tqdm
 from probewise.arm import LegoArm, Pose, Reading, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link, Timing
 from probewise.calibration import FittedSensor
-from probewise.emulator import Bench, Faults, SensorPose, VirtualClock, VirtualLine, set_up_bench
+from probewise.emulator import EmulatedBench, Faults, SensorPose, VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
 from probewise.experiment import Experiment, Step, experiment_for, explore, read_journal, world_like
@@ -123,7 +123,7 @@ class Answer:
 class BrickLog:
     """The brick's own record: every valid light reading that it put on the line."""
 
-    bench: Bench | None = None
+    bench: EmulatedBench | None = None
     answers: list[Answer] = field(default_factory=list)
 
     def __call__(self, now_s: float, event: str, text: str) -> None:
@@ -194,7 +194,7 @@ class Run:
         return float(np.abs(self.steps[-1].mean - TRUTH).max())
 
 
-def bench_with(faults: Faults, clock: VirtualClock, *, seed: int) -> tuple[Bench, BrickLog]:
+def bench_with(faults: Faults, clock: VirtualClock, *, seed: int) -> tuple[EmulatedBench, BrickLog]:
     """Set up the arm over the circle, and the brick's record."""
     log = BrickLog()
     circle = Disc(TRUTH[:2], TRUTH[2])
@@ -243,12 +243,12 @@ def _session(
     return None
 
 
-def _is_lit(bench: Bench) -> bool:
+def _is_lit(bench: EmulatedBench) -> bool:
     """Ask the brick, past the line, whether its port feeds the LED."""
     return bench.radio.brick.answer(bytes((0, LIGHT, GEOMETRY.sensor_port)))[5] == LED_ON
 
 
-def _comes_to_rest(bench: Bench, clock: VirtualClock) -> bool:
+def _comes_to_rest(bench: EmulatedBench, clock: VirtualClock) -> bool:
     """Tell whether nothing turns any more once the last move has come to its end, and nothing then starts to."""
     clock.sleep(QUIET_S)
     bench.radio.brick.advance()

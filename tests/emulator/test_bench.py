@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from probewise.emulator import (
-    Bench,
     EmulatedArm,
+    EmulatedBench,
     Geometry,
     LightModel,
     SensorPose,
@@ -41,7 +41,7 @@ def posed(geometry: Geometry, *angles_deg: float) -> SensorPose:
     """Bring an arm's base, shoulder and elbow to these angles by hand."""
     arm = EmulatedArm(geometry)
     for joint, angle_deg in zip(arm.joints, angles_deg, strict=True):
-        joint.bring_to(angle_deg)
+        joint.set_angle_by_hand(angle_deg)
     return arm.sensor_pose()
 
 
@@ -81,7 +81,7 @@ def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry: Geometr
 def test_the_brick_counts_what_a_hand_turns(geometry: Geometry, clock: VirtualClock) -> None:
     bench = set_up_bench(geometry, WORLD, CIRCLE, clock, seed=1)
     shoulder = bench.arm.joints[1]
-    shoulder.bring_to(shoulder.numbers.home_deg + 10)
+    shoulder.set_angle_by_hand(shoulder.numbers.home_deg + 10)
     clock.sleep(0.01)
     bench.radio.brick.advance()
     counts = bench.radio.brick.outputs.ports["ABC".index(shoulder.numbers.port)].rotation_count
@@ -132,7 +132,7 @@ def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualCloc
         assert look(True) != pytest.approx(expected)
 
 
-def read_light(bench: Bench, clock: VirtualClock, port: int) -> int:
+def read_light(bench: EmulatedBench, clock: VirtualClock, port: int) -> int:
     brick = bench.radio.brick
     brick.answer(bytes((0x80, 0x05, port, 0x05, 0x80)))
     clock.sleep(0.1)
@@ -156,7 +156,7 @@ def test_a_brick_over_a_circle_reads_white_inside_and_black_outside(geometry: Ge
         shoulder = slope + math.acos((upper**2 + far**2 - lower**2) / (2 * upper * far))
         elbow = slope - math.acos((lower**2 + far**2 - upper**2) / (2 * lower * far))
         for joint, angle_rad in zip(bench.arm.joints, (-math.pi / 2, shoulder, elbow), strict=True):
-            joint.bring_to(math.degrees(angle_rad))
+            joint.set_angle_by_hand(math.degrees(angle_rad))
         stand = bench.arm.sensor_pose()
         assert (stand.x_mm, stand.y_mm, stand.height_mm) == pytest.approx((524.0, y_mm, 14.0))
         readings.append(read_light(bench, clock, geometry.sensor_port - 1))

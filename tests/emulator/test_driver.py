@@ -12,7 +12,7 @@ import pytest
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.emulator import (
-    Bench,
+    EmulatedBench,
     Faults,
     VirtualClock,
     VirtualLine,
@@ -28,7 +28,7 @@ SEED = 11
 WORLD, CIRCLE = true_world("paper"), Disc((600.0, 250.0), 80.0)
 
 
-def measured(bench: Bench, clock: VirtualClock, places_mm: np.ndarray) -> list[arm.Reading]:
+def measured(bench: EmulatedBench, clock: VirtualClock, places_mm: np.ndarray) -> list[arm.Reading]:
     """Read at each place, in one session."""
     geometry = arm.read_geometry(arm.shipped_geometry_path())
     link = Link(VirtualLine(bench.radio, clock), clock=clock)
@@ -54,7 +54,7 @@ def some_places(n: int) -> np.ndarray:
     return np.concatenate([inside, places[good & (from_edge > 0)][: n - len(inside)]])
 
 
-def bench_over_circle(clock: VirtualClock) -> Bench:
+def bench_over_circle(clock: VirtualClock) -> EmulatedBench:
     return set_up_bench(read_geometry(shipped_geometry_path()), WORLD, CIRCLE, clock, seed=SEED)
 
 
@@ -101,7 +101,7 @@ def test_joints_stand_where_their_counters_say_but_for_half_a_count(
 class Cut:
     """Let the n-th telegram from now on be the last that the brick gets."""
 
-    def __init__(self, bench: Bench, n: int) -> None:
+    def __init__(self, bench: EmulatedBench, n: int) -> None:
         self._radio, self._left, self._answer = bench.radio, n, bench.radio.brick.answer
         bench.radio.brick.answer = self  # type: ignore[method-assign]
 

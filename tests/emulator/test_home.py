@@ -11,7 +11,7 @@ import pytest
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
 from probewise.emulator import (
-    Bench,
+    EmulatedBench,
     Faults,
     VirtualClock,
     VirtualLine,
@@ -34,14 +34,14 @@ def with_stops(*names: str) -> arm.Geometry:
     )
 
 
-def lost(clock: VirtualClock, **turned_deg: float) -> Bench:
+def lost(clock: VirtualClock, **turned_deg: float) -> EmulatedBench:
     """Set up an arm whose joints were turned by hand while its counters showed 0."""
     bench = set_up_bench(
         read_geometry(shipped_geometry_path()), true_world("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1
     )
     names = ("base", "shoulder", "elbow")
     for joint, name in zip(bench.arm.joints, names, strict=True):
-        joint.bring_to(joint.numbers.home_deg + turned_deg.get(name, 0.0))
+        joint.set_angle_by_hand(joint.numbers.home_deg + turned_deg.get(name, 0.0))
     clock.sleep(0.01)
     bench.radio.brick.advance()
     for port in bench.radio.brick.outputs.ports:
@@ -49,12 +49,12 @@ def lost(clock: VirtualClock, **turned_deg: float) -> Bench:
     return bench
 
 
-def connected(bench: Bench, clock: VirtualClock, geometry: arm.Geometry) -> arm.LegoArm:
+def connected(bench: EmulatedBench, clock: VirtualClock, geometry: arm.Geometry) -> arm.LegoArm:
     machine = BrickMachine(Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock), geometry)
     return arm.LegoArm(machine, geometry, clock=clock)
 
 
-def lowest_while(bench: Bench) -> list[float]:
+def lowest_while(bench: EmulatedBench) -> list[float]:
     """Collect the sensor's height at each telegram from now on."""
     heights: list[float] = []
     answer = bench.radio.brick.answer

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from probewise.emulator import Battery, Brick, Motor, MotorParameters, VirtualClock
-from probewise.emulator.output import Output, RunState
+from probewise.emulator.output import OutputPort, RunState
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
 
@@ -21,7 +21,7 @@ def turn(ask: Callable[[str], str], power: int, limit: int, *, how: str = RUN, p
     ask(f"80 04 {port:02X} {power & 0xFF:02X} {how} {little(limit)}")
 
 
-def wait(clock: VirtualClock, brick: Brick, seconds: float) -> Output:
+def wait(clock: VirtualClock, brick: Brick, seconds: float) -> OutputPort:
     """Let time pass and return port A."""
     clock.sleep(seconds)
     brick.advance()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from probewise.arm import Geometry, Instrument, LegoArm, Machine, OwnInstrument, Pose, Reading
     from probewise.arm.basics import Clock
     from probewise.arm.nxt import Brick
-    from probewise.emulator import Bench as EmulatedBench
+    from probewise.emulator import EmulatedBench
     from probewise.world import Surface, World
 
 ARMS = (

@@ -19,7 +19,7 @@ from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.emulator import Bench, SensorPose, Trace
+    from probewise.emulator import EmulatedBench, SensorPose, Trace
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
 class _TypedCommands:
     """The typed commands of the bench (a scene, `turn DEGREES`, `where`), and a watch on the sensor's height."""
 
-    def __init__(self, bench: Bench) -> None:
+    def __init__(self, bench: EmulatedBench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
         self._is_in_table = False
 

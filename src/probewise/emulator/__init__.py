@@ -5,11 +5,11 @@ sensor over a `world`. It shares no code with the driver in `arm`, so each tests
 """
 
 from probewise.emulator.arm import EmulatedArm, Joint, SensorPose
-from probewise.emulator.bench import Bench, set_up_bench
+from probewise.emulator.bench import EmulatedBench, set_up_bench
 from probewise.emulator.brick import Battery, Brick
 from probewise.emulator.clock import Clock, VirtualClock
 from probewise.emulator.faults import Faults
-from probewise.emulator.geometry import Geometry, JointNumbers, read_geometry, shipped_geometry_path
+from probewise.emulator.geometry import Geometry, JointParameters, read_geometry, shipped_geometry_path
 from probewise.emulator.light_model import LightModel
 from probewise.emulator.line import VirtualLine
 from probewise.emulator.motor import Motor, MotorParameters
@@ -36,16 +36,16 @@ Light = LightSensor
 __all__ = [
     "AnalogSensor",
     "Battery",
-    "Bench",
     "Brick",
     "Clock",
     "DigitalSensor",
     "EmptyPort",
     "EmulatedArm",
+    "EmulatedBench",
     "Faults",
     "Geometry",
     "Joint",
-    "JointNumbers",
+    "JointParameters",
     "LightModel",
     "LightSensor",
     "Motor",
@@ -74,3 +74,9 @@ sonar = ultrasonic_sensor
 
 Table = Tabletop
 """The old name of `Tabletop`."""
+
+Bench = EmulatedBench
+"""The old name of `EmulatedBench`."""
+
+JointNumbers = JointParameters
+"""The old name of `JointParameters`."""

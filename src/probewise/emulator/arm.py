@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Self
 
-from probewise.emulator.geometry import Geometry, JointNumbers
+from probewise.emulator.geometry import Geometry, JointParameters
 from probewise.emulator.motor import Motor, MotorParameters
 
 _BEYOND_LIMITS_DEG = 3.0  # a joint's mechanical stops lie this far outside the file's limits
@@ -26,11 +26,11 @@ class SensorPose:
 class Joint:
     """A joint and the motor that drives it through gears; backlash is measured at the motor."""
 
-    numbers: JointNumbers
+    numbers: JointParameters
     motor: Motor
 
     @classmethod
-    def create_at_home(cls, numbers: JointNumbers) -> Self:
+    def create_at_home(cls, numbers: JointParameters) -> Self:
         """Make a joint at its home position, with the motor at 0."""
         ends = sorted(
             (angle_deg - numbers.home_deg) * numbers.gear_ratio
@@ -48,10 +48,12 @@ class Joint:
         """Angle of the joint."""
         return math.radians(self.numbers.home_deg + self.motor.driven_deg / self.numbers.gear_ratio)
 
-    def bring_to(self, angle_deg: float) -> None:
+    def set_angle_by_hand(self, angle_deg: float) -> None:
         """Set the joint to an angle, as by hand; the motor follows and rests in the middle of the backlash."""
         self.motor.angle_deg = self.motor.driven_deg = (angle_deg - self.numbers.home_deg) * self.numbers.gear_ratio
         self.motor.speed_deg_s = 0.0
+
+    bring_to = set_angle_by_hand  # its old name
 
 
 class EmulatedArm:

@@ -22,7 +22,7 @@ _WALL_CM = 42
 
 
 @dataclass(frozen=True)
-class Bench:
+class EmulatedBench:
     """The emulated bench; `arm` and `radio.brick` give access to its state."""
 
     table: Tabletop
@@ -41,7 +41,7 @@ def set_up_bench(
     faults: Faults | None = None,
     sleep_min: int = 10,
     trace: Trace = ignore_trace,
-) -> Bench:
+) -> EmulatedBench:
     """Build a bench, the arm at home.
 
     Parameters
@@ -86,4 +86,4 @@ def set_up_bench(
         watch=arm.record_lowest,
     )
     rng = np.random.default_rng([seed, 1])
-    return Bench(table, arm, Radio(brick, clock, rng=rng, faults=faults, trace=trace))
+    return EmulatedBench(table, arm, Radio(brick, clock, rng=rng, faults=faults, trace=trace))

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from probewise.emulator.clock import Clock
 from probewise.emulator.files import Files
-from probewise.emulator.inputs import Inputs, Sensor
+from probewise.emulator.inputs import InputPorts, Sensor
 from probewise.emulator.motor import Motor
-from probewise.emulator.outputs import Outputs
+from probewise.emulator.outputs import OutputPorts
 from probewise.emulator.programs import Programs
 from probewise.emulator.protocol import RefusedError, Request, Status, build_reply, parse_request
 from probewise.emulator.sensors import EmptyPort
@@ -87,8 +87,8 @@ class Brick:
         self._battery = Battery() if battery is None else battery
         self._name = name.encode("latin-1")
         plugged = [Motor() for _ in range(3)] if motors is None else motors
-        self.outputs = Outputs(plugged, now_s=self._began_s, watch=watch)
-        self.inputs = Inputs([EmptyPort()] * 4 if sensors is None else sensors, clock)
+        self.outputs = OutputPorts(plugged, now_s=self._began_s, watch=watch)
+        self.inputs = InputPorts([EmptyPort()] * 4 if sensors is None else sensors, clock)
         self._files = Files({"echo.rxe": b""} if files is None else files, capacity=_FLASH_BYTES)
         self._programs = Programs(self._files.exists, self._reset_ports)
         self._commands: Mapping[int, Callable[..., bytes]] = {

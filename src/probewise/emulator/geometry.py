@@ -19,7 +19,7 @@ LARGEST = 1e6
 
 
 @dataclass(frozen=True)
-class JointNumbers:
+class JointParameters:
     """One joint: motor port, gear ratio (motor turns per joint turn), angle at count 0, limits, backlash."""
 
     port: str
@@ -42,7 +42,7 @@ class Geometry:
     sensor_mm: tuple[float, float]  # forward of the wrist, below it
     mounting_deg: float
     read_height_mm: float
-    joints: tuple[JointNumbers, JointNumbers, JointNumbers]  # base, shoulder, elbow
+    joints: tuple[JointParameters, JointParameters, JointParameters]  # base, shoulder, elbow
 
 
 def shipped_geometry_path() -> Path:
@@ -70,7 +70,7 @@ def read_geometry(path: Path) -> Geometry:
             raise FileError(path, f"{'.'.join(keys)} is {shown(value)}", f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
-    def joint(name: str) -> JointNumbers:
+    def joint(name: str) -> JointParameters:
         port = _value_in_file(path, table, ("joints", name, "port"))
         if port not in ("A", "B", "C"):
             raise FileError(path, f"joints.{name}.port is {shown(port)}", "A, B or C")
@@ -80,7 +80,7 @@ def read_geometry(path: Path) -> Geometry:
         home, low, high, play = (number("joints", name, f"{key}_deg") for key in ("home", "low", "high", "play"))
         if not low <= home <= high:
             raise FileError(path, f"joints.{name}.home_deg is {home:g}", f"within its limits, {low:g} to {high:g}")
-        return JointNumbers(port, ratio, home, low, high, play)
+        return JointParameters(port, ratio, home, low, high, play)
 
     elbow = _value_in_file(path, table, ("links", "elbow"))
     if elbow not in ("absolute", "relative"):

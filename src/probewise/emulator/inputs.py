@@ -36,7 +36,7 @@ class _InputPort:
 
 
 @dataclass
-class Inputs:
+class InputPorts:
     """The input ports 1 to 4 with their sensors, and the commands that set and read them.
 
     Parameters

@@ -46,7 +46,7 @@ class OutputSetting:
 
 
 @dataclass
-class Output:
+class OutputPort:
     """One output port: its motor and the firmware's state."""
 
     motor: Motor = field(default_factory=Motor)
@@ -202,7 +202,7 @@ class Output:
         if sign * (self.tacho_count - self._goal) >= 0:
             self.target_power = self.set_power
             self.run_state = RunState.IDLE
-        self._drive_unregulated()
+        self._set_unregulated_power()
 
     def _ramp_down(self) -> None:
         """Lower the power in steps of 1, not below 10, until the limit."""
@@ -218,7 +218,7 @@ class Output:
             if not self.set_power:
                 self.target_power = self.power = 0
             self.run_state, self._regulation = RunState.IDLE, 0
-        self._drive_unregulated()
+        self._set_unregulated_power()
 
     def _stop_at_limit(self) -> None:
         """Become idle at the limit; without one, carry the goal along."""
@@ -227,9 +227,9 @@ class Output:
                 self._goal = self.tacho_count
         elif self.is_at_limit and not self.is_synchronised:
             self.run_state, self._regulation = RunState.IDLE, 0
-        self._drive_unregulated()
+        self._set_unregulated_power()
 
-    def _drive_unregulated(self) -> None:
+    def _set_unregulated_power(self) -> None:
         if not self._regulation:
             self.power = clipped(self.target_power, 100)
 

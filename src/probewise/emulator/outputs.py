@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from probewise.emulator.motor import Motor
-from probewise.emulator.output import Output, OutputSetting, RunState, clipped, quotient_towards_zero
+from probewise.emulator.output import OutputPort, OutputSetting, RunState, clipped, quotient_towards_zero
 from probewise.emulator.protocol import RefusedError, Status
 
 _ALL = 0xFF
@@ -23,7 +23,7 @@ class _Synchronisation:
     lead_sum: int = 0
     turn: int = 0  # difference in counts demanded by the turn ratio so far
 
-    def correct_powers(self, one: Output, two: Output) -> None:
+    def correct_powers(self, one: OutputPort, two: OutputPort) -> None:
         """Slow the motor that leads and speed up the one that lags (PID gains 3, 1, 1, over 4)."""
         inner = two if (one.setting.turn_ratio > 0) == (one.target_power >= 0) else one
         self.turn += 2 * quotient_towards_zero(inner.setting.turn_ratio * abs(inner.target_power), 100)
@@ -35,7 +35,7 @@ class _Synchronisation:
             port.power = clipped(target, abs(port.target_power) if one.setting.turn_ratio else 100)
 
 
-class Outputs:
+class OutputPorts:
     """The output ports A, B and C with their motors, and the commands that drive them.
 
     Parameters
@@ -50,7 +50,7 @@ class Outputs:
 
     def __init__(self, motors: Sequence[Motor], *, now_s: float, watch: Callable[[], None] = lambda: None) -> None:
         self._watch = watch
-        self.ports = tuple(Output(motor) for motor in motors)
+        self.ports = tuple(OutputPort(motor) for motor in motors)
         self._ticked_s = now_s
         self._synchronisation = _Synchronisation()
         self.commands: Mapping[int, Callable[..., bytes]] = {
@@ -77,7 +77,7 @@ class Outputs:
         for port in self.ports:
             port.apply_setting(OutputSetting())
 
-    def _simulate_millisecond(self, moving: Sequence[Output], battery_mv: float) -> None:
+    def _simulate_millisecond(self, moving: Sequence[OutputPort], battery_mv: float) -> None:
         """Simulate a millisecond of the moving ports; a synchronised pair stops when one of them reaches its limit."""
         for port in moving:
             port.simulate_millisecond(battery_mv)
@@ -106,7 +106,7 @@ class Outputs:
         self._checked_port(port).reset_counter(block=bool(relative))
         return b""
 
-    def _checked_port(self, port: int) -> Output:
+    def _checked_port(self, port: int) -> OutputPort:
         if port >= len(self.ports):
             raise RefusedError(Status.OUT_OF_RANGE)
         return self.ports[port]

@@ -13,7 +13,7 @@ import pytest
 from probewise import __version__
 from probewise.calibration import predict, read_sensor
 from probewise.cli import VERBS, main
-from probewise.recordings import read_plan, read_plan_and_readings, read_prediction
+from probewise.recordings import read_plan, read_plan_and_readings, read_prediction_columns
 from probewise.report import exploration
 
 
@@ -24,7 +24,7 @@ def run(*arguments):
 def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, recording_file, tmp_path, capsys):
     out = tmp_path / "new" / "p.csv"
     assert run("predict", sensor_file, recording_file, "--out", out) == 0
-    mean, sd, log_density = read_prediction(out)
+    mean, sd, log_density = read_prediction_columns(out)
     plan, readings = read_plan_and_readings(recording_file)
     direct = predict(read_sensor(sensor_file), plan, readings)
     np.testing.assert_array_equal(mean, direct.mean)

@@ -18,7 +18,7 @@ from probewise.recordings import (
     Stripes,
     Uniform,
     read_plan,
-    read_prediction,
+    read_prediction_columns,
     read_recording,
 )
 
@@ -274,7 +274,7 @@ def test_missing_files_are_named(tmp_path):
 def test_a_prediction_with_a_spread_of_nothing_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("mean,sd,log_density\n1,1,\n1,0,2\n")
     with pytest.raises(FileError, match="row 3, column sd"):
-        read_prediction(tmp_path / "p.csv")
+        read_prediction_columns(tmp_path / "p.csv")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")

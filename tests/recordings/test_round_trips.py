@@ -25,7 +25,7 @@ from probewise.recordings import (
     fingerprint,
     read_plan,
     read_plan_and_readings,
-    read_prediction,
+    read_prediction_columns,
     read_recording,
     write_plan,
     write_prediction,
@@ -220,7 +220,7 @@ def test_predictions_keep_every_row_and_leave_missing_densities_empty(tmp_path):
     mean, sd, log_density = np.array([1.0, 2 / 3, 3.0]), np.array([0.1, 0.2, 1 / 3]), np.array([-1.5, np.nan, 0.7])
     path = tmp_path / "p.csv"
     write_prediction(Prediction(plan_of(3), mean, sd, log_density), path)
-    back = read_prediction(path)
+    back = read_prediction_columns(path)
     for written, read in zip((mean, sd, log_density), back, strict=True):
         np.testing.assert_array_equal(written, read)
     lines = path.read_text().splitlines()

@@ -34,7 +34,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import NestedResult, StopRule
 from probewise.recordings import Recording, fingerprint
-from probewise.recordings.plan import require_described, require_recording
+from probewise.recordings.plan import require_patterns_described, require_recording
 from probewise.sensor import SSFField
 
 _N_SAMPLES = 1000
@@ -184,7 +184,7 @@ def calibrate(
         If there are fewer usable readings than parameters, or the sampler warns of a doubtful run.
     """
     require_recording(recording)
-    require_described(recording.plan)
+    require_patterns_described(recording.plan)
     require_rng(rng)
     checked_whole("n_live", n_live)
     wanted = _checked_orders(orders)

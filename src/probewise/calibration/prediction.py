@@ -15,7 +15,7 @@ from probewise.effects.origin import CountsTimeFromOrigin
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
-from probewise.recordings.plan import require_described, require_plan
+from probewise.recordings.plan import require_patterns_described, require_plan
 from probewise.scene import KnownScene
 from probewise.sensor import with_declared_height_commanded
 
@@ -75,7 +75,7 @@ def predict(
             raise ParameterError("readings", readings, "none together with a recording, which has its own")
         readings, plan = plan.readings, plan.plan
     require_plan(plan)
-    require_described(plan)
+    require_patterns_described(plan)
     recorded = np.full(len(plan), np.nan) if readings is None else floats(readings, "readings")
     if recorded.shape != (len(plan),):
         raise ShapeError(f"readings have shape {recorded.shape}; allowed: ({len(plan)},), one per row of the plan")

@@ -23,7 +23,7 @@ from probewise.diagnosis.joining import join
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.errors import ParameterError
-from probewise.recordings.plan import Recording, require_described
+from probewise.recordings.plan import Recording, require_patterns_described
 from probewise.sensor import Stage
 
 
@@ -112,7 +112,7 @@ def prepare(
         require_sensor_prior(sensor)
     everything = join([recordings] if isinstance(recordings, Recording) else recordings)
     if null is None:
-        require_described(everything.plan)
+        require_patterns_described(everything.plan)
     if sensor is not None:
         require_same_unit(sensor, everything.plan)
         null = sensor_from_samples(sensor)

@@ -48,7 +48,7 @@ from probewise.nested.run import run
 from probewise.nested.weights import resampled_rows
 from probewise.recordings import Recording
 from probewise.recordings import Uniform as UniformPattern
-from probewise.recordings.plan import require_described, require_recording
+from probewise.recordings.plan import require_patterns_described, require_recording
 from probewise.scene import Field, HypothesisScene, KnownScene, Shape
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, NaiveSensor
 from probewise.world import World
@@ -237,7 +237,7 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
     """
     require_recording(recording)
     require_sensor(sensor)
-    require_described(recording.plan)
+    require_patterns_described(recording.plan)
     mixture, patterns = sensor.with_leading_effects().mean_mixture(), KnownScene(recording.plan.patterns)
     share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)
     seen = share.predict(np.empty((1, 0)), recording.plan)[0]

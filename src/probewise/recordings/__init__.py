@@ -23,7 +23,7 @@ from probewise.recordings.patterns import (
 )
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.plans import paper_plan, two_way_plan
-from probewise.recordings.prediction import Prediction, read_prediction, write_prediction
+from probewise.recordings.prediction import Prediction, read_prediction_columns, write_prediction
 from probewise.recordings.shipping import shipped
 from probewise.recordings.strict_json import json_of, parse_json_file_text, parse_strict_json, strict_json
 from probewise.recordings.text import read_bytes, read_text
@@ -52,7 +52,7 @@ __all__ = [
     "read_bytes",
     "read_plan",
     "read_plan_and_readings",
-    "read_prediction",
+    "read_prediction_columns",
     "read_recording",
     "read_text",
     "shipped",
@@ -64,3 +64,6 @@ __all__ = [
     "write_recording",
     "write_text_atomically",
 ]
+
+read_prediction = read_prediction_columns
+"""The old name of `read_prediction_columns`."""

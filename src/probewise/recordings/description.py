@@ -85,10 +85,10 @@ class _CheckedFields:
     def positive_number(self, name: str) -> float:
         return self.number(name, "a number greater than 0", lambda v: v > 0)
 
-    def pair(self, name: str) -> tuple[float, float]:
+    def pair_of_numbers(self, name: str) -> tuple[float, float]:
         allowed = "two finite numbers [x, y]"
         value = self.required_value(name, allowed)
-        if not _is_pair(value):
+        if not _is_pair_of_numbers(value):
             raise self.error_at(name, value, allowed)
         return float(value[0]), float(value[1])
 
@@ -108,7 +108,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
-def _is_pair(value: object) -> bool:
+def _is_pair_of_numbers(value: object) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(_is_number(v) for v in value)
 
 
@@ -125,20 +125,22 @@ def _parse_half_plane(f: _CheckedFields) -> Pattern:
 
 
 def _parse_quadrant(f: _CheckedFields) -> Pattern:
-    direction = f.pair("direction")
+    direction = f.pair_of_numbers("direction")
     if any(abs(d) != 1 for d in direction):
         raise f.error_at("direction", f.content["direction"], "[1, 1], [1, -1], [-1, 1] or [-1, -1]")
-    return Quadrant(f.pair("corner_mm"), (int(direction[0]), int(direction[1])), *f.inside_and_outside_albedo())
+    return Quadrant(
+        f.pair_of_numbers("corner_mm"), (int(direction[0]), int(direction[1])), *f.inside_and_outside_albedo()
+    )
 
 
 def _parse_disc(f: _CheckedFields) -> Pattern:
-    return Disc(f.pair("center_mm"), f.positive_number("radius_mm"), *f.inside_and_outside_albedo())
+    return Disc(f.pair_of_numbers("center_mm"), f.positive_number("radius_mm"), *f.inside_and_outside_albedo())
 
 
 def _parse_polygon(f: _CheckedFields) -> Pattern:
     allowed = "a list of at least three corners [x, y]"
     vertices = f.required_value("vertices_mm", allowed)
-    if not isinstance(vertices, list) or len(vertices) < 3 or not all(_is_pair(v) for v in vertices):
+    if not isinstance(vertices, list) or len(vertices) < 3 or not all(_is_pair_of_numbers(v) for v in vertices):
         raise f.error_at("vertices_mm", vertices, allowed)
     return Polygon(tuple((float(x), float(y)) for x, y in vertices), *f.inside_and_outside_albedo())
 
@@ -166,7 +168,7 @@ def _parse_image(f: _CheckedFields) -> Pattern:
     picture = f.path.parent / name
     if not picture.is_file():  # the error names the JSON that refers to the picture
         raise f.error_at("file", name, "the name of a PNG or .npy file that lies in the same folder")
-    return Image(read_image(picture), f.positive_number("pixel_mm"), f.pair("origin_mm"), name)
+    return Image(read_image(picture), f.positive_number("pixel_mm"), f.pair_of_numbers("origin_mm"), name)
 
 
 _KINDS: dict[str, Callable[[_CheckedFields], Pattern]] = {

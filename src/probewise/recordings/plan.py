@@ -537,7 +537,7 @@ def require_recording(recording: object) -> None:
     require_kind("recording", recording, Recording, allowed)
 
 
-def require_described(plan: Plan) -> None:
+def require_patterns_described(plan: Plan) -> None:
     """Raise ParameterError where a pattern that occurs in the plan is not described."""
     for name, _ in plan.rows_by_pattern():
         if name not in plan.patterns:

@@ -92,7 +92,7 @@ def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> No
     write_text_atomically(path, csv_text(columns))
 
 
-def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def read_prediction_columns(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Read `mean`, `sd` and `log_density` from a file of predictions, each (n_points,); an empty density becomes NaN.
 
     Raises

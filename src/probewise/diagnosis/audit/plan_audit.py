@@ -43,7 +43,7 @@ from probewise.diagnosis.verdict_report.words import substitute_reading_unit
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
-from probewise.recordings.plan import Plan, Recording, require_described, require_plan
+from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
 from probewise.sensor import Stage, is_free_form
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
@@ -272,7 +272,7 @@ def audit_plan(
         require_sensor_prior(sensor)
     if len(plan) == 0:
         raise ParameterError("plan", "no row", "at least one")
-    require_described(plan)
+    require_patterns_described(plan)
     if sensor is not None:
         require_same_unit(sensor, plan)
     if noise_sd is None and isinstance(sensor, FittedSensor):

@@ -22,7 +22,7 @@ from probewise.calibration import FittedSensor, posterior_mean_ssf_field
 from probewise.experiment import TRUST, experiment_for, explore, left_out_after_step, repaired_sensor
 from probewise.recordings import Instrumentation
 from probewise.scene import Field
-from probewise.sensor import mixture_names
+from probewise.sensor import mixture_parameter_names
 from probewise.study.circles import FIELD, POPULATIONS
 from probewise.study.concealed import ConcealedTrial, _arm_in_concealed_world
 from probewise.study.rows import REFERENCE
@@ -41,7 +41,7 @@ def calibrated() -> FittedSensor:
     sd = np.array([0.0, 0.02, 0.02, *(0.01 * np.abs(truth[3:6])), 0.05, 0.05])
     samples = truth + sd * np.random.default_rng(11).standard_normal((500, len(truth)))
     return FittedSensor(
-        names=(*mixture_names(1), "I_min", "I_max"),
+        names=(*mixture_parameter_names(1), "I_min", "I_max"),
         samples=samples,
         n_gaussians=1,
         noise_sd=np.full(500, REFERENCE.noise_sd),

@@ -18,7 +18,7 @@ from probewise.calibration.compensation import CompensatedShapeProposal
 from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FreeLevels, FreeMixture, mixture_names
+from probewise.sensor import Chain, FreeLevels, FreeMixture, mixture_parameter_names
 
 TRUTH = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
 NOISE_SD = 0.5
@@ -34,7 +34,7 @@ def _sensor(
     extra = extra or {}
     columns = np.broadcast_to(list(extra.values()), (n_samples, len(extra)))
     return FittedSensor(
-        names=(*mixture_names(1), "I_min", "I_max", *extra),
+        names=(*mixture_parameter_names(1), "I_min", "I_max", *extra),
         samples=np.concatenate([samples, columns], axis=1),
         n_gaussians=1,
         noise_sd=NOISE_SD * np.exp(0.05 * spread * rng.standard_normal(n_samples)),

@@ -55,7 +55,7 @@ from probewise.recordings import (
     write_recording,
 )
 from probewise.recordings.plans import with_jittered_times
-from probewise.sensor import footprint_of, mixture_names
+from probewise.sensor import footprint_of, mixture_parameter_names
 
 EXTENT = Extent(10.0, 60.0, with_jittered_times(two_way_plan(), rng=np.random.default_rng(0)))
 
@@ -127,7 +127,7 @@ def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
     z = 0.02 * rng.normal(size=(4000, free.n_params))
     theta = free.theta(z)
     np.testing.assert_allclose(free.z(theta), z, atol=1e-8)
-    names = (*mixture_names(free.n_gaussians), "I_min", "I_max")
+    names = (*mixture_parameter_names(free.n_gaussians), "I_min", "I_max")
     prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
     assert isinstance(prior, FreeFormSensor)
     drawn = prior.theta(rng.normal(size=(4000, free.n_params)))

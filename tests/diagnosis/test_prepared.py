@@ -15,7 +15,7 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, paper_plan
 from probewise.scene import Circle
-from probewise.sensor import SSFField, mixture_names
+from probewise.sensor import SSFField, mixture_parameter_names
 
 SENSOR: Apparatus = LightSensorApparatus()
 
@@ -52,7 +52,10 @@ def test_values_of_usable_readings_are_spread_over_all_rows():
 
 def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     """As readings of the calibration's height that command it; the plan itself stays as it was declared."""
-    names, theta = (*mixture_names(1), "I_min", "I_max"), np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
+    names, theta = (
+        (*mixture_parameter_names(1), "I_min", "I_max"),
+        np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0]),
+    )
     sensor = FittedSensor(
         names=names,
         samples=theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8)),

@@ -54,7 +54,7 @@ from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
 from probewise.recordings import Instrumentation, Plan, Uniform
-from probewise.sensor import mixture_names
+from probewise.sensor import mixture_parameter_names
 from probewise.study import ConcealedTrial, arm_of, concealed_csv_rows, experiment_of, run_concealed_trial
 from probewise.study.concealed import _arm_in_concealed_world
 from probewise.study.rows import REFERENCE
@@ -89,7 +89,7 @@ def sensor():
     sd = np.array([0.0, 0.03, 0.03, 0.001, 0.002, 0.0005, 0.05, 0.05])
     samples = truth + sd * np.random.default_rng(11).standard_normal((500, 8))
     return FittedSensor(
-        names=(*mixture_names(1), "I_min", "I_max"),
+        names=(*mixture_parameter_names(1), "I_min", "I_max"),
         samples=samples,
         n_gaussians=1,
         noise_sd=np.full(500, 0.5),

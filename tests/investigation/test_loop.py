@@ -12,7 +12,7 @@ from probewise.diagnosis import Hypothesis
 from probewise.errors import ParameterError
 from probewise.investigation import Budget, investigate, reason_if_settled
 from probewise.recordings import Instrumentation, Recording, paper_plan
-from probewise.sensor import mixture_names
+from probewise.sensor import mixture_parameter_names
 from probewise.world import World
 from probewise.world.concealed import Backlash
 from probewise.world.shipped import BLOB
@@ -130,7 +130,7 @@ def test_an_instrument_at_another_height_than_its_sensors_calibration_goes_on_to
     sd = np.array([0.0, 0.03, 0.03, 6e-4, 2e-3, 3e-4, 0.1, 0.1])
     samples = truth + sd * np.random.default_rng(1).standard_normal((500, 8))
     sensor = FittedSensor(
-        names=(*mixture_names(1), "I_min", "I_max"),
+        names=(*mixture_parameter_names(1), "I_min", "I_max"),
         samples=samples,
         n_gaussians=1,
         noise_sd=np.full(500, 0.6),

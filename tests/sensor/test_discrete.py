@@ -7,7 +7,7 @@ from probewise.errors import ShapeError
 from probewise.recordings import patterns as kinds
 from probewise.scene import HalfPlaneRegion, disc_region, region_of
 from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
-from probewise.sensor.gaussian import Spot, mean_albedo_under_one
+from probewise.sensor.gaussian import Spot, mean_albedo_under_one_gaussian
 
 MIXTURE = FixedMixture([1.0], [[0.7, 1.3]], [[[20.0, 6.0], [6.0, 30.0]]])
 PATTERNS = {
@@ -39,7 +39,7 @@ def closed(region, poses):
     turn = np.moveaxis(np.array([[c, -s], [s, c]]), (0, 1), (-2, -1))
     lab = turn @ cov @ np.swapaxes(turn, -1, -2)
     spot = Spot(poses.x_mm, poses.y_mm, c * u - s * v, s * u + c * v, lab[..., 0, 0], lab[..., 1, 1], lab[..., 0, 1])
-    return mean_albedo_under_one(region, spot, 64)
+    return mean_albedo_under_one_gaussian(region, spot, 64)
 
 
 @pytest.mark.parametrize("name", PATTERNS)

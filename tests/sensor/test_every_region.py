@@ -16,7 +16,7 @@ from probewise.scene.regions import (
     UniformRegion,
 )
 from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
-from probewise.sensor.gaussian import mean_albedo_under_gaussians, mean_albedo_under_one
+from probewise.sensor.gaussian import mean_albedo_under_gaussians, mean_albedo_under_one_gaussian
 
 ELLIPSE = EllipseRegion([[3.0, 1.0]], [[14.0, 9.0]], [0.4])
 POLYGON = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]]]))
@@ -55,7 +55,7 @@ def test_a_footprint_is_seen_alike_by_closed_form_and_by_the_papers_sum(kind):
         KINDS[kind], x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0))
     )
     np.testing.assert_allclose(closed[:, :, 0], by_pixels, atol=2.5e-4)  # its error falls as the pixel squared
-    assert kind in registered(mean_albedo_under_one)
+    assert kind in registered(mean_albedo_under_one_gaussian)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -15,9 +15,9 @@ from probewise.sensor import (
     DiscreteSSF,
     FreeLevels,
     FreeMixture,
-    bends_of,
+    bend_coefficients,
     footprint_of,
-    free_form_parameters,
+    free_form_theta,
     is_free_form,
     mean_ssf_field,
 )
@@ -46,25 +46,25 @@ def predicted(theta: np.ndarray) -> np.ndarray:
 
 
 def test_without_bends_it_is_the_one_gaussian():
-    np.testing.assert_allclose(predicted(free_form_parameters(ONE, np.zeros((1, N_BENDS)))), predicted(ONE), atol=1e-10)
+    np.testing.assert_allclose(predicted(free_form_theta(ONE, np.zeros((1, N_BENDS)))), predicted(ONE), atol=1e-10)
 
 
 def test_bends_leave_mean_and_covariance_alone():
-    bent = free_form_parameters(np.repeat(ONE, 6, axis=0), BENDS)
+    bent = free_form_theta(np.repeat(ONE, 6, axis=0), BENDS)
     np.testing.assert_allclose(moments(bent), np.repeat(moments(ONE), 6, axis=0), atol=1e-10)
 
 
 def test_readings_are_linear_in_the_bends():
-    plain, *bent = (predicted(free_form_parameters(ONE, b[None])) for b in (np.zeros(N_BENDS), BENDS[0], BENDS[1]))
-    both = predicted(free_form_parameters(ONE, (2.0 * BENDS[0] - 3.0 * BENDS[1])[None]))
+    plain, *bent = (predicted(free_form_theta(ONE, b[None])) for b in (np.zeros(N_BENDS), BENDS[0], BENDS[1]))
+    both = predicted(free_form_theta(ONE, (2.0 * BENDS[0] - 3.0 * BENDS[1])[None]))
     np.testing.assert_allclose(both - plain, 2.0 * (bent[0] - plain) - 3.0 * (bent[1] - plain), atol=1e-9)
     assert np.ptp(bent[0] - plain) > 0.5
 
 
 def test_bends_are_found_again_and_free_forms_are_known():
-    bent = free_form_parameters(np.repeat(ONE, 6, axis=0), BENDS)
+    bent = free_form_theta(np.repeat(ONE, 6, axis=0), BENDS)
     bent[:, ::6] *= 7.0  # only ratios of amplitudes matter
-    np.testing.assert_allclose(bends_of(bent), BENDS, atol=1e-12)
+    np.testing.assert_allclose(bend_coefficients(bent), BENDS, atol=1e-12)
     assert is_free_form(bent)
     others = bent.copy()
     others[:, 9] *= 1.01
@@ -75,7 +75,7 @@ def test_bends_are_found_again_and_free_forms_are_known():
 @pytest.mark.slow
 def test_a_bent_form_sees_what_the_sum_over_its_pixels_sees():
     """Route one: closed forms of each Gaussian; route two: the field, pixel by pixel (paper, eq. discreteR)."""
-    bent = free_form_parameters(ONE, BENDS[:1])
+    bent = free_form_theta(ONE, BENDS[:1])
     grid = np.arange(-25.0, 25.01, 0.25)
     field = mean_ssf_field(footprint_of(bent, N_FREE_FORM), u_mm=grid, v_mm=grid)
     chain = Chain(DiscreteSSF(field), FreeLevels(), KnownScene(PLAN.patterns))
@@ -88,7 +88,7 @@ def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(name, monkeypat
     """Route one: once a geometry and summed; route two: each hypothesis by itself."""
     effects = [] if name is None else [VOCABULARY[name].for_extent(Extent(10.0, 60.0, PLAN))]
     built = Chain(FreeMixture(N_FREE_FORM), FreeLevels(), KnownScene(PLAN.patterns), effects)
-    shapes = free_form_parameters(np.repeat(ONE, 12, axis=0), 0.1 * RNG.standard_normal((12, N_BENDS)))
+    shapes = free_form_theta(np.repeat(ONE, 12, axis=0), 0.1 * RNG.standard_normal((12, N_BENDS)))
     shapes[6:, 1::6] += 0.3
     own = np.concatenate([effect.bank()[0][:1] for effect in effects], axis=1) if effects else np.zeros((1, 0))
     own = np.where(np.arange(12)[:, None] % 6 < 3, 1.0, 1.2) * own

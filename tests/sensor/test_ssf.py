@@ -16,8 +16,8 @@ from probewise.sensor import (
     footprint_of,
     mean_ssf_field,
     merged_mean_mixture,
-    mixture_names,
     mixture_of_field,
+    mixture_parameter_names,
 )
 
 TWO = np.array([[1.0, 2.0, -1.0, 0.02, 0.01, 0.004, 0.5, -6.0, 3.0, 0.05, 0.04, -0.01]])
@@ -36,8 +36,21 @@ def paper_ssf(x, y, row):
 
 
 def test_parameters_are_named_in_the_papers_order():
-    assert mixture_names(2) == ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "a_2", "u_2", "v_2", "A_2", "B_2", "C_2")
-    assert FreeMixture(2).names == mixture_names(2)
+    assert mixture_parameter_names(2) == (
+        "a_1",
+        "u_1",
+        "v_1",
+        "A_1",
+        "B_1",
+        "C_1",
+        "a_2",
+        "u_2",
+        "v_2",
+        "A_2",
+        "B_2",
+        "C_2",
+    )
+    assert FreeMixture(2).names == mixture_parameter_names(2)
 
 
 def test_the_footprint_is_the_papers_formula_normalised():
@@ -168,7 +181,7 @@ def test_a_known_ssf_has_no_parameters():
             "mass of the SSF is -10.0.*; allowed: greater than 0",
         ),
         (lambda: footprint_of(np.zeros((1, 5)), 1), r"allowed: \(n_samples, 6\)"),
-        (lambda: mixture_names(0), "n_gaussians is 0; allowed: 1 or more"),
+        (lambda: mixture_parameter_names(0), "n_gaussians is 0; allowed: 1 or more"),
         (lambda: FixedMixture([1.0], [[0.0, 0.0]], [[[1.0, 2.0], [2.0, 1.0]]]), "positive definite"),
         (lambda: FixedMixture([0.0], [[0.0, 0.0]], [np.eye(2)]), "weights"),
         (lambda: FixedMixture([1.0], [[0.0]], [np.eye(2)]), "means_mm has shape"),

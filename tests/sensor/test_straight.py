@@ -11,7 +11,7 @@ from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene, region_of
 from probewise.sensor import Chain, FixedLevels, FreeMixture, footprint_of, mean_albedo_under_gaussians
-from probewise.sensor.gaussian import probabilities_beyond_corner_and_sides, turn_into_lab_frame
+from probewise.sensor.gaussian import moments_in_lab_frame, probabilities_beyond_corner_and_sides
 
 EDGES = {
     "edge": kinds.HalfPlane(0.0, 0.0),
@@ -54,7 +54,7 @@ def out_and_back(patterns):
 def by_itself(theta, plan, row):
     """What a reading sees, from the closed form of its own pattern."""
     foot = footprint_of(theta, theta.shape[1] // 6)
-    dx, dy, *spread = turn_into_lab_frame(
+    dx, dy, *spread = moments_in_lab_frame(
         plan.orientation_rad[row], foot.u_mm, foot.v_mm, foot.var_u, foot.var_v, foot.cov_uv
     )
     region = region_of(plan.patterns[plan.pattern_names[plan.pattern[row]]])

@@ -41,8 +41,8 @@ from probewise.sensor import (
     footprint_of,
     is_free_form,
     merged_mean_mixture,
-    mixture_names,
     mixture_of_field,
+    mixture_parameter_names,
 )
 
 T = TypeVar("T")
@@ -153,7 +153,7 @@ class FittedSensor(NamedSamples):
         if not 1 <= self.n_gaussians <= len(self.names) // 6:
             allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
             raise ParameterError("n_gaussians", self.n_gaussians, allowed)
-        wanted = (*mixture_names(self.n_gaussians), "I_min", "I_max")
+        wanted = (*mixture_parameter_names(self.n_gaussians), "I_min", "I_max")
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
         owners = {name.partition(".")[0] for name in self.names[len(wanted) :]}
@@ -245,7 +245,8 @@ class FittedSensor(NamedSamples):
     def summary(self) -> str:
         """Describe the sensor in plain text."""
         unit, n = self.instrumentation.unit, self.n_gaussians
-        bending = frozenset(mixture_names(n)[6:] if self.is_free_form else ())  # twenty Gaussians would not be readable
+        # Twenty Gaussians would not be readable.
+        bending = frozenset(mixture_parameter_names(n)[6:] if self.is_free_form else ())
         form = "an SSF of free form" if bending else f"{n} Gaussian{'s' if n > 1 else ''}"
         lines = [
             f"{form}, {len(self.samples)} posterior samples"

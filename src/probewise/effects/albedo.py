@@ -22,7 +22,7 @@ from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 from probewise.scene.regions import edge_distance
-from probewise.sensor.gaussian import LabGaussian, mean_albedo_under_one
+from probewise.sensor.gaussian import LabGaussian, mean_albedo_under_one_gaussian
 from probewise.sensor.stages import SceneView, Stage
 
 _STEP = 1e-3  # of a standard deviation, for the central difference: its error is a millionth of this
@@ -119,7 +119,7 @@ class RegionWithGradient:
         return np.asarray(1 + self.per_mm @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under each Gaussian, by Stein's lemma.
 
@@ -132,7 +132,7 @@ def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian
 
     def mean_albedo_at_shift(sign: float) -> FloatArray:
         moved = replace(gaussian, dx_mm=gaussian.dx_mm + sign * x, dy_mm=gaussian.dy_mm + sign * y)
-        return mean_albedo_under_one(region.region, moved, n_nodes)
+        return mean_albedo_under_one_gaussian(region.region, moved, n_nodes)
 
     ahead, behind = mean_albedo_at_shift(1.0), mean_albedo_at_shift(-1.0)
     from_x = gaussian.x_mm + gaussian.dx_mm - region.origin.x_mm
@@ -166,7 +166,7 @@ class RegionWithPatch:
         return albedo * gaussian_bump((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_with_patch(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under each Gaussian: the region's, plus the patch's, a bell of covariance C + r^2."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
@@ -175,7 +175,7 @@ def _mean_albedo_with_patch(region: RegionWithPatch, gaussian: LabGaussian, n_no
     det = var_x * var_y - gaussian.cov_xy**2
     distance = (var_y * from_x**2 + var_x * from_y**2 - 2 * gaussian.cov_xy * from_x * from_y) / det
     added = albedo * r**2 / np.sqrt(det) * np.exp(-0.5 * distance)
-    return mean_albedo_under_one(region.region, gaussian, n_nodes) + added
+    return mean_albedo_under_one_gaussian(region.region, gaussian, n_nodes) + added
 
 
 def _regions_with_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:

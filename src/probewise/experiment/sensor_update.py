@@ -18,7 +18,7 @@ from probewise.calibration import FittedSensor
 from probewise.errors import ParameterError
 from probewise.priors import Normal, Product
 from probewise.sensor import FixedMixture, Footprint, footprint_of
-from probewise.sensor.stages import require_columns
+from probewise.sensor.stages import require_theta_columns
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class AdjustedMixture:
 
     def footprint(self, theta: FloatArray) -> Footprint:
         """Return the mixture of each hypothesis, theta (n_samples, 4)."""
-        require_columns(theta, self.names)
+        require_theta_columns(theta, self.names)
         size_u, size_v = np.exp(theta[:, None, 0:1]), np.exp(theta[:, None, 1:2])
         whole = self.mixture.footprint(np.empty((1, 0)))
         mean_u, mean_v = self.mixture.mean_mm

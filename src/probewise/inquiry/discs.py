@@ -21,7 +21,7 @@ from probewise.inquiry.scanlines import ROWS, Interval, PlacesNearEdges, Scanlin
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
-from probewise.sensor.stages import AnyEffect, SensorModel, require_columns
+from probewise.sensor.stages import AnyEffect, SensorModel, require_theta_columns
 
 NAMES = ("x_mm", "y_mm", "radius_mm")
 
@@ -113,7 +113,7 @@ class DiscTable:
         x_mm, y_mm, orientation_rad
             Poses of the sensor, broadcasting to (n_samples, n_points).
         """
-        require_columns(theta, NAMES)
+        require_theta_columns(theta, NAMES)
         away_x, away_y = x_mm - theta[:, :1], y_mm - theta[:, 1:2]
         distance = np.hypot(away_x, away_y) - theta[:, 2:]
         out = np.asarray(self.dark + (self.bright - self.dark) * (distance <= 0.0), dtype=np.float64)

@@ -12,7 +12,7 @@ from probewise.sensor.commanded import (
     with_declared_height_commanded,
 )
 from probewise.sensor.discrete import mean_albedo_by_pixels, seen_discrete
-from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bends_of, free_form_parameters, is_free_form
+from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bend_coefficients, free_form_theta, is_free_form
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians, seen
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
@@ -24,8 +24,8 @@ from probewise.sensor.ssf import (
     footprint_of,
     mean_ssf_field,
     merged_mean_mixture,
-    mixture_names,
     mixture_of_field,
+    mixture_parameter_names,
 )
 from probewise.sensor.stages import (
     AnyEffect,
@@ -64,17 +64,17 @@ __all__ = [
     "SensorModel",
     "Stage",
     "View",
-    "bends_of",
+    "bend_coefficients",
     "footprint_at_height_ratio",
     "footprint_of",
-    "free_form_parameters",
+    "free_form_theta",
     "is_free_form",
     "mean_albedo_by_pixels",
     "mean_albedo_under_gaussians",
     "mean_ssf_field",
     "merged_mean_mixture",
-    "mixture_names",
     "mixture_of_field",
+    "mixture_parameter_names",
     "raised",
     "response",
     "seen",
@@ -88,8 +88,8 @@ footprint_at_height = footprint_at_height_ratio
 field_of = mean_ssf_field
 """The old name of `mean_ssf_field`."""
 
-free_form = free_form_parameters
-"""The old name of `free_form_parameters`."""
+free_form = free_form_theta
+"""The old name of `free_form_theta`."""
 
 FieldSSF = DiscreteSSF
 """The old name of `DiscreteSSF`."""
@@ -99,3 +99,12 @@ NoiseLevel = NoiseParameters
 
 mean_mixture = merged_mean_mixture
 """The old name of `merged_mean_mixture`."""
+
+free_form_parameters = free_form_theta
+"""The old name of `free_form_theta`."""
+
+bends_of = bend_coefficients
+"""The old name of `bend_coefficients`."""
+
+mixture_names = mixture_parameter_names
+"""The old name of `mixture_parameter_names`."""

@@ -24,7 +24,7 @@ from probewise.sensor.commanded import (
     with_declared_height_commanded,
 )
 from probewise.sensor.discrete import mean_albedo_by_pixels
-from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, mean_albedo_under_one, turn_into_lab_frame
+from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, mean_albedo_under_one_gaussian, moments_in_lab_frame
 from probewise.sensor.ssf import DiscreteSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
@@ -36,7 +36,7 @@ from probewise.sensor.stages import (
     View,
     effects_with_columns,
     parameter_names_of_effects,
-    require_columns,
+    require_theta_columns,
 )
 from probewise.sensor.straight import StraightCorners, StraightEdges, select_reading_columns
 
@@ -177,15 +177,19 @@ class Chain:
             `DiscreteSSF`.
         """
         plan = self.plan_at_calibrated_height(plan)
-        at_once = self._hypotheses_at_once(theta, plan)
+        at_once = self._n_hypotheses_at_once(theta, plan)
         if at_once < len(theta):
             blocks = (theta[first : first + at_once] for first in range(0, len(theta), at_once))
             return np.concatenate([self.predict(block, plan) for block in blocks])
         view = self.simulated_view(theta, plan)
         plain = not self.effects and not has_commanded_height_or_led(plan)
-        return self._plain_readings(view.seen, theta) if plain else self.readings_from_simulated_view(view, theta, plan)
+        return (
+            self._readings_without_effects(view.seen, theta)
+            if plain
+            else self.readings_from_simulated_view(view, theta, plan)
+        )
 
-    def _hypotheses_at_once(self, theta: FloatArray, plan: Plan) -> int:
+    def _n_hypotheses_at_once(self, theta: FloatArray, plan: Plan) -> int:
         """Return how many hypotheses to predict at once; memory limits it where footprints differ between readings."""
         if not any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
             return len(theta)
@@ -199,20 +203,20 @@ class Chain:
         plan = self.plan_at_calibrated_height(plan)
         apply = self._stage_applier(theta, plan)
         seen = apply(Stage.RESPONSE, apply(Stage.SEEN, view).seen)
-        i_min, i_max = self._levels_of(theta)
+        i_min, i_max = self._levels_from_theta(theta)
         reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * led_state(plan) * view.brightness * seen)
         for stage in (Stage.OFFSET, Stage.LAG, Stage.SATURATION):
             reading = apply(stage, reading)
         shape = (len(theta), len(plan))
         return reading if reading.shape == shape else np.array(np.broadcast_to(reading, shape))
 
-    def _levels_of(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _levels_from_theta(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         n_ssf = len(self.ssf.names)
         return self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
 
-    def _plain_readings(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
+    def _readings_without_effects(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
         """Compute readings from R where no effect acts; overwrites `seen`."""
-        i_min, i_max = self._levels_of(theta)
+        i_min, i_max = self._levels_from_theta(theta)
         reading = seen if len(seen) == len(theta) else np.repeat(seen, len(theta), axis=0)
         reading *= i_max - i_min
         reading += i_min
@@ -224,7 +228,7 @@ class Chain:
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> View:
         """Compute the sensor's view of the scene: the stages of `predict` before SEEN, with their effects."""
-        require_columns(theta, self.names)
+        require_theta_columns(theta, self.names)
         plan = self.plan_at_calibrated_height(plan)
         layout = self._layout_under_poses(theta, plan)
         if isinstance(self.ssf, DiscreteSSF):
@@ -270,7 +274,7 @@ class Chain:
         moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
         return None if len(first) < len(theta) and any(moved) else _HypothesesByGeometry(first, which)
 
-    def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> Layout:
+    def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> SceneLayout:
         """Lay out the scene under the poses; cached for the last plan if no parameter moves scene or poses."""
         fixed = not self.scene.names and all(effect.stage > Stage.SCENE for effect in self.effects)
         known = self._layout_cache.get(plan) if fixed else None
@@ -282,20 +286,20 @@ class Chain:
         poses = self.poses(theta, plan)
         view: SceneView = apply(Stage.SCENE, SceneView(regions))
         x_mm, y_mm = poses.x_mm - view.dx_mm, poses.y_mm - view.dy_mm
-        layout = Layout(view.regions, Poses(x_mm, y_mm, poses.orientation_rad), plan)
+        layout = SceneLayout(view.regions, Poses(x_mm, y_mm, poses.orientation_rad), plan)
         if fixed:
             self._layout_cache.clear()
             self._layout_cache[plan] = layout
         return layout
 
     @cached_property
-    def _layout_cache(self) -> dict[Plan, Layout]:
+    def _layout_cache(self) -> dict[Plan, SceneLayout]:
         """Layout of the last plan, by that plan, where no parameter changes it; otherwise empty."""
         return {}
 
     def noise_parameters(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseParameters:
         """Return the noise of each reading: `sd`, broadcasting to (n_samples, n_points), and the effects on it."""
-        require_columns(theta, self.names)
+        require_theta_columns(theta, self.names)
         plan = self.plan_at_calibrated_height(plan)
         start = NoiseParameters(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
@@ -325,7 +329,7 @@ class Chain:
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class SceneLayout:
     """The region under each reading and the sensor's pose relative to it: all that does not depend on the SSF.
 
     Its use raises ParameterError if the plan has a pattern that the regions lack.
@@ -388,7 +392,7 @@ class Layout:
         ]
 
 
-def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
+def response(layout: SceneLayout, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
     """Integrate the footprint over each reading's pattern (paper, eq. R), by closed forms.
 
     Parameters
@@ -421,7 +425,7 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
             turn = turn[:, :1]
         for g in range(footprint.weight.shape[2]):
             one = (select_reading_columns(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in footprint.moments)
-            seen = mean_albedo_under_one(region, LabGaussian(x, y, *turn_into_lab_frame(turn, *one)), n_nodes)
+            seen = mean_albedo_under_one_gaussian(region, LabGaussian(x, y, *moments_in_lab_frame(turn, *one)), n_nodes)
             out[:, rows] += select_reading_columns(footprint.weight[:, :, g], rows) * seen
     return out
 
@@ -436,7 +440,7 @@ class _HypothesesByGeometry:
     first: IntArray
     which: IntArray
 
-    def response(self, layout: Layout, footprint: Footprint, *, n_nodes: int) -> FloatArray:
+    def response(self, layout: SceneLayout, footprint: Footprint, *, n_nodes: int) -> FloatArray:
         """Integrate as `response` does, but each Gaussian of each geometry only once.
 
         Parameters
@@ -467,7 +471,7 @@ class _HypothesesByGeometry:
         return np.stack([own @ parts[at] for own, at in zip(weight, self.which, strict=True)])
 
 
-def _discrete_response(layout: Layout, ssf: DiscreteSSF) -> FloatArray:
+def _discrete_response(layout: SceneLayout, ssf: DiscreteSSF) -> FloatArray:
     poses, found = layout.poses, []
     for rows, region in layout.rows_and_regions:
         there = Poses(*(select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))

@@ -32,7 +32,7 @@ def led_state(plan: Plan) -> FloatArray:
     led = plan.covariates.get("led")
     if led is None:
         return np.ones(1)
-    _require_none_beyond("led", led, (led < 0.0) | (led > 1.0), "0 (off) to 1 (on), NaN where it was not recorded")
+    _require_values_allowed("led", led, (led < 0.0) | (led > 1.0), "0 (off) to 1 (on), NaN where it was not recorded")
     return np.where(np.isfinite(led), led, 1.0)
 
 
@@ -44,7 +44,7 @@ def height_ratio(plan: Plan) -> FloatArray | None:
     height_mm, usual_mm = plan.covariates.get("height_mm"), plan.instrumentation.height_mm
     if height_mm is None or usual_mm is None:
         return None
-    _require_none_beyond("height_mm", height_mm, height_mm <= 0.0, "greater than 0, NaN where it was not commanded")
+    _require_values_allowed("height_mm", height_mm, height_mm <= 0.0, "greater than 0, NaN where it was not commanded")
     ratio = np.where(np.isfinite(height_mm), height_mm / usual_mm, 1.0)
     return None if (ratio == 1.0).all() else ratio
 
@@ -66,7 +66,7 @@ def with_declared_height_commanded(plan: Plan, calibrated_mm: float | None) -> P
     )
 
 
-def _require_none_beyond(name: str, values: FloatArray, beyond: BoolArray, allowed: str) -> None:
+def _require_values_allowed(name: str, values: FloatArray, beyond: BoolArray, allowed: str) -> None:
     """Raise ParameterError that names the first of the values of a column that are `beyond` what is allowed."""
     if beyond.any():
         raise ParameterError(name, float(values[beyond][0]), allowed)

@@ -46,7 +46,7 @@ N_FREE_FORM = 1 + len(_WIDTHS)
 """Number of Gaussians of a free form, the one that sets place and size first."""
 
 
-def free_form_parameters(one: FloatArray, bends: FloatArray) -> FloatArray:
+def free_form_theta(one: FloatArray, bends: FloatArray) -> FloatArray:
     """Return the parameters of free forms: each a Gaussian bent without a change of its mean and covariance.
 
     Parameters
@@ -76,7 +76,7 @@ def free_form_parameters(one: FloatArray, bends: FloatArray) -> FloatArray:
     return blocks.reshape(len(one), -1)
 
 
-def bends_of(theta: FloatArray) -> FloatArray:
+def bend_coefficients(theta: FloatArray) -> FloatArray:
     """Return the coefficients `bends` of free forms, (n_samples, 6 N_FREE_FORM) -> (n_samples, N_BENDS)."""
     return np.asarray(footprint_of(theta, N_FREE_FORM).weight[:, 0, 1:] @ _DIRECTIONS)
 

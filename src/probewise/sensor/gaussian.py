@@ -3,7 +3,7 @@
 The first of the two independent routes to the response R (paper, eq. R): exact integrals of each
 Gaussian of the SSF over the region. The other, the paper's sum over pixels, is
 `probewise.sensor.discrete`. A new kind of region may register its closed form with
-`mean_albedo_under_one.register`; without one it is integrated numerically from its `coverage`.
+`mean_albedo_under_one_gaussian.register`; without one it is integrated numerically from its `coverage`.
 """
 
 from __future__ import annotations
@@ -57,9 +57,11 @@ class LabGaussian:
     var_y: FloatArray
     cov_xy: FloatArray
 
-    def take(self, rows: IntArray) -> LabGaussian:
+    def select_samples(self, rows: IntArray) -> LabGaussian:
         """Select samples; arrays shared by all samples are kept as they are."""
         return LabGaussian(*(a[rows] if a.shape[0] != 1 else a for a in self._arrays()))
+
+    take = select_samples  # its old name
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -74,7 +76,7 @@ Spot = LabGaussian
 """The old name of `LabGaussian`."""
 
 
-def turn_into_lab_frame(
+def moments_in_lab_frame(
     turn_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Turn mean and covariance anticlockwise into the lab frame: dx, dy, var_x, var_y, cov_xy; all broadcast."""
@@ -123,7 +125,7 @@ def mean_albedo_under_gaussians(
         x, y, var1, var2, cov = (a[:, :, g] for a in arrays)
         gaussian = LabGaussian(x, y, zero, zero, var_x=var1, var_y=var2, cov_xy=cov)
         shape = np.broadcast_shapes(x.shape, (region.n_regions, 1))
-        layers.append(np.broadcast_to(mean_albedo_under_one(region, gaussian, n_nodes), shape))
+        layers.append(np.broadcast_to(mean_albedo_under_one_gaussian(region, gaussian, n_nodes), shape))
     return np.stack(layers, axis=-1)
 
 
@@ -131,7 +133,7 @@ seen = mean_albedo_under_gaussians  # its earlier name
 
 
 @singledispatch
-def mean_albedo_under_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
 
     A region without a registered closed form is summed over square pixels, a quarter of the smaller
@@ -173,7 +175,7 @@ def mean_albedo_under_one(region: Region, gaussian: LabGaussian, n_nodes: int) -
     return out
 
 
-seen_by_one = mean_albedo_under_one  # its earlier name
+mean_albedo_under_one = seen_by_one = mean_albedo_under_one_gaussian  # its old names
 
 
 def _broadcast_entry(array: FloatArray, i: int, j: int) -> float:
@@ -186,12 +188,12 @@ def _albedo_by_share_inside(outside: float, inside: float, share: FloatArray) ->
     return outside + (inside - outside) * share
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_uniform(region: UniformRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     return region.level[:, None]
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the cumulative of the Gaussian's projection on the normal."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
@@ -202,7 +204,7 @@ def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian,
     return _albedo_by_share_inside(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the field at the Gaussian's mean, which is exact for a linear field."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
@@ -211,7 +213,7 @@ def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: i
     )
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_stripes(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum cumulatives or, for stripes finer than the footprint, their Fourier series."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
@@ -280,7 +282,7 @@ def probabilities_beyond_corner_and_sides(
     return np.clip(opening - sides[0] - sides[1], 0.0, 1.0), beyond[0], beyond[1]
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_quadrant(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     corner, direction = region.corner_mm, region.direction
     share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], gaussian)
@@ -300,7 +302,7 @@ def mass_in_quadrant(
     return probabilities_beyond_corner_and_sides(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))[0]
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum over the edges the angle that each subtends at the mean, less the mass beyond it.
 
@@ -333,11 +335,13 @@ def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_no
     return _albedo_by_share_inside(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
 
 
-@mean_albedo_under_one.register
-def _mean_albedo_over_carded_region(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+@mean_albedo_under_one_gaussian.register
+def _mean_albedo_over_region_with_cards(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate over the region and over each card by itself, then lay the cards over the region."""
-    covered = [mean_albedo_under_one(card.region, gaussian, n_nodes) for card in region.cards]
-    return mean_albedo_with_cards(mean_albedo_under_one(region.region, gaussian, n_nodes), region.cards, covered)
+    covered = [mean_albedo_under_one_gaussian(card.region, gaussian, n_nodes) for card in region.cards]
+    return mean_albedo_with_cards(
+        mean_albedo_under_one_gaussian(region.region, gaussian, n_nodes), region.cards, covered
+    )
 
 
 def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
@@ -366,7 +370,7 @@ def _half_legendre_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
     return node[n_nodes // 2 :], weight[n_nodes // 2 :]
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_ellipse(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate cumulatives along the normal by quadrature along the tangent, after a map to the unit disc."""
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
@@ -398,7 +402,7 @@ def _mass_in_unit_disc(
 
     Only the (sample, reading) pairs whose edge is within reach are integrated.
     """
-    reach = _reach_in_sds(n_nodes)
+    reach = _sds_covered_by_nodes(n_nodes)
     largest = np.sqrt(0.5 * (var_p + var_q) + np.hypot(0.5 * (var_p - var_q), cov_pq))
     distance = np.sqrt(p * p + q * q)
     near = np.abs(distance - 1) < reach * largest
@@ -416,7 +420,7 @@ def _mass_in_unit_disc(
     cc, ss, cs = c * c, s * s, c * s
     cross = 2 * cs * cov_pq
     var_r, var_t = cc * var_p + ss * var_q + cross, ss * var_p + cc * var_q - cross
-    share[near] = _mass_in_disc_if_near_edge(d, var_r, var_t, cs * (var_q - var_p) + (cc - ss) * cov_pq, reach, n_nodes)
+    share[near] = _mass_in_disc_by_chords(d, var_r, var_t, cs * (var_q - var_p) + (cc - ss) * cov_pq, reach, n_nodes)
     return np.clip(share, 0.0, 1.0)
 
 
@@ -424,12 +428,12 @@ _BLOCK = 2**13  # nodes at a time: they fit the cache
 _FLAT, _BENT = 0.01, 0.4  # curvature of an edge, in footprints of sd 1, up to which few and some nodes suffice
 
 
-def _reach_in_sds(n_nodes: int) -> float:
+def _sds_covered_by_nodes(n_nodes: int) -> float:
     """Choose how many standard deviations n_nodes cover, so that truncation and quadrature errors balance."""
     return float(np.clip(4.3 + (n_nodes - 20) / 20, 4.0, 6.5))
 
 
-def _mass_in_disc_if_near_edge(
+def _mass_in_disc_by_chords(
     d: FloatArray, var_r: FloatArray, var_t: FloatArray, cov: FloatArray, reach: float, n_nodes: int
 ) -> FloatArray:
     """Integrate Gaussians over the unit disc, mean at (d, 0), radial and tangential variances; (n_pairs,) each.
@@ -554,16 +558,16 @@ def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
     return node, weight / weight.sum()
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_mixed_regions(region: RegionsOfMixedKinds, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo, (n_samples, n_points), of regions of several kinds: each by the rule for its kind."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows_and_regions():
-        out[rows] = mean_albedo_under_one(part, gaussian.take(rows), n_nodes)
+        out[rows] = mean_albedo_under_one_gaussian(part, gaussian.select_samples(rows), n_nodes)
     return out
 
 
-@mean_albedo_under_one.register
+@mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return an image's mean albedo: exact along x in each row of pixels, by Gauss-Legendre in panels across it."""
     shape = gaussian.shape
@@ -573,7 +577,7 @@ def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes:
         np.broadcast_to(gaussian.y_mm + gaussian.dy_mm, shape),
     )
     for i, j in np.ndindex(*shape):
-        out[i, j] = _image_albedo_under_one(
+        out[i, j] = _image_albedo_under_one_gaussian(
             region,
             float(x[i, j]),
             float(y[i, j]),
@@ -584,7 +588,9 @@ def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes:
     return out
 
 
-def _image_albedo_under_one(region: ImageRegion, x: float, y: float, var_x: float, var_y: float, cov: float) -> float:
+def _image_albedo_under_one_gaussian(
+    region: ImageRegion, x: float, y: float, var_x: float, var_y: float, cov: float
+) -> float:
     n_rows, n_columns = region.values.shape
     pixel = region.pixel_mm
     sd_y = float(np.sqrt(var_y))

@@ -10,7 +10,7 @@ from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Scene
 from probewise.sensor.chain import Levels, region_named, require_levels, require_scene
-from probewise.sensor.stages import require_columns
+from probewise.sensor.stages import require_theta_columns
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class NaiveSensor:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
-        require_columns(theta, self.names)
+        require_theta_columns(theta, self.names)
         n_levels = len(self.levels.names)
         i_min, i_max = self.levels.values(theta[:, :n_levels])
         regions = self.scene.regions(theta[:, n_levels:])

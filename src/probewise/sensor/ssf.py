@@ -19,7 +19,7 @@ _REACH = 6.5  # sds: beyond, a Gaussian's density is below 1e-9 of its peak
 _NEGLIGIBLE = 1e-9  # share of a field's light that is not drawn
 
 
-def mixture_names(n_gaussians: int) -> tuple[str, ...]:
+def mixture_parameter_names(n_gaussians: int) -> tuple[str, ...]:
     """Name the paper's parameters in order: a_1, u_1, v_1, A_1, B_1, C_1, a_2, ..."""
     if n_gaussians < 1:
         raise ParameterError("n_gaussians", n_gaussians, "1 or more")
@@ -93,7 +93,7 @@ class FreeMixture:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The paper's a_1 to C_N."""
-        return mixture_names(self.n_gaussians)
+        return mixture_parameter_names(self.n_gaussians)
 
     def footprint(self, theta: FloatArray) -> Footprint:
         """Return the mixture of each hypothesis, theta (n_samples, 6 n_gaussians)."""

@@ -180,7 +180,7 @@ class SensorModel(Protocol):
         ...
 
 
-def require_columns(theta: FloatArray, names: tuple[str, ...]) -> None:
+def require_theta_columns(theta: FloatArray, names: tuple[str, ...]) -> None:
     """Raise ShapeError unless theta has shape (n_samples, len(names))."""
     if theta.ndim != 2 or theta.shape[1] != len(names):
         raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_samples, {len(names)}) for {names}")

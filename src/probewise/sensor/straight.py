@@ -17,8 +17,8 @@ from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf_of_cells_in_plac
 from probewise.sensor.gaussian import (
     LabGaussian,
     mass_in_quadrant,
+    moments_in_lab_frame,
     probabilities_beyond_corner_and_sides,
-    turn_into_lab_frame,
 )
 from probewise.sensor.stages import Footprint, Poses
 
@@ -81,15 +81,15 @@ class StraightEdges:
         if len(self.distance_mm) == 1 and not _varies_with_reading(footprint):
             self._distinct_views.write_response(footprint, seen)
         else:
-            self._write_shares_by_hypothesis(footprint, seen)
+            self._write_mass_inside_by_hypothesis(footprint, seen)
             seen *= self.inside - self.outside
             seen += self.outside
         if self._rows_as_slice is None:
             out[:, self.rows] = seen
 
-    def _write_shares_by_hypothesis(self, footprint: Footprint, share: FloatArray) -> None:
+    def _write_mass_inside_by_hypothesis(self, footprint: Footprint, share: FloatArray) -> None:
         """Write the shares inside where the position varies with the hypothesis or the footprint with the reading."""
-        weight, *moments = (self._own_columns(a) for a in (footprint.weight, *footprint.moments))
+        weight, *moments = (self._own_reading_columns(a) for a in (footprint.weight, *footprint.moments))
         varies = _varies_with_reading(footprint)
         angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
         per_sd, shift = np.broadcast_arrays(*_inverse_sd_and_mean_on_axes(angles[:, None], *moments))
@@ -111,7 +111,7 @@ class StraightEdges:
                 normal_cdf_of_cells_in_place(cells)
                 share[block] += cells * _select_hypotheses(weight, block)[:, :, g]
 
-    def _own_columns(self, array: FloatArray) -> FloatArray:
+    def _own_reading_columns(self, array: FloatArray) -> FloatArray:
         """Select the columns of these readings, as a view where they are contiguous."""
         if self._rows_as_slice is None or array.shape[1] == 1:
             return select_reading_columns(array, self.rows)
@@ -217,7 +217,7 @@ class StraightCorners:
         if still and not _varies_with_reading(footprint):
             out[:, self.rows] = self._distinct_views.response(footprint)
             return
-        moved = turn_into_lab_frame(
+        moved = moments_in_lab_frame(
             poses.orientation_rad[..., None], *(select_reading_columns(a, self.rows) for a in footprint.moments)
         )
         gaussians = LabGaussian(
@@ -264,7 +264,7 @@ class _DistinctCornerViews:
         """Compute the responses to a footprint that is the same at all readings, (n_samples or 1, n_rows)."""
         weight, *moments = _weight_and_moments_samples_last(footprint)
         turn, x, y = (a[:, None, None] for a in (self.turn_rad, self.x_mm, self.y_mm))
-        dx, dy, var_x, var_y, cov_xy = turn_into_lab_frame(turn, *moments)
+        dx, dy, var_x, var_y, cov_xy = moments_in_lab_frame(turn, *moments)
         sd_x, sd_y = np.sqrt(var_x), np.sqrt(var_y)
         shares = probabilities_beyond_corner_and_sides((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
         # Sum over the Gaussians: (n_views, n_gaussians, n_samples) each -> (3 n_views, n_samples).

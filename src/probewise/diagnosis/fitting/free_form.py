@@ -19,7 +19,7 @@ from probewise.diagnosis.fitting.coordinates import (
     natural_to_theta,
     theta_to_natural,
 )
-from probewise.sensor import N_BENDS, N_FREE_FORM, bends_of, free_form_parameters
+from probewise.sensor import N_BENDS, N_FREE_FORM, bend_coefficients, free_form_theta
 
 _SHARE = 0.1  # prior sd of each weight, as a share of the mass
 
@@ -65,7 +65,7 @@ class FreeFormSensor(CalibratedSensor):
     def theta_from_natural(self, natural: FloatArray) -> FloatArray:
         """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
         one = natural_to_theta(natural[:, :-N_BENDS], 1)
-        return np.concatenate([free_form_parameters(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
+        return np.concatenate([free_form_theta(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
 
     def natural_from_theta(self, theta: FloatArray) -> FloatArray:
         """Invert `theta_from_natural`."""
@@ -76,4 +76,4 @@ def theta_to_free_form_natural(theta: FloatArray) -> FloatArray:
     """Map theta, (n_samples, 6 N + 2), to a free form's natural coordinates, (n_samples, 7 + N_BENDS)."""
     # The amplitude of the first does not enter its natural coordinates.
     one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)
-    return np.concatenate([theta_to_natural(one, 1), bends_of(theta[:, :-2])], axis=1)
+    return np.concatenate([theta_to_natural(one, 1), bend_coefficients(theta[:, :-2])], axis=1)

@@ -2,7 +2,7 @@
 
 A new kind is a frozen dataclass with `n_regions`, `albedo` and `coverage`. In the same file it may register the
 distance to its edge (`edge_distance`) and, where that is closed, its outline (`outlines`); a closed form registered
-with `sensor.gaussian.mean_albedo_under_one` makes a footprint over it cost microseconds instead of milliseconds.
+with `sensor.gaussian.mean_albedo_under_one_gaussian` makes a footprint over it cost microseconds, not milliseconds.
 """
 
 from probewise.scene.regions.ellipse import EllipseRegion, disc_region

@@ -5,7 +5,7 @@ import pytest
 
 from probewise.calibration import calibrate, default_prior
 from probewise.calibration.order_problems import ProblemsByOrder
-from probewise.calibration.peaks import _split_gaussian, find_highest_peak_by_order
+from probewise.calibration.peaks import _split_gaussian, find_highest_likelihood_peak_by_order
 from probewise.recordings import Recording, paper_plan
 from probewise.world import Blob, World, gaussian_spot
 
@@ -19,13 +19,13 @@ def two_lobes() -> Recording:
 
 def test_the_peak_of_one_gaussian_is_no_lower_than_the_truth(recording: Recording, truth: np.ndarray) -> None:
     problem = ProblemsByOrder(recording, default_prior).problem
-    peak = find_highest_peak_by_order(problem, 1, rng=np.random.default_rng(9))[1]
+    peak = find_highest_likelihood_peak_by_order(problem, 1, rng=np.random.default_rng(9))[1]
     assert peak.log_likelihood >= problem(1).log_likelihood(truth[None])[0]
     assert peak.log_likelihood == pytest.approx(problem(1).log_likelihood(peak.theta[None])[0])
 
 
 def test_two_lobes_are_found(two_lobes: Recording) -> None:
-    peaks = find_highest_peak_by_order(
+    peaks = find_highest_likelihood_peak_by_order(
         ProblemsByOrder(two_lobes, default_prior).problem, 2, rng=np.random.default_rng(13)
     )
     assert peaks[2].log_likelihood > peaks[1].log_likelihood + 50

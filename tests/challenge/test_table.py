@@ -14,7 +14,7 @@ from probewise.challenge import (
     reliability_bins,
     score,
 )
-from probewise.challenge.estimates import estimated_by_bootstrap, estimated_mean, estimated_share
+from probewise.challenge.estimates import estimated_mean, estimated_share, estimated_statistic
 
 
 def row(results, name):
@@ -39,7 +39,7 @@ def test_a_mean_has_student_s_interval():
 
 def test_a_bootstrap_of_the_mean_agrees_with_its_standard_error():
     values = np.random.default_rng(1).standard_normal(400)
-    found = estimated_by_bootstrap(values, lambda v: float(v.mean()))
+    found = estimated_statistic(values, lambda v: float(v.mean()))
     assert (found.high - found.low) / 2 == pytest.approx(1.96 * values.std() / 20, rel=0.1)
 
 

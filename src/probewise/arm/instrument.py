@@ -64,7 +64,7 @@ class Instrument(Protocol):
         ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,).
+        """Return the sensor's orientation at places, (n_places, 2), to which a design's is added: shape (n_places,).
 
         For an arm whose sensor turns with its base, this is the only possible orientation.
         """

@@ -112,7 +112,7 @@ class SimulatedArm:
         return self.reach.contains(_checked_places(places_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,).
+        """Return the sensor's orientation at places, (n_places, 2), to which a design's is added: shape (n_places,).
 
         Raises
         ------

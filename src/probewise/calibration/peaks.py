@@ -37,14 +37,14 @@ _SAME, _HARDLY_LOWER, _N_OTHERS = 0.05, 6.0, 3
 
 @dataclass(frozen=True, eq=False)
 class HighestPeak:
-    """The highest peak found, (n_params,), ln L there, and other peaks that are hardly lower, (n_others, n_params)."""
+    """The likelihood's highest peak found, (n_params,), ln L there, and others hardly lower, (n_others, n_params)."""
 
     theta: FloatArray
     log_likelihood: float
     others: FloatArray
 
 
-def find_highest_peak_by_order(
+def find_highest_likelihood_peak_by_order(
     problem: Callable[[int], SensorProblem], highest: int, *, rng: np.random.Generator
 ) -> dict[int, HighestPeak]:
     """Find the highest peak of the likelihood of each order from 1; return them by order.

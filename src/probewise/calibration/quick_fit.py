@@ -27,7 +27,7 @@ from probewise.calibration.mixed_reference import MixedReferenceDensity
 from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.calibration.order_search import OrderPosterior, Progress, Search
 from probewise.calibration.peak_density import PeakDensity, fit_density_about_peak, share_missed_about_peak
-from probewise.calibration.peaks import HighestPeak, find_highest_peak_by_order
+from probewise.calibration.peaks import HighestPeak, find_highest_likelihood_peak_by_order
 from probewise.calibration.posterior_parts import (
     FootprintPlaceAndSize,
     PosteriorPart,
@@ -93,7 +93,7 @@ def fit_orders_quickly(
     if unlike:
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
-    peaks = find_highest_peak_by_order(problems.problem, highest, rng=climbing)
+    peaks = find_highest_likelihood_peak_by_order(problems.problem, highest, rng=climbing)
     whole = FootprintPlaceAndSize.from_gaussian(peaks[1].theta)
     found: dict[int, OrderPosterior] = {}
     parts: dict[int, PosteriorPart] = {}

@@ -46,7 +46,7 @@ def estimated_mean(values: list[float]) -> Estimate:
     return Estimate(center, center - half, center + half, n)
 
 
-def estimated_by_bootstrap(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
+def estimated_statistic(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
     """Estimate a statistic of rows (n, ...), with the basic bootstrap interval from fixed random draws.
 
     The basic interval reflects the draws about the estimate, which corrects the bias of small samples (Davison and

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.challenge.estimates import Estimate, estimated_by_bootstrap, estimated_share
+from probewise.challenge.estimates import Estimate, estimated_share, estimated_statistic
 from probewise.challenge.scoring import leading_probability_and_correctness
 
 _EDGES = np.linspace(0, 1, 11)
@@ -38,7 +38,7 @@ def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
 
 def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
     """Estimate the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
-    found = estimated_by_bootstrap(
+    found = estimated_statistic(
         np.array([leading_probability_and_correctness(result) for result in results], dtype=np.float64).reshape(-1, 2),
         _calibration_error_of_rows,
     )

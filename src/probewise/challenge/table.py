@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import Estimate, estimated_by_bootstrap, estimated_mean, estimated_share
+from probewise.challenge.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic
 from probewise.challenge.oracle_baseline import (
     oracle_covariate_rate,
     oracle_credible_set_size,
@@ -249,18 +249,18 @@ def _rows_on_held_out_gains(done: list[Result]) -> list[ScoreRow]:
     outside = [r for r in done if r["kind"] == "outside" and r["noise_model"] == "white"]
     worse = [_summed_gains_over_null(r, _SCANS, "true")[0] < -1.0 for r in done]
     return [
-        ScoreRow("held-out gain, share of the right model's", estimated_by_bootstrap(gains, _ratio_of_gains), 0.98),
+        ScoreRow("held-out gain, share of the right model's", estimated_statistic(gains, _ratio_of_gains), 0.98),
         *(
-            ScoreRow(f"  a new {scan}", estimated_by_bootstrap(gains[:, k], _ratio_of_gains))
+            ScoreRow(f"  a new {scan}", estimated_statistic(gains[:, k], _ratio_of_gains))
             for k, scan in enumerate(_SCANS)
         ),
         ScoreRow(
             "  share of what the truth itself would gain",
-            estimated_by_bootstrap(_held_out_gains_by_scan(white, "true"), _ratio_of_gains),
+            estimated_statistic(_held_out_gains_by_scan(white, "true"), _ratio_of_gains),
         ),
         ScoreRow(
             "  the same, outside the vocabulary",
-            estimated_by_bootstrap(_held_out_gains_by_scan(outside, "true"), _ratio_of_gains),
+            estimated_statistic(_held_out_gains_by_scan(outside, "true"), _ratio_of_gains),
         ),
         ScoreRow("held-out worse than the null by over 1 nat", estimated_share(worse), most=0.01),
         # The scatter that noise alone causes in the best gain possible with these readings.

@@ -96,7 +96,7 @@ class Experiment:
     step, reading_range
         Rounding step of the readings (None: not rounded), and their smallest and largest possible values.
     orientations_rad, repeats
-        Possible orientations of the sensor, and numbers of repeated readings.
+        Possible turns of the sensor, added to the arm's orientation, and numbers of repeated readings.
     heights_mm, calibrated_height_mm
         Possible heights above the surface, if selectable, and the height of the calibration; other heights scale the
         footprint and dim the signal (see `sensor.commanded`).

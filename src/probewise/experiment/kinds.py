@@ -72,7 +72,7 @@ def kinds_of(
     trust: float = 1.0,
     rivals: Sequence[SensorModelRival] = (),
 ) -> tuple[HypothesisKind, ...]:
-    """Return the kinds of hypotheses of an experiment: every shape without effects and with each rival.
+    """Return the kinds of hypotheses of an experiment: for every shape, the sensor model alone and with each rival.
 
     Parameters
     ----------
@@ -83,11 +83,11 @@ def kinds_of(
     prior, likelihood
         Prior and likelihood of all parameters of the experiment.
     models
-        The sensor model for kinds without effects, with its tables, and the chain to which effects are added.
+        The sensor model, from tables where possible, for kinds without effects; the chain to which effects are added.
     trust
-        Prior probability that the sensor model is complete; the rivals share the rest equally.
+        Prior probability that the sensor model is complete, below 1 if there are rivals, which share the rest equally.
     rivals
-        Effects that it may leave out, for each shape; rivals of one name share the probability of one.
+        Effects that the sensor model may leave out, and other likelihoods; those of one name share one probability.
     """
     quick, chain = models
     ways = Counter(rival.name for rival in rivals)

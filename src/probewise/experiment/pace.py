@@ -63,7 +63,7 @@ class DescribedEffect(Effect[Any], Protocol):
 
 @dataclass(frozen=True, eq=False)
 class EffectInPacedTime(WrappedEffect[FloatArray]):
-    """An effect whose times and rates are in the run's own time; without that column in the plan, in recorded time."""
+    """An effect whose times and rates are in paced time; in recorded time if the plan lacks that column."""
 
     effect: DescribedEffect
 

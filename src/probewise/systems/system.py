@@ -153,7 +153,10 @@ class System:
         return Product(self.marginals)
 
     def parameters(self, theta: FloatArray, table: RunTable) -> dict[str, FloatArray]:
-        """Return parameters by name: (n_samples, 1), or (n_samples, n_points) for those per run; extras at null."""
+        """Return parameters by name: (n_samples, 1), or (n_samples, n_points) for those per run.
+
+        The user's own effects (`Simulator.extra`) are absent: at their `null`, (1, 1).
+        """
         own, out = self.simulator, {}
         at = {name: k for k, name in enumerate(self.marginals)}
         for name in own.parameters:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import estimated_by_bootstrap, estimated_mean, estimated_share
+from probewise.challenge.estimates import estimated_mean, estimated_share, estimated_statistic
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     Result,
@@ -146,7 +146,7 @@ def _shares_of_right_models_gain(results: Sequence[Result]) -> FloatArray:
 def _rows_on_held_out_gains(done: list[Result]) -> list[ScoreRow]:
     named = [r for r in done if r["kind"] in ("single", "pair")]
     clean = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done if r["kind"] == "clean") if g is not None]
-    shares = estimated_by_bootstrap(_shares_of_right_models_gain(named), lambda rows: float(np.median(rows)))
+    shares = estimated_statistic(_shares_of_right_models_gain(named), lambda rows: float(np.median(rows)))
     every = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done) if g is not None]
     return [
         ScoreRow("held-out runs: median share of the right model's gain", shares, 0.95),

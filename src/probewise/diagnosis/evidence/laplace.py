@@ -260,10 +260,10 @@ class OrthonormalBlocks:
     @classmethod
     def of(cls, problem: Linearised, templates: Sequence[FloatArray]) -> OrthonormalBlocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
-        return cls.of_projected(scale_and_project(problem, templates), [t.shape[1] for t in templates])
+        return cls.of_projected_templates(scale_and_project(problem, templates), [t.shape[1] for t in templates])
 
     @classmethod
-    def of_projected(cls, projected: FloatArray, widths: Sequence[int]) -> OrthonormalBlocks:
+    def of_projected_templates(cls, projected: FloatArray, widths: Sequence[int]) -> OrthonormalBlocks:
         """Orthonormalise each of the concatenated templates from `scale_and_project`, (n_rows, n_columns)."""
         starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
         u, gain = np.empty_like(projected), np.empty(projected.shape[1])

@@ -44,7 +44,7 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
     if not prepared.has_too_little_data:
         require_converged_fit(null.found, Linearised.of(null.found, null.law))
     draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
-    p_value = bayes_factor_p_value(problem, searched.template_banks_for_test(null.found), draws)
+    p_value = bayes_factor_p_value(problem, searched.template_banks_for_global_test(null.found), draws)
     p_value = _max_p_value_over_orders(searched, null, noise, p_value, rng=rng)
     # Constant readings have no noise to compare a residual with.
     return GlobalTest(null, noise, problem, draws, 1.0 if prepared.has_only_equal_readings else p_value)
@@ -71,5 +71,5 @@ def _max_p_value_over_orders(
         beside = prepared.apparatus.fine_structure_slopes(found, prepared.usable_rows) if fine else None
         problem = Linearised.of(found, rival.evidence[noise].likeliest_law, beside)
         draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
-        p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_test(found), draws))
+        p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_global_test(found), draws))
     return p_value

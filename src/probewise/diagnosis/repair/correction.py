@@ -126,7 +126,9 @@ def improvement_and_correction(
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
             rms_after=float(np.sqrt(np.mean(found.residuals**2))),
             p_value_after=bayes_factor_p_value(
-                problem, searched.template_banks_for_test(best.fit.found), problem.draw_null_residuals(N_DRAWS, rng=rng)
+                problem,
+                searched.template_banks_for_global_test(best.fit.found),
+                problem.draw_null_residuals(N_DRAWS, rng=rng),
             ),
         )
         if gain.p_value_after >= ALARM or not held.by_scan:

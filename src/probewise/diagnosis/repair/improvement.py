@@ -57,6 +57,6 @@ def improvement_of(
     parts = prepared.apparatus.held_out_parts(prepared.recording)
     held = held_out_gain(null.found, best.found, prepared.recording, law, parts)
     p_after = bayes_factor_p_value(
-        after, searched.template_banks_for_test(best.found), after.draw_null_residuals(N_DRAWS, rng=rng)
+        after, searched.template_banks_for_global_test(best.found), after.draw_null_residuals(N_DRAWS, rng=rng)
     )
     return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_value_after=p_after)

@@ -15,9 +15,11 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 
 def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
-    """Refit the most probable combinations (`by_mean`: probabilities) at other plausible SSF orders.
+    """Refit the most probable combinations of effects on the mean at other plausible SSF orders.
 
-    An unknown effect may lead at an order at which no named effect was tried; named ones must then be tried there.
+    Refits that are significant are stored in `state`. `by_mean` is the posterior probability of each combination,
+    whatever the noise. An unknown effect may lead at an order at which no named effect was tried; named ones must then
+    be tried there.
     """
     known = sum(p for names, p in by_mean.items() if names != ("unknown",))
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])

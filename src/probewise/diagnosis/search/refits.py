@@ -131,7 +131,7 @@ class Refits:
             twin = self._refit_taken_from_twin(parent, effect, against) or self._refit_taken_from_parents_twin(
                 parent, effect, against
             )
-            self.known[key] = twin or self._refit_likely_variants(parent, effect, against)
+            self.known[key] = twin or self._refit_with_likely_variants(parent, effect, against)
         return self.known[key]
 
     def replace_fit(self, held: WeighedFit, better: WeighedFit) -> None:
@@ -165,7 +165,8 @@ class Refits:
         twin = swap.candidate_with_twin(known[0], self.templates.usable)
         return None if twin is None else (twin, known[1])
 
-    def _refit_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
+    def _refit_with_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
+        """Refit a candidate with one more effect in its likely variants, see `refit_with_effect`."""
         templates = self.templates.templates_of(parent.found, effect)
         own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
 

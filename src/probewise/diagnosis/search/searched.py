@@ -285,7 +285,7 @@ class Searched:
                 out[name] = out.get(name, 0.0) + weight / sum(weights.values())
         return out
 
-    def template_banks_for_test(self, found: Fit) -> list[TemplateBank]:
+    def template_banks_for_global_test(self, found: Fit) -> list[TemplateBank]:
         """Return the two banks by which a fit is tested: of the effects that it lacks, and of unknown effects."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]
         missing = [effect for effect in on_mean if effect.name not in found.model.names]

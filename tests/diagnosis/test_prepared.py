@@ -45,7 +45,7 @@ def test_too_little_is_few_readings_or_equal_ones():
 def test_values_of_usable_readings_are_spread_over_all_rows():
     whole = recording(30)
     holes = replace(whole, readings=np.where(np.arange(30) % 2, np.nan, whole.readings))
-    spread = prepare(holes, apparatus=SENSOR).expand_to_all_rows(np.arange(15.0))
+    spread = prepare(holes, apparatus=SENSOR).expand_usable_to_all_rows(np.arange(15.0))
     np.testing.assert_array_equal(spread[::2], np.arange(15.0))
     assert np.isnan(spread[1::2]).all()
 

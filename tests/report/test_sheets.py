@@ -22,7 +22,7 @@ from probewise.report.sheets import (
     arm_home_jig_sheets,
     field_sheet,
     marks_sheet,
-    plan_sheets,
+    pattern_sheets,
     target_sheet,
     tiles_of,
 )
@@ -71,7 +71,7 @@ def filled(page):
 @pytest.mark.parametrize(("paper", "size"), [("a4", (210, 297)), ("letter", (215.9, 279.4))])
 def test_the_edge_is_where_it_should_be_and_the_ruler_is_100_mm_long(paper, size):
     plan = paper_plan()
-    pages = pages_of(sheets_pdf(plan_sheets(plan.patterns, plan), paper=paper, title="t"))
+    pages = pages_of(sheets_pdf(pattern_sheets(plan.patterns, plan), paper=paper, title="t"))
     assert len(pages) == 6  # one that explains, five sheets
     page = pages[1]
     assert sorted(page[0]) == pytest.approx(size, abs=0.01)
@@ -85,7 +85,7 @@ def test_the_edge_is_where_it_should_be_and_the_ruler_is_100_mm_long(paper, size
 
 def test_each_quadrant_has_its_corner_and_its_side():
     plan = paper_plan()
-    pages = pages_of(sheets_pdf(plan_sheets(plan.patterns, plan), paper="a4", title="t"))
+    pages = pages_of(sheets_pdf(pattern_sheets(plan.patterns, plan), paper="a4", title="t"))
     for page, (corner, direction) in zip(
         pages[2:], [((0, 0), (1, 1)), ((0, 0), (-1, 1)), ((4, 4), (1, 1)), ((-4, 4), (-1, 1))], strict=True
     ):
@@ -153,11 +153,11 @@ def test_every_cut_has_its_marks_in_the_margin():
 
 def test_a_sheet_is_as_large_as_its_readings_need():
     plan = two_way_plan()
-    sheets = {sheet.name: sheet for sheet in plan_sheets(plan.patterns, plan)}
+    sheets = {sheet.name: sheet for sheet in pattern_sheets(plan.patterns, plan)}
     assert (sheets["boundary"].low_mm, sheets["boundary"].high_mm) == ((-90.0, -40.0), (90.0, 40.0))
     assert np.degrees(sheets["boundary"].orientations_rad) == pytest.approx([0, 90, 180, 270])
     turned = dataclasses.replace(plan, orientation_rad=plan.orientation_rad + 2 * np.pi * (plan.scan % 2))
-    again = plan_sheets(plan.patterns, turned)
+    again = pattern_sheets(plan.patterns, turned)
     assert [sheet.orientations_rad for sheet in again] == [sheet.orientations_rad for sheet in sheets.values()]
     assert set(sheets) == set(plan.pattern_names)
 
@@ -165,14 +165,14 @@ def test_a_sheet_is_as_large_as_its_readings_need():
 def test_a_pattern_that_the_plan_does_not_have_needs_no_sheet():
     plan = paper_plan()
     described = {**plan.patterns, "another": Uniform(0.5)}
-    assert [sheet.name for sheet in plan_sheets(described, plan)] == [
-        sheet.name for sheet in plan_sheets(plan.patterns, plan)
+    assert [sheet.name for sheet in pattern_sheets(described, plan)] == [
+        sheet.name for sheet in pattern_sheets(plan.patterns, plan)
     ]
 
 
 def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
     picture = Image(np.linspace(0, 1, 20).reshape(4, 5), 10.0, (0.0, 0.0), "x.npy")
-    sheets = plan_sheets({"a": Stripes(0.3, 8.0, 0.5, 1.0), "b": picture, "c": Uniform(0.5)})
+    sheets = pattern_sheets({"a": Stripes(0.3, 8.0, 0.5, 1.0), "b": picture, "c": Uniform(0.5)})
     assert b"/Subtype /Image" in sheets_pdf(sheets, paper="a4", title="t")
 
 

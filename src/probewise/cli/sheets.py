@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     from probewise.cli._plans import read_or_shipped_plan
     from probewise.recordings.description import read_description
-    from probewise.report.sheets import arm_home_jig_sheets, field_sheet, marks_sheet, plan_sheets, target_sheet
+    from probewise.report.sheets import arm_home_jig_sheets, field_sheet, marks_sheet, pattern_sheets, target_sheet
 
     what = arguments.what
     if what not in (FIELD, TARGET) and arguments.target is not None:
@@ -88,10 +88,10 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     if path.suffix.lower() == ".json":
         beside = path.with_suffix(".csv")
         if not beside.exists():
-            return plan_sheets(read_description(path).patterns)
+            return pattern_sheets(read_description(path).patterns)
         what = str(beside)
     plan = read_or_shipped_plan(what)
-    return plan_sheets(plan.patterns, plan)
+    return pattern_sheets(plan.patterns, plan)
 
 
 def _target_outline_mm(text: str, field_mm: tuple[float, float]):  # type: ignore[no-untyped-def]

@@ -91,7 +91,7 @@ class Prepared:
         """Whether the readings are too few for a verdict, or all equal."""
         return len(self.usable_rows) < self.least_readings or self.has_only_equal_readings
 
-    def expand_to_all_rows(self, values: FloatArray) -> FloatArray:
+    def expand_usable_to_all_rows(self, values: FloatArray) -> FloatArray:
         """Expand values of usable readings to all rows, NaN elsewhere: (n_usable,) -> (n_points,)."""
         out = np.full(len(self.recording), np.nan)
         out[self.usable_rows] = values

@@ -74,7 +74,10 @@ class ScanMisplacement(ScanGroupEffect[SceneView]):
 
 
 def _with_shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
-    """Return the view with each reading's pattern shifted along its edge's normal, `by_mm` (n_samples, n_points)."""
+    """Return the view with each reading's pattern shifted by `by_mm`, (n_samples, n_points).
+
+    The shift is along the normal of a half-plane, stripes or a ramp, and along X otherwise.
+    """
     angle = np.zeros(len(plan))
     for name, rows in plan.rows_by_pattern():
         pattern = plan.patterns.get(name)

@@ -211,7 +211,7 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
         return self.bank()[:, 0, :]
 
     def weighed_nodes(self, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
-        """Return nodes given a fit, (n_nodes, n_params), and the log of each one's prior weight, (n_nodes,)."""
+        """Return nodes given a fit, (n_nodes, n_params), and log weights, (n_nodes,): by default those of the prior."""
         nodes = self.nodes(residuals, rows)
         return nodes, np.full(len(nodes), -np.log(max(len(nodes), 1)))
 

@@ -194,7 +194,7 @@ _KIND_OF = {
 
 
 def read_description(path: Path) -> Description:
-    """Read NAME.json.
+    """Read the description beside NAME.csv, NAME.json: instrumentation, patterns, and notes on what is not used.
 
     Raises FileError if it is missing, does not parse, or a field is missing or invalid.
     """

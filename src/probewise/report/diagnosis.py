@@ -269,7 +269,7 @@ def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         ),
         *_credible_set_elements(credible),
         *_unknown_effect_elements(diagnosis),
-        *_unlisted_correction_elements(diagnosis),
+        *_unstated_effect_elements(diagnosis),
         *_laplace_and_nested_table(diagnosis),
         *_effect_elements(diagnosis),
     )
@@ -300,7 +300,7 @@ def _unknown_candidate_in_words(name: str) -> str:
     return effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)
 
 
-def _unlisted_correction_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _unstated_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Build a paragraph for each correction in posterior samples of the repaired model that no explanation has."""
     return tuple(
         paragraph(_as_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))

@@ -167,7 +167,7 @@ def _fault_section(steps: Sequence[Step], trust: float) -> Section:
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, with the posterior sd; those without a truth are left out."""
-    step, truth = run.last, _truth_near_estimate(run, truth)
+    step, truth = run.last, _truth_with_angles_near_estimate(run, truth)
     return ", ".join(
         f"{without_unit(_without_shape_prefix(step, name))} "
         f"{value_with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
@@ -176,7 +176,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     )
 
 
-def _truth_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[str, float]:
+def _truth_with_angles_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[str, float]:
     """Return the truth with its angle within half a turn of the estimate's: a rectangle's sides may then be swapped."""
     shape, step = run.experiment.shape, run.last
     likely, columns = shape, np.arange(len(step.names))

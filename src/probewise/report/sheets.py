@@ -151,7 +151,7 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     )
 
 
-def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
+def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
     """Make one sheet per pattern, as large as the plan's readings need.
 
     Parameters

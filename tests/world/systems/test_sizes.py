@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from probewise.world.systems import KINDS, cases, draw_system, draw_system_case, system_stratum_of, truth_of
+from probewise.world.systems import KINDS, cases, draw_system, draw_system_case, system_stratum_of, truth_json
 from probewise.world.systems.cases import _draw_effect_of_size
 from probewise.world.systems.rivals import rivals_with_nats
 from probewise.world.systems.strata import SYSTEMS_WHEEL
@@ -73,9 +73,9 @@ def quick(monkeypatch):
 
 @pytest.mark.parametrize("number", [1, 2, pytest.param(8, marks=pytest.mark.slow), 14])
 def test_a_case_follows_from_the_seed_and_its_number(number, quick):
-    one, again = (truth_of(draw_system_case(12, number)) for _ in range(2))
+    one, again = (truth_json(draw_system_case(12, number)) for _ in range(2))
     assert one == again
-    assert one != truth_of(draw_system_case(13, number))
+    assert one != truth_json(draw_system_case(13, number))
 
 
 @pytest.mark.parametrize("number", [*range(4), *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 20))])

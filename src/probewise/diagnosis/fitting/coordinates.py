@@ -2,7 +2,8 @@
 
 The sensor's natural coordinates are the logits of the Gaussians' shares, their means, the logs of their
 widths, the inverse hyperbolic tangents of their correlations, and the two levels: all unbounded, all of
-order one. An effect's coordinates are the standard-normal transforms of its own prior.
+order one. (They are not the natural parameters of an exponential family.) An effect's coordinates are the
+standard-normal transforms of its own prior.
 """
 
 from __future__ import annotations

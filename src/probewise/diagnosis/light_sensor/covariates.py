@@ -91,7 +91,7 @@ def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariat
 def covariate_of_effect(
     effect: NamedEffect[Any], change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
 ) -> Covariate | None:
-    """Return the first of an effect's covariates that varies here; None if none varies, or nothing changes.
+    """Return the first of an effect's covariates that varies here; None if none varies, or `change` is 0 everywhere.
 
     Parameters
     ----------

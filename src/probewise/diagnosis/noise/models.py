@@ -29,7 +29,7 @@ _FINE = 0.01  # noise sds: tolerance of a lost reading's value without rounding
 
 @dataclass(frozen=True, eq=False)
 class NoiseNodes:
-    """The nodes of a noise model about a fit: distributions, settings (n_nodes, n_params) and log prior weights."""
+    """The nodes of a noise model about a fit: distributions, settings (n_nodes, n_params) and log weights."""
 
     settings: FloatArray
     laws: tuple[NoiseLaw, ...]
@@ -110,7 +110,7 @@ class NoiseModel:
     def _weighted_nodes(
         self, effect: NoiseEffect, residuals: FloatArray, rows: FittedReadings
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the nodes of one effect and their log prior weights."""
+        """Return the nodes of one effect, (n_nodes, n_params), and their log weights, (n_nodes,)."""
         if effect.name in self.likely:
             return self.likely[effect.name]
         return effect.weighed_nodes(residuals, rows)

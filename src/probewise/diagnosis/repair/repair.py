@@ -115,9 +115,11 @@ def repair_of(
         before = PredictionAndResiduals(plain, readings - plain)
         after = PredictionAndResiduals(repaired + by_rows, readings - repaired - by_rows)
     else:
-        before = PredictionAndResiduals(_predictions_of_all_rows(null), prepared.expand_to_all_rows(null.residuals))
+        before = PredictionAndResiduals(
+            _predictions_of_all_rows(null), prepared.expand_usable_to_all_rows(null.residuals)
+        )
         after = PredictionAndResiduals(
-            _predictions_of_all_rows(fit) + by_rows, prepared.expand_to_all_rows(fit.residuals - change)
+            _predictions_of_all_rows(fit) + by_rows, prepared.expand_usable_to_all_rows(fit.residuals - change)
         )
     return Repair(drawn.null, drawn.repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
 

@@ -188,7 +188,7 @@ class SimulatorApparatus:
         plan: Plan,
         known: Sequence[Covariate],
     ) -> Covariate | None:
-        """Return the first of an effect's covariates that is known; None if none is, or nothing changes.
+        """Return the first known one of an effect's covariates; None if none is known, or `change` is 0 at every row.
 
         The values of `level` are those predicted `without` the effect.
         """

@@ -46,9 +46,10 @@ _MOVED = {
 
 @dataclass(frozen=True)
 class VerdictReport:
-    """The verdict in words and numbers: reason, effects, noise, evidences by both methods, and what is beyond.
+    """The verdict in words and numbers: reason, effects, noise, log evidences, and what named effects do not explain.
 
-    `remainder` and `formula` are None if there is none.
+    Log evidences are by Laplace's approximation and by nested sampling. `remainder` and `formula` are None if there is
+    none.
     """
 
     reason: str

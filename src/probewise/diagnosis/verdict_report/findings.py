@@ -181,7 +181,9 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
         gain = holder.evidence[noise].log_z - max(without)
         return math.sqrt(2 * max(gain, 0.0))
     model, stay = found.model.model_and_mask_without(name)
-    noise_free = prepared.recording.with_readings(prepared.expand_to_all_rows(found.predicted)).without_declared_range()
+    noise_free = prepared.recording.with_readings(
+        prepared.expand_usable_to_all_rows(found.predicted)
+    ).without_declared_range()
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
     sigma = float(law.likeliest_sigma(law(found.residuals)[:, None])[0])
     refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)

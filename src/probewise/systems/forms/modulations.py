@@ -25,8 +25,9 @@ _ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial frequenc
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `marginals` is a function of the amplitude's prior, `entries` of its typical size, `units` of the quantity's unit,
-    `says` of the quantity's name and unit and the parameters' mean and sd. `counted_from` is that of the forms.
+    `marginals` is a function of the amplitude's prior, `entries` of the amplitude's typical size, `units` of the
+    quantity's unit, `says` of the quantity's name and unit and the parameters' mean and sd. The other attributes become
+    those of the `Form`.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]

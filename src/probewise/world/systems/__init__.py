@@ -5,7 +5,7 @@ fits are implemented a second time.
 """
 
 from probewise.world.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, draw_system_case
-from probewise.world.systems.files import simulator_file_text, truth_of, write_system_case
+from probewise.world.systems.files import simulator_file_text, truth_json, write_system_case
 from probewise.world.systems.noise import OTHER_NOISE
 from probewise.world.systems.right_model import right_predictions
 from probewise.world.systems.strata import SYSTEMS_WHEEL, system_stratum_of
@@ -22,12 +22,15 @@ __all__ = [
     "right_predictions",
     "simulator_file_text",
     "system_stratum_of",
-    "truth_of",
+    "truth_json",
     "write_system_case",
 ]
 
 Drawn = DrawnSystem
 """The old name of `DrawnSystem`."""
+
+truth_of = truth_json
+"""The old name of `truth_json`."""
 
 owners_file = owners_file_text = simulator_file_text
 """The old names of `simulator_file_text`."""

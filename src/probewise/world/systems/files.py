@@ -25,7 +25,7 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
         "simulator.py": simulator_file_text(case),
         "table.csv": table_text(case, seen),
         "table_test.csv": table_text(case, later),
-        "truth.json": json.dumps(truth_of(case), indent=1, allow_nan=False) + "\n",
+        "truth.json": json.dumps(truth_json(case), indent=1, allow_nan=False) + "\n",
     }
     for name, text in texts.items():
         write_text_atomically(directory / name, text)
@@ -52,7 +52,7 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
     return csv_text(dict(columns))
 
 
-def truth_of(case: SystemCase) -> dict[str, Any]:
+def truth_json(case: SystemCase) -> dict[str, Any]:
     """Return the truth of a case as a JSON object, the content of truth.json."""
     seen = case.drawn.diagnosed_row_numbers
     later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)

@@ -46,20 +46,19 @@ def candidate_scan_groups(plan: Plan) -> tuple[tuple[str, ...], ...]:
     who comes back later may have mounted the sensor anew, or may not. A group of all scans is left out, since nothing
     remains to compare it with. A scan in which the sensor turns belongs to no mounting.
     """
-    by_angle: dict[tuple[int | None, float], list[str]] = {}
-    by_session: dict[int, list[str]] = {}
     turned_deg = orientation_deg(plan)
     sessions = plan.sessions or (0,) * len(plan.scan_names)
+    mountings: dict[float, list[str]] = {}
+    mountings_of_session: dict[tuple[int, float], list[str]] = {}
+    recordings: dict[int, list[str]] = {}
     for name, rows, session in zip(plan.scan_names, plan.rows_by_scan(), sessions, strict=True):
-        by_session.setdefault(session, []).append(name)
-        angles = np.unique(turned_deg[rows])
+        recordings.setdefault(session, []).append(name)
+        angles = np.unique(turned_deg[rows]).tolist()
         if len(angles) == 1:
-            for which in (None, session):
-                by_angle.setdefault((which, float(angles[0])), []).append(name)
-    mountings = [tuple(dict.fromkeys(names)) for (which, _), names in by_angle.items() if which is None]
-    of_session = [tuple(dict.fromkeys(names)) for (which, _), names in by_angle.items() if which is not None]
-    recordings = [tuple(dict.fromkeys(names)) for names in by_session.values()]
-    singles = [(name,) for name in dict.fromkeys(plan.scan_names)]
+            mountings.setdefault(angles[0], []).append(name)
+            mountings_of_session.setdefault((session, angles[0]), []).append(name)
+    singles = [[name] for name in plan.scan_names]
+    groups = (*mountings.values(), *singles, *mountings_of_session.values(), *recordings.values())
+    found = dict.fromkeys(tuple(dict.fromkeys(names)) for names in groups)
     every = set(plan.scan_names)
-    found = dict.fromkeys([*mountings, *singles, *of_session, *recordings])
     return tuple(group for group in found if set(group) != every)

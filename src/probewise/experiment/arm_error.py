@@ -30,7 +30,7 @@ from probewise.experiment.state import ArmError
 from probewise.inference.problem import checked_log_prob
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
-from probewise.scene.any_of import AnyOf
+from probewise.scene.any_of import AnyOf, shape_and_columns
 from probewise.scene.symmetry import with_angles_near
 
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
@@ -137,13 +137,8 @@ def _posterior_mean_shifts(
     likely_shape: str,
 ) -> FloatArray:
     """Return the shift of the shape's posterior mean by each error of one sd, (n_params, n_errors)."""
-    shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
-    likely, columns = shape, np.arange(len(mean))
-    if isinstance(shape, AnyOf):
-        likely, columns = (
-            shape.shapes[likely_shape],
-            shape.prior.columns_by_shape[shape.shape_names.index(likely_shape)],
-        )
+    n_sensor = int(experiment.shape_columns[0])
+    likely, columns = shape_and_columns(experiment.shape, likely_shape)
     own = np.arange(n_sensor, n_sensor + len(columns))
     thetas, weights, by_error, by_shape = [], [], [], []
     kinds = zip(posterior.kinds, posterior.particles, posterior.probability.tolist(), strict=True)

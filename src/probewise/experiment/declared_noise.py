@@ -40,7 +40,7 @@ class DeclaredNoise:
         """Return which readings, (n_points,), lie between the ends of the scale."""
         if self.ends is None:
             return np.ones(len(readings), dtype=np.bool_)
-        return ~(self.ends.lowest_reading_mask(readings) | self.ends.highest_reading_mask(readings))
+        return ~self.ends.end_mask(readings)
 
     def log_density(
         self,

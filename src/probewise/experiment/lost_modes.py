@@ -19,7 +19,6 @@ from probewise.experiment.sampled_anew import SolverFromScratch, sample_from_scr
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 
-_CHECKED_FOR = 5  # readings that a check is good for, if the samples follow them with ease
 _LOST = 0.05  # share of a posterior that may lie beyond all of a kind's samples, besides what chance leaves there
 
 
@@ -34,8 +33,7 @@ def with_lost_modes_found(
     particles, n_readings = list(posterior.particles), len(problems[0].recording)
     for k, (kind, probability) in enumerate(zip(posterior.kinds, posterior.probability.tolist(), strict=True)):
         own, problem = particles[k], problems[k]
-        is_recent = n_readings < own.searched_at + _CHECKED_FOR and not (own.strained or own.hurried)
-        if kind.left_out or probability < HAS_A_SAY or is_recent:
+        if kind.left_out or probability < HAS_A_SAY or not own.is_search_old(n_readings):
             continue
         particles[k] = own = replace(own, searched_at=n_readings)
         n = len(own.ancestor)

@@ -30,6 +30,7 @@ _SURPRISED = 12.5  # nats by which even the best sample misses the last reading:
 _STIFF = 0.5  # accepted steps per sample below which the moves are unreliable
 _MOST_ROUNDS = 6
 _MANY_DEGREES = 4
+_SEARCHED_FOR = 5  # readings that a search from scratch is good for, if its samples follow them with ease
 _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 
@@ -104,6 +105,10 @@ class Particles:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
+
+    def is_search_old(self, n_readings: int) -> bool:
+        """Return whether the last search from scratch, if there was one, no longer holds after `n_readings`."""
+        return self.strained or self.hurried or n_readings >= self.searched_at + _SEARCHED_FOR
 
     @property
     def log_z(self) -> float:

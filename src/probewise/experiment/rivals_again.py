@@ -24,7 +24,6 @@ _BEHIND = 9.0  # nats behind the best kind, from which on a rival is not sampled
 _FEWEST = 4.0  # effective draws below which a sample replaces none
 _LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
 _RULED_OUT = 10.0  # nats by which fits and a kind's own samples may miss its evidence, where both are behind
-_SEARCHED_FOR = 5  # readings that a search from scratch is good for, if its samples follow them with ease
 _SEARCHED_PER_READING = 1  # kinds that are searched from scratch after a reading; before a run ends, all that need it
 
 
@@ -61,8 +60,7 @@ def sample_rivals_again(
         own = particles[k]
         beyond = own.log_z < particles[plain].log_z - _NESTED
         hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
-        is_search_old = own.strained or own.hurried or len(problem.recording) >= own.searched_at + _SEARCHED_FOR
-        may_search = n_searches > 0 and is_search_old
+        may_search = n_searches > 0 and own.is_search_old(len(problem.recording))
         matters = each and may_search and probability[k] > HAS_A_SAY
         wanted = matters or (each and not own.refitted) or beyond or own.strained or own.hurried
         if not wanted or (own.log_z_limit < hopeless and (own.limit_is_searched or not each)):

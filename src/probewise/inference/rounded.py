@@ -49,6 +49,10 @@ class ScaleEnds:
         """Return which readings are the highest possible one."""
         return np.asarray(readings >= self.high - self._tolerance)
 
+    def end_mask(self, readings: FloatArray) -> BoolArray:
+        """Return which readings are the lowest or the highest possible one."""
+        return self.lowest_reading_mask(readings) | self.highest_reading_mask(readings)
+
     def log_prob_at_ends(self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray) -> FloatArray:
         """Return the log probability of readings at an end, (n_points,), given predictions, (n_samples, n_points)."""
         inward = np.where(
@@ -99,7 +103,7 @@ class Rounded:
         """Return the log probability of the readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
-        at_end = self.ends.lowest_reading_mask(readings) | self.ends.highest_reading_mask(readings)
+        at_end = self.ends.end_mask(readings)
         if at_end.any():
             within = self._log_cell_probability(away[:, ~at_end]).sum(axis=1)
             beyond = self.ends.log_prob_at_ends(readings[at_end], predicted[:, at_end], self.sd)

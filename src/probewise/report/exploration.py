@@ -39,7 +39,8 @@ from probewise.report.words import (
     value_with_error,
     without_unit,
 )
-from probewise.scene import AnyOf, outlines, with_angles_near
+from probewise.scene import outlines, with_angles_near
+from probewise.scene.any_of import shape_and_columns
 
 MODEL_NAMES = {"ssf": "SSF"}
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
@@ -178,11 +179,8 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
 
 def _truth_with_angles_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[str, float]:
     """Return the truth with its angle within half a turn of the estimate's: a rectangle's sides may then be swapped."""
-    shape, step = run.experiment.shape, run.last
-    likely, columns = shape, np.arange(len(step.names))
-    if isinstance(shape, AnyOf):
-        likely = shape.shapes[step.likely_shape]
-        columns = shape.prior.columns_by_shape[shape.shape_names.index(step.likely_shape)]
+    step = run.last
+    likely, columns = shape_and_columns(run.experiment.shape, step.likely_shape)
     names = [step.names[k] for k in columns]
     if not all(name in truth for name in names):
         return dict(truth)

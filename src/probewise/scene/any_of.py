@@ -140,3 +140,10 @@ class AnyOf:
             # An empty field stands in for a shape that no hypothesis selects.
             parts.append(shape.region(theta[np.ix_(rows, columns)]) if rows.size else UniformRegion(np.zeros(1)))
         return RegionsOfMixedKinds(which, tuple(parts))
+
+
+def shape_and_columns(shape: Shape, name: str) -> tuple[Shape, IntArray]:
+    """Return the shape of this name in a set, and its columns of theta; of a single shape, itself and all columns."""
+    if isinstance(shape, AnyOf):
+        return shape.shapes[name], shape.prior.columns_by_shape[shape.shape_names.index(name)]
+    return shape, np.arange(len(shape.prior.names))

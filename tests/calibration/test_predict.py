@@ -212,6 +212,9 @@ def test_a_plan_that_declares_another_height_is_predicted_at_it(sensor: FittedSe
         found = predict(calibrated, replace(at_28, covariates={"height_mm": column}))
         told = replace(at_14, covariates={"height_mm": np.where(np.isfinite(column), column, 28.0)})
         np.testing.assert_array_equal(found.mean, predict(calibrated, told).mean)
+        chain = calibrated.chain(KnownScene(at_28.patterns))
+        theta, commanded = calibrated.samples_for_new_scans, replace(at_28, covariates={"height_mm": column})
+        np.testing.assert_array_equal(chain.predict(theta, commanded), chain.predict(theta, told))
     assert found.plan.instrumentation.height_mm == 28.0
     np.testing.assert_array_equal(predict(calibrated, at_28).mean[5:], found.mean[5:])
     np.testing.assert_array_equal(predict(sensor, at_28).mean, predict(sensor, at_14).mean)  # calibrated at no height

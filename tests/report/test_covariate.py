@@ -1,8 +1,13 @@
 """Names and units of covariates on the axes of a report."""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
+from probewise.diagnosis import Place
 from probewise.report.covariate import covariate_in_words, covariate_unit
+from probewise.report.covariate_view import _probability_unknown_depends_on
 
 
 @pytest.mark.parametrize("name", ["k", "c", "v", "s", "mm", "deg", "percent", "_k"])
@@ -15,3 +20,14 @@ def test_the_last_part_of_a_columns_name_is_its_unit_and_the_rest_its_name():
     assert (covariate_in_words("battery_mv"), covariate_unit("battery_mv", "counts")) == ("battery", "mV")
     assert (covariate_in_words("k"), covariate_in_words("_k")) == ("k", " k")
     assert covariate_unit("time", "counts") == "s"
+
+
+def test_an_unknown_effect_that_depends_on_the_run_is_found_by_its_run():
+    """A whole run of a table is a place without "within scans", as a whole scan is."""
+    place = Place("run", "third", None, None, 0.001, 5.0, np.zeros(2), np.zeros(2), np.ones(2))
+    diagnosis = SimpleNamespace(
+        verdict="unknown",
+        judged=SimpleNamespace(unknown_shares={"run, by group": 0.7, "time, smooth": 0.2}),
+        apparatus=SimpleNamespace(words=SimpleNamespace(run="run")),
+    )
+    assert _probability_unknown_depends_on(diagnosis, place) == 0.7

@@ -17,7 +17,6 @@ from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
 from probewise.recordings.plan import require_patterns_described, require_plan
 from probewise.scene import KnownScene
-from probewise.sensor import with_declared_height_commanded
 
 # Numbers held in memory by one block of samples: about 30 MB.
 _BLOCK = 4_000_000
@@ -92,8 +91,7 @@ def predict(
     scored = Recording(plan, recorded).usable
     step = sensor.instrumentation.step if plan.instrumentation.step is None else plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
-    there = with_declared_height_commanded(plan, sensor.instrumentation.height_mm)
-    model = chain if sensor.effects else DeduplicatedModel(chain, there)
+    model = chain if sensor.effects else DeduplicatedModel(chain, plan)
     for effect in sensor.effects_on_new_scans:
         for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
             warnings.warn(
@@ -116,8 +114,8 @@ def predict(
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = slice(first, first + per_block)
-        noise = chain.noise_parameters(theta[block], there, sensor.noise_sd[block, None])
-        mixture.add(model.predict(theta[block], there), noise)
+        noise = chain.noise_parameters(theta[block], plan, sensor.noise_sd[block, None])
+        mixture.add(model.predict(theta[block], plan), noise)
     return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)
 
 

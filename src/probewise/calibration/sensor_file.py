@@ -189,9 +189,16 @@ class FittedSensor(NamedSamples):
     def chain(self, scene: Scene) -> Chain:
         """Build the model that predicts new readings over a scene, with the effects that apply to new scans.
 
-        Its parameters are the columns of `samples_for_new_scans`; those of a scene come before the effects'.
+        Its parameters are the columns of `samples_for_new_scans`; those of a scene come before the effects'. Readings
+        of a plan that declares another height than the calibration are predicted at the plan's.
         """
-        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.effects_on_new_scans)
+        return Chain(
+            FreeMixture(self.n_gaussians),
+            FreeLevels(),
+            scene,
+            self.effects_on_new_scans,
+            calibrated_height_mm=self.instrumentation.height_mm,
+        )
 
     @property
     def is_free_form(self) -> bool:

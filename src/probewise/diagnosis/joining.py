@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 
@@ -48,20 +48,20 @@ def join(recordings: Sequence[Recording]) -> Recording:
             found = f"{_recording_label(one, i)} (number {i + 1}) and {_recording_label(other, j)} (number {j + 1})"
             raise ParameterError("recordings", found, "recordings that differ; these are the same")
     notes = [note for recording in recordings for note in recording.notes]
-    plan = join_plans([recording.plan for recording in recordings])
     return Recording(
-        replace(plan, sessions=_joined_sessions([recording.plan for recording in recordings])),
+        join_plans([recording.plan for recording in recordings], own_sessions=True),
         np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
         " + ".join(r.source for r in recordings if r.source),
         (*notes, *_notes_on_missing_covariates(recordings), *_notes_on_other_instrumentation(recordings)),
     )
 
 
-def join_plans(plans: Sequence[Plan]) -> Plan:
+def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
     """Concatenate plans, with the covariates of the first and commanded columns (LED, height) of all.
 
     Commanded columns are NaN (as at calibration) where a plan lacks them, unless it declares another height than the
-    first; other covariates keep their last known value. If a plan has sessions, each of the others is a further one.
+    first; other covariates keep their last known value. With `own_sessions`, or if a plan has sessions, each plan
+    without is a session of its own.
     """
     first = plans[0]
     plans = [with_declared_height_commanded(plan, first.instrumentation.height_mm) for plan in plans]
@@ -97,7 +97,7 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         patterns=patterns,
         covariates={name: _joined_covariate(plans, name) for name in sorted({*first.covariates, *commanded})},
         instrumentation=first.instrumentation,
-        sessions=_joined_sessions(plans) if any(plan.sessions for plan in plans) else (),
+        sessions=_joined_sessions(plans) if own_sessions or any(plan.sessions for plan in plans) else (),
     )
 
 

@@ -33,7 +33,7 @@ from probewise.experiment.journal import (
     require_same_settings,
 )
 from probewise.experiment.pace import Pace
-from probewise.experiment.posterior import prior_posterior
+from probewise.experiment.posterior import Posterior, prior_posterior
 from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
 from probewise.experiment.stopping_rule import (
     OFF_SDS,
@@ -129,14 +129,10 @@ def step(
         # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
-    wary = carried.with_raised_fault_odds
-    joined = wary.joined(rng=rng)
-    posterior = with_aligned_angles(experiment, joined)
+    wary, joined, posterior = _wary_kinds_and_posterior(experiment, carried, rng)
     if _may_stop_and_chance_off(experiment, posterior, None, "", rng)[0]:
         carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
-        wary = carried.with_raised_fault_odds
-        joined = wary.joined(rng=rng)
-        posterior = with_aligned_angles(experiment, joined)
+        wary, joined, posterior = _wary_kinds_and_posterior(experiment, carried, rng)
     mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     leader = carried.kinds[carried.most_probable_kind_index]
     p_value, worst = p_value_and_worst_reading(
@@ -196,6 +192,15 @@ def step(
         arm_error=arm,
     )
     return ExplorationState(readings, carried, pose, tuple(planned)), info
+
+
+def _wary_kinds_and_posterior(
+    experiment: Experiment, carried: Posterior, rng: np.random.Generator
+) -> tuple[Posterior, Weighted, Weighted]:
+    """Return the kinds with raised fault odds, their samples as one posterior, and the latter with aligned angles."""
+    wary = carried.with_raised_fault_odds
+    joined = wary.joined(rng=rng)
+    return wary, joined, with_aligned_angles(experiment, joined)
 
 
 def _goal_less_arm_error(experiment: Experiment, arm: ArmError | None) -> Goal | None:

@@ -201,7 +201,7 @@ def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float
     shares = diagnosis.judged.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
         return 0.0
-    within = " within scans" if place.scan is not None and place.covariate != "scan" else ""
+    within = " within scans" if place.scan is not None and place.covariate != diagnosis.apparatus.words.run else ""
     return sum(p for family, p in shares.items() if family.partition(",")[0] == place.covariate + within)
 
 

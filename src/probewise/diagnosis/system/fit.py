@@ -146,9 +146,7 @@ def fit_simulator(
         raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
     null, noise = _null_fit_and_evidence(prepared)
     samples = sample_model(null.found, noise, prepared.recording, weights={}, rng=rng)
-    evidence = Evidence(
-        noise.log_z + null.log_prior_factor, 0.0, "the Laplace approximation", _reason_against_sampling(prepared)
-    )
+    evidence = Evidence(noise.log_z, 0.0, "the Laplace approximation", _reason_against_sampling(prepared))
     if not evidence.reason:
         samples, evidence = _nested_samples_and_evidence(
             prepared, null, noise, samples, evidence, rng=rng, progress=progress

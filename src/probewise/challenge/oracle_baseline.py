@@ -71,7 +71,12 @@ def _rate_against_closest_rival(hidden: Hidden, right: Set[str]) -> float:
 
 
 def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
-    """Return the distance of every rival in noise sds; noise effects have no rivals."""
+    """Return the distance of every rival in noise sds; noise effects have no rivals.
+
+    Rivals of a system's effect have a loss in nats, half the squared distance; those of the light sensor a cosine.
+    """
+    if "rival_nats" in hidden:
+        return {name: float(np.sqrt(2 * nats)) for name, nats in hidden["rival_nats"].items()}
     cosines: Mapping[str, float] = hidden["cosines"]
     size = float(hidden["size_lambda"])
     return {

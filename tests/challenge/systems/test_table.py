@@ -74,6 +74,15 @@ def test_what_explains_the_same_within_three_nats_is_right_too():
     assert [_row([r], "wrong name stated above .9").found.value for r in told] == [0.0, 1.0]
 
 
+def test_an_oracle_tells_two_that_are_eight_nats_apart_as_often_as_the_normal_law_says():
+    """Distance 4 sds: Phi(2) = 0.977. An alias, within three nats, does not count; cases without rivals have no row."""
+    own = _hidden("lag") | {"cosines": {"delay": 1.0}, "rival_nats": {"delay": 0.1, "settling": 8.0}}
+    row = _row([_single("lag", hide=own)], "oracle against the hardest rival, lambda 12")
+    assert row.found.value == pytest.approx(0.97725, abs=1e-5)
+    assert _row([_single("lag", hide=own)], "oracle, so counted, lambda 12").found.value < 1.2
+    assert not [row for row in score_systems([_single("lag")]) if "oracle" in row.name]
+
+
 def test_noise_said_beside_an_effect_does_not_make_it_wrong():
     said = _single(said=["offset_drift", "random_walk"])
     assert _row([said], "right name and target first, lambda 12").found.value == 1.0

@@ -70,7 +70,7 @@ def _truth_json(case: SystemCase) -> dict[str, Any]:
 
 
 def _effect_json(effect: SystemEffect) -> dict[str, Any]:
-    """Describe one effect; a rival's loss in nats is converted to a cosine."""
+    """Describe one effect; an alias's loss in nats is converted to a cosine."""
     squared = effect.size_lambda**2
     return {
         "name": effect.name,
@@ -78,7 +78,8 @@ def _effect_json(effect: SystemEffect) -> dict[str, Any]:
         "on_noise": False,
         "in_vocabulary": effect.in_vocabulary,
         "shows_in": list(effect.covariates),
-        "cosines": {name: math.sqrt(max(1 - 2 * nats / squared, 0.0)) for name, nats in effect.rivals.items()},
+        "cosines": {name: math.sqrt(max(1 - 2 * nats / squared, 0.0)) for name, nats in effect.aliases.items()},
+        "rival_nats": dict(effect.rivals),
         "parameters": {name: value for name, value in effect.parameters.items() if isinstance(value, float)},
     }
 

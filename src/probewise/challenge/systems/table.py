@@ -9,6 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.challenge.estimates import estimated_mean, estimated_share, estimated_statistic
+from probewise.challenge.oracle_baseline import oracle_credible_set_size, oracle_name_rate
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     Result,
@@ -76,15 +77,16 @@ def _rows_on_naming(done: list[Result]) -> list[ScoreRow]:
     targets = {6.0: -math.inf, 8.0: 0.9, 12.0: 0.95, 20.0: 0.98}
     shown = cases_with_one_effect(done, 12.0)
     pairs = [r for r in done if r["kind"] == "pair"]
+    first: list[ScoreRow] = []
+    for size, least in targets.items():
+        own = cases_with_one_effect(done, size)
+        name = f"right name and target first, lambda {size:g}"
+        first.append(ScoreRow(name, estimated_share([is_leading_name_right(r) for r in own]), least))
+        oracle = [oracle_name_rate(hidden) for hidden in _effects_with_rivals(own)]
+        if oracle:
+            first.append(ScoreRow(f"  oracle against the hardest rival, lambda {size:g}", estimated_mean(oracle)))
     return [
-        *(
-            ScoreRow(
-                f"right name and target first, lambda {size:g}",
-                estimated_share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]),
-                least,
-            )
-            for size, least in targets.items()
-        ),
+        *first,
         ScoreRow(
             "right covariate first, lambda 12",
             estimated_share([bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]),
@@ -101,6 +103,7 @@ def _rows_on_stated_probabilities(done: list[Result]) -> list[ScoreRow]:
     covered, covered_of_all = (
         estimated_share([credible_set_holds_truth(r, merged=True) for r in rs]) for rs in (own, done)
     )
+    oracle = [oracle_credible_set_size(hidden) for hidden in _effects_with_rivals(own)]
     return [
         ScoreRow("95 % credible set holds the truth or its alias, lambda 12", covered, 0.95),
         ScoreRow("  the same, all cases", covered_of_all),
@@ -109,9 +112,15 @@ def _rows_on_stated_probabilities(done: list[Result]) -> list[ScoreRow]:
             estimated_mean([credible_set_size_with_aliases_merged(r) for r in own]),
             most=1.4,
         ),
+        *([ScoreRow("  oracle, so counted, lambda 12", estimated_mean(oracle))] if oracle else []),
         ScoreRow("wrong name stated above .9", estimated_share([_is_confidently_wrong(r) for r in done]), most=0.01),
         ScoreRow("expected calibration error", calibration_error(done)),
     ]
+
+
+def _effects_with_rivals(singles: Sequence[Result]) -> list[Result]:
+    """List the concealed effects of cases with one effect whose rivals are on file."""
+    return [r["hidden"][0] for r in singles if "rival_nats" in r["hidden"][0]]
 
 
 def _is_confidently_wrong(result: Result) -> bool:

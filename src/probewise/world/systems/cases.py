@@ -26,7 +26,7 @@ from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
 from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
 from probewise.world.systems.residual_covariates import residual_covariates_of
-from probewise.world.systems.rivals import rivals_with_nats, vocabulary_name
+from probewise.world.systems.rivals import TELLING_NATS, rivals_with_nats, vocabulary_name
 from probewise.world.systems.strata import system_stratum_of
 from probewise.world.systems.table import SystemTable
 from probewise.world.systems.vocabulary import FAMILIES, forms_of
@@ -136,7 +136,7 @@ class DrawnSystem:
 
 @dataclass(frozen=True, eq=False)
 class SystemEffect:
-    """A concealed effect: form, parameter values, size, aliases by name with their loss in nats, visible covariates."""
+    """A concealed effect: form, parameter values, size, rivals by name with their loss in nats, visible covariates."""
 
     form: Form
     values: Mapping[str, float]
@@ -153,6 +153,11 @@ class SystemEffect:
     def in_vocabulary(self) -> bool:
         """Whether a diagnosis can name it."""
         return not self.form.shape
+
+    @property
+    def aliases(self) -> dict[str, float]:
+        """The rivals that no diagnosis can tell from it: loss below TELLING_NATS, by name."""
+        return {name: nats for name, nats in self.rivals.items() if nats < TELLING_NATS}
 
     @property
     def form_with_parameters(self) -> FormWithParameters:
@@ -331,7 +336,7 @@ def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Fo
 
 
 def _draw_effect_of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.random.Generator) -> SystemEffect:
-    """Draw an effect of this form with the requested size; its aliases are not filled in yet."""
+    """Draw an effect of this form with the requested size; its rivals are not filled in yet."""
     more = form.draw(rng)
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
@@ -379,7 +384,7 @@ def _cosine_of_effects(drawn: DrawnSystem, one: SystemEffect, other: SystemEffec
 def _effect_with_rivals(
     effect: SystemEffect, forms: Sequence[Form], drawn: DrawnSystem, others: Sequence[SystemEffect]
 ) -> SystemEffect:
-    """Return an effect with its aliases and visible covariates, found in the presence of the other effects."""
+    """Return an effect with its rivals and visible covariates, found in the presence of the other effects."""
     target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
     beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
     model = ModelWithForms(drawn.kind, drawn.diagnosed_table, beside)

@@ -69,8 +69,8 @@ def truth_json(case: SystemCase) -> dict[str, Any]:
         )
     return {
         "effects": effects,
-        "rivals": [] if pair or not case.effects else _rival_name_and_nats_rows(case.effects[0]),
-        "rivals_of": {effect.name: _rival_name_and_nats_rows(effect) for effect in case.effects} if pair else {},
+        "rivals": [] if pair or not case.effects else _alias_name_and_nats_rows(case.effects[0]),
+        "rivals_of": {effect.name: _alias_name_and_nats_rows(effect) for effect in case.effects} if pair else {},
         "covariates": list(case.effects[0].covariates) if len(case.effects) == 1 else [],
         "parameters": dict(case.drawn.shared),
         "noise_sd": case.drawn.kind.sd,
@@ -91,5 +91,5 @@ def _effect_json(effect: SystemEffect) -> dict[str, Any]:
     )
 
 
-def _rival_name_and_nats_rows(effect: SystemEffect) -> list[list[Any]]:
-    return [[name, round(nats, 3)] for name, nats in effect.rivals.items()]
+def _alias_name_and_nats_rows(effect: SystemEffect) -> list[list[Any]]:
+    return [[name, round(nats, 3)] for name, nats in effect.aliases.items()]

@@ -1,4 +1,4 @@
-"""Aliases of an effect: forms that, fitted together with the system, come within a few nats of it.
+"""Rivals of an effect: forms that, fitted together with the system, come within a few nats of it; aliases within three.
 
 First linearised, for every form at once; then by full fits of the closest ones.
 """
@@ -26,7 +26,7 @@ from probewise.world.systems.forms.true_system import TrueSystem
 TELLING_NATS = 3.0
 """Evidence below which two explanations cannot be distinguished."""
 
-_NEAR = 12.0  # linearised nats within which a full fit is made
+_NEAR = 12.0  # nats within which a form is a rival; linearised ones within which a full fit is made
 _COSINE = 0.9
 _MOST_FITS = 6
 _CHUNK = 160  # settings simulated together
@@ -57,7 +57,7 @@ def rivals_with_nats(
     model: ModelWithForms,
     without: frozenset[str],
 ) -> dict[str, float]:
-    """Find the forms that explain an effect's noise-free readings almost as well as the effect itself.
+    """Find the forms that explain an effect's noise-free readings nearly as well as the effect itself, six at most.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def rivals_with_nats(
 
     Returns
     -------
-    Loss of log likelihood in nats by name, for those below TELLING_NATS, the best first.
+    Loss of log likelihood in nats by name, for those below 12, the best first; those below TELLING_NATS are aliases.
     """
     left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
     near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], left, fitted, model)
@@ -106,7 +106,7 @@ def rivals_with_nats(
         except NotConvergedError:
             continue
         found[name] = min(nats, found.get(name, np.inf))
-    close = {name: nats for name, nats in found.items() if nats < TELLING_NATS}
+    close = {name: nats for name, nats in found.items() if nats < _NEAR}
     return dict(sorted(close.items(), key=lambda item: item[1]))
 
 

@@ -54,29 +54,29 @@ LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Mapping[str, FloatArra
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The steps of an integration, which takes each step for all runs together."""
+    """Integration steps over a table, each taken in all runs together; position k is the k-th row of every run."""
 
     places: RowsInRuns
     max_step: float
 
     @cached_property
     def schedule(self) -> StepSchedule:
-        """Number of steps from each position in the runs to the next, and their method."""
+        """Number of steps from each row of a run to the next, the same in all runs, and the Runge-Kutta method."""
         return self.places.step_schedule(self.max_step)
 
     @property
     def n_steps_by_gap(self) -> IntArray:
-        """Number of steps from each position in the runs to the next, (n_places - 1,)."""
+        """Number of steps from each row of a run to the next, (n_places - 1,); the same in all runs."""
         return self.schedule.n_steps
 
     @cached_property
     def gap_of_step(self) -> IntArray:
-        """Position in the runs of the row before each step, (n_steps,)."""
+        """Number of the gap in which each step lies, (n_steps,); gap k is between rows k and k + 1 of every run."""
         return np.repeat(np.arange(len(self.n_steps_by_gap)), self.n_steps_by_gap)
 
     @cached_property
     def n_steps_before_position(self) -> IntArray:
-        """Number of steps before each position in the runs, (n_places,)."""
+        """Number of steps from the first row of a run to its row at each position, (n_places,)."""
         return np.concatenate([[0], np.cumsum(self.n_steps_by_gap)])
 
     @property
@@ -86,14 +86,14 @@ class Steps:
 
     @cached_property
     def begin_share_of_gap(self) -> FloatArray:
-        """Share of the gap between rows at which each step begins, (n_steps * n_runs,): the runs of a step in turn."""
+        """Share of its gap between rows at which each step begins, (n_steps * n_runs,), ordered by step, then run."""
         gap = self.gap_of_step
         share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.n_steps_by_gap[gap]
         return np.repeat(share, self.n_runs)
 
     @cached_property
     def length_share_of_gap(self) -> FloatArray:
-        """Share of the gap between rows that each step takes, (n_steps * n_runs,): the runs of a step in turn."""
+        """Share of its gap between rows that each step takes, (n_steps * n_runs,), ordered by step, then run."""
         return np.repeat(1.0 / self.n_steps_by_gap[self.gap_of_step], self.n_runs)
 
     def states_at_rows(self, states: FloatArray) -> FloatArray:
@@ -104,13 +104,13 @@ class Steps:
 
 @lru_cache(maxsize=16)
 def steps_for_table(table: RunTable, max_step: float) -> Steps:
-    """Return the steps of an integration over a table."""
+    """Return the steps of an integration over a table, none longer than `max_step` at fourth order."""
     return Steps(RowsInRuns(table), max_step)
 
 
 @dataclass(frozen=True, eq=False)
 class KnownTrajectory:
-    """A solved trajectory: parameters (n_params,), states (n_states, n_steps + 1, n_runs), the Jacobian once needed."""
+    """A solved trajectory: theta (n_params,), states (n_states, n_steps + 1, n_runs), `bands` its Jacobian if known."""
 
     theta: FloatArray
     states: FloatArray
@@ -119,7 +119,7 @@ class KnownTrajectory:
 
 @dataclass(eq=False)
 class TrajectoryCache:
-    """Cache of trajectories, by steps and by effects; `useless` if the law cannot evaluate all steps at once."""
+    """Cache of solved trajectories by (steps, effects); `useless` if the law cannot evaluate all steps at once."""
 
     known: dict[tuple[Hashable, Hashable], list[KnownTrajectory]] = field(default_factory=dict)
     useless: bool = False
@@ -127,10 +127,10 @@ class TrajectoryCache:
     def known_and_nearest_indices(
         self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
     ) -> tuple[list[KnownTrajectory], IntArray]:
-        """Return the cached trajectories of these steps and effects, and the number of the nearest to each sample.
+        """Return the cached trajectories of these steps and effects, and the index of the nearest to each sample.
 
-        Samples are theta, (n_samples, n_params); the numbers are (n_samples,). Where there is no trajectory with these
-        effects, those with others are taken, compared by the first `n_own` parameters.
+        Samples are theta, (n_samples, n_params); the indices are (n_samples,). Without a trajectory of these effects,
+        those of others are returned, compared by the first `n_own` parameters; without any, both results are empty.
         """
         own, width = self.known.get((steps, effects), []), theta.shape[1]
         if not own:
@@ -143,7 +143,7 @@ class TrajectoryCache:
         return own, np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
 
     def add(self, steps: Hashable, effects: Hashable, more: Sequence[KnownTrajectory]) -> None:
-        """Add trajectories to the cache; drop the oldest of steps and effects that were added to least recently."""
+        """Add trajectories; beyond 48 in all, drop the oldest of the (steps, effects) added to least recently."""
         if not more:
             return
         own = self.known.pop((steps, effects), [])  # those used last come last
@@ -162,7 +162,7 @@ class TrajectoryCache:
 class SolvedSteps:
     """States (n_states, n_samples, n_steps + 1, n_runs), and the mask `done` (n_samples,) of converged samples.
 
-    `bands` holds the last Jacobian, as of `_bands_of_jacobian`, by sample number, where one was computed. `moved`
+    `bands` holds the last Jacobian, as of `_bands_of_jacobian`, by sample index, where one was computed. `moved`
     (n_samples,) is the largest change of any state from the trajectory that a sample began from, in that state's
     largest absolute value. `n_evaluated`, the cost, is the number of steps evaluated, of all samples and runs.
     """
@@ -174,7 +174,7 @@ class SolvedSteps:
     n_evaluated: int
 
     def new_trajectories_to_cache(self, theta: FloatArray) -> list[KnownTrajectory]:
-        """Return the converged trajectories of samples theta that are far enough from known ones to be cached."""
+        """Return up to eight converged trajectories, of samples theta, that are far from the known ones."""
         worth = np.flatnonzero(self.done & (self.moved > _FAR))[:_MOST_NEW]
         return [
             KnownTrajectory(theta[k].copy(), self.states[:, k].copy(), [self.bands[k]] if k in self.bands else [])
@@ -191,15 +191,15 @@ def integrate_from_known_trajectories(
     theta: FloatArray,
     n_own: int,
 ) -> tuple[dict[str, FloatArray], int]:
-    """Integrate samples, theta (n_samples, n_params), and return their states and what that cost.
+    """Integrate a law for samples, theta (n_samples, n_params); return their states at the rows and the cost.
 
-    A few samples are solved for all steps at once, from the known trajectories nearest to them; the others, and those
-    for which that does not converge, step by step.
+    Up to 300 samples times runs are solved for all steps at once, from the known trajectories nearest to them; the
+    others, and those for which that does not converge, step by step.
 
     Parameters
     ----------
     law_and_inputs, steps
-        The law of some samples, and the steps.
+        Function of sample indices that returns their law, parameters and columns; and the steps.
     memory
         Trajectories integrated before; more are added.
     effects
@@ -209,7 +209,7 @@ def integrate_from_known_trajectories(
 
     Returns
     -------
-    Every state at every row, (n_samples, n_points), and the cost in steps, each of all samples together.
+    Every state at every row, by name, (n_samples, n_points); and the cost, in steps of all samples together.
     """
     n_samples, n_steps = len(theta), len(steps.gap_of_step)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
@@ -253,11 +253,11 @@ def solve_all_steps(
     Parameters
     ----------
     law_and_inputs
-        The law of some samples.
+        Function of sample indices that returns their law, parameters and columns.
     steps
         The steps.
     known, nearest
-        Trajectories, and for each sample the number of the one to begin from, (n_samples,).
+        Trajectories, and for each sample the index of the one to begin from, (n_samples,).
     """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(law_and_inputs, steps, guess.copy())
@@ -272,7 +272,7 @@ def solve_all_steps(
 
 
 def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTrajectory], nearest: IntArray) -> None:
-    """Take chord iterations, each with the Jacobian of the known trajectory nearest to a sample."""
+    """Take up to four chord iterations, each sample with the Jacobian of the known trajectory nearest to it."""
     for _ in range(_CHORDS):
         active = search.active_mask & ((search.rate < _SLOW) | ~np.isfinite(search.change))
         samples = np.flatnonzero(active)
@@ -293,7 +293,7 @@ def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTr
 
 
 def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
-    """Take Newton iterations of the samples that have not converged; return the last Jacobian of each, by number."""
+    """Take up to eight Newton iterations of samples not yet converged; return their last Jacobians by sample index."""
     last: dict[int, FloatArray] = {}
     for k in range(_NEWTONS):
         if k == _HOPELESS:
@@ -310,7 +310,7 @@ def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
 
 @dataclass(eq=False)
 class _NewtonState:
-    """The state of the Newton iteration: the states of all samples, and the convergence of each."""
+    """State of the Newton iteration: all samples' states at every step, and the convergence of each sample."""
 
     law_and_inputs: LawAndInputs
     steps: Steps
@@ -333,19 +333,19 @@ class _NewtonState:
         return self.possible & ~self.done
 
     def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
-        """Return the states to which each step leads from those at its beginning, (n_states, n, n_steps, n_runs)."""
+        """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
         if not np.array_equal(samples, self._chosen):
             self._chosen, self._end = samples, _stepping_function(self.law_and_inputs, self.steps, samples)
         self.n_evaluated += states[0, :, 1:].size
         return self._end(states[:, :, :-1])
 
     def step_residuals(self, samples: IntArray) -> FloatArray:
-        """Return the end of each step minus the state that should equal it, (n_states, n, n_steps, n_runs)."""
+        """Return each step's end minus the trajectory's state there, (n_states, n, n_steps, n_runs); 0 if solved."""
         states = self.states[:, samples]
         return self.states_at_step_ends(samples, states) - states[:, :, 1:]
 
     def jacobian_bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
-        """Return each sample's Jacobian about states (n_states, n, n_steps + 1, n_runs), as `_bands_of_jacobian`."""
+        """Return samples' Jacobians at states (n_states, n, n_steps + 1, n_runs), each as of `_bands_of_jacobian`."""
         at_end, columns = self.states_at_step_ends(samples, states), []
         for values in states:
             nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
@@ -370,7 +370,7 @@ class _NewtonState:
 def _stepping_function(
     law_and_inputs: LawAndInputs, steps: Steps, samples: IntArray
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the function that maps the states at the beginning of each step to those at its end."""
+    """Return a function from the states before each step to those after, (n_states, n, n_steps, n_runs) each."""
     motion, parameters, columns = law_and_inputs(samples)
     n_states = len(motion.law.states)
     first = {state: np.zeros((len(samples), steps.n_runs)) for state in motion.law.states}
@@ -389,16 +389,17 @@ def _stepping_function(
 
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:
-    """Return each sample's largest change of a state, over the largest absolute value of that state, (n_samples,)."""
+    """Return each sample's largest change of a state, relative to that state's largest absolute value, (n_samples,)."""
     size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
     return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
 
 
 def _bands_of_jacobian(slopes: FloatArray) -> list[FloatArray]:
-    """Return each sample's Jacobian of the system of all steps, its diagonal and lower bands, (n_unknowns, 2 n_states).
+    """Return each sample's Jacobian of the equations of all steps, as bands, (n_unknowns, 2 n_states).
 
-    `slopes` (n_states, n_states, n_samples, n_steps, n_runs) are derivatives of a step's end by its beginning.
-    Unknowns are ordered by run, then by step, then by state.
+    Column k holds the k-th subdiagonal; the diagonal is 1 throughout, and column 0 is not used. `slopes` (n_states,
+    n_states, n_samples, n_steps, n_runs) are derivatives of a step's end by its beginning. Unknowns are ordered by run,
+    then by step, then by state.
     """
     n_states, _, n_samples, n_steps, n_runs = slopes.shape
     out = np.zeros((n_samples, n_runs, n_steps, n_states, 2 * n_states))
@@ -409,7 +410,7 @@ def _bands_of_jacobian(slopes: FloatArray) -> list[FloatArray]:
 
 
 def _solved_corrections(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
-    """Solve for corrections (n_states, n_samples, n_steps, n_runs); samples share one Jacobian or each has its own."""
+    """Return corrections for residuals `missed`, (n_states, n_samples, n_steps, n_runs); `shared`: by one Jacobian."""
     n_states, n_samples, n_steps, n_runs = missed.shape
     right = missed.transpose(1, 3, 2, 0).reshape((n_samples, -1) if shared else (1, -1))
     solved, _ = dtbtrs(bands.T, right.T, uplo="L", diag="U")

@@ -26,7 +26,7 @@ _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 
 @dataclass(eq=False)
 class IntegrationTally:
-    """Counts of a law's integration steps, and of the samples at which it raises an error."""
+    """Counts of integration steps and of samples at which a law raises an error; `cut_short` if work was skipped."""
 
     n_failed: int = 0
     n_steps: int = 0
@@ -48,7 +48,9 @@ class Caller:
     name
         The name of the function in messages.
 
-    `cut_short` is set if work was skipped because of too many calls.
+    `cut_short` is set if work was skipped because of too many calls. `interpolated` collects the parameters that vary
+    by row though the function takes a number: its readings are interpolated between calls at five values of such a
+    parameter.
     """
 
     simulate: Simulate
@@ -74,9 +76,9 @@ class Caller:
         broadcasts: bool,
         name: str = "simulate",
     ) -> Caller:
-        """Return a caller that calls a function in the fastest way that it takes, by trial calls at some samples.
+        """Find by trial calls the fastest way to call a function for many samples; return a caller that uses it.
 
-        The parameters of `samples` are (n_samples, 1 or n_points).
+        `samples` are parameters by name, (n_samples, 1 or n_points) each.
 
         Raises
         ------
@@ -155,7 +157,7 @@ class Caller:
         *,
         strict: bool,
     ) -> FloatArray:
-        """Call a broadcasting `simulate` once; where it raises, halve the samples until those that fail are alone."""
+        """Call a broadcasting `simulate` once; if it raises, halve the samples until failing ones are alone: NaN."""
         n_samples = shape[0]
         self._count_call()
         try:
@@ -212,7 +214,7 @@ class Caller:
         return self._taken_together[changed]
 
     def _cached_call(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
-        """Call `simulate`, or return its cached result: effects on the readings do not change its arguments."""
+        """Return the readings of one sample, (n_points,), by a call or from an earlier one with the same arguments."""
         digest = hashlib.blake2b(digest_size=16)
         for name, values in (*own.items(), *columns.items()):
             digest.update(name.encode())
@@ -280,7 +282,7 @@ class ProgressWithCallCount:
 def _readings_or_nan(
     together: Caller, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
 ) -> FloatArray:
-    """Return the readings of samples, NaN where `simulate` raises; its error if it raises for all of them."""
+    """Return the readings of samples, NaN where `simulate` raises; raise its error if no reading is finite then."""
     try:
         return together(samples, columns, strict=True)
     except ShapeError:
@@ -299,7 +301,7 @@ def _parameters_accepted_by_row(
     alone: FloatArray,
     per_run: tuple[str, ...],
 ) -> frozenset[str]:
-    """Return the names of parameters that may be arrays (n_points,) in a call for one sample, by trial."""
+    """Find by trial the parameters, besides `per_run`, that may be arrays (n_points,) in a call for one sample."""
     n_points = alone.shape[1]
     taken = []
     for name, values in samples.items():
@@ -316,16 +318,16 @@ def _parameters_accepted_by_row(
 
 
 def _parameter_value_of_sample(values: FloatArray, k: int, *, by_row: bool) -> Any:
-    """Return a parameter's value in sample k, a number or one per row; the same for all if there is only one.
+    """Return a parameter's value in sample k: a number, or an array (n_points,); a single row applies to all samples.
 
-    `by_row`: it is one per row even if there is only one row.
+    `by_row`: an array even if there is only one row in the table.
     """
     own = values[min(k, len(values) - 1)]
     return float(own[0]) if own.shape == (1,) and not by_row else own
 
 
 def _values_of_samples(values: Mapping[str, Any], samples: slice) -> dict[str, Any]:
-    """Return the values of some samples; arrays with one axis, or with one sample, are the same for all."""
+    """Select some samples of values by name; arrays of one axis, or of one sample, apply to all and are kept."""
     return {name: v[samples] if np.ndim(v) == 2 and len(v) > 1 else v for name, v in values.items()}
 
 
@@ -338,7 +340,7 @@ def _parameters_and_columns_of_sample(
 
 
 def _column_and_altered_copy(values: FloatArray) -> FloatArray:
-    """Return a column (n_points,) and a slightly different one in the same order, (2, n_points)."""
+    """Return a column (n_points,) and a copy raised by about 1 % of its size, (2, n_points)."""
     size = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
     return np.stack([values, 1.01 * values + 0.01 * size])
 

@@ -54,15 +54,16 @@ class FittedSystem(NamedSamples):
     effects
         Names of the effects, including noise effects.
     absent
-        By effect, the mask of the samples in which it is absent, (n_samples,).
+        By effect, the mask of the samples in which the effect is absent, (n_samples,).
     level
         Smallest and largest of the readings predicted for the recording.
     max_step
         Largest integration step, if there is a law.
     known
-        The recording and fit about which the effects were bound; None without effects.
+        The recording and fit by which the effects were scaled and given origins; None if there are noise effects at
+        most.
     recording
-        Fingerprint of the recording.
+        Fingerprint (digest) of the recording.
     source
         Name of the recording's file.
     notes
@@ -98,7 +99,7 @@ class FittedSystem(NamedSamples):
         object.__setattr__(self, "noise_sd", noise_sd)
 
     def summary(self) -> str:
-        """Return a plain-text summary with each parameter's interval."""
+        """Return a plain-text summary with each parameter's median and 95 % interval."""
         own, unit = self.simulator, self.simulator.unit
         effects = f", with {', '.join(self.effects)}" if self.effects else ""
         lines = [f"{own.source or 'a simulator'} of {own.reading} ({unit}){effects}; {len(self.samples)} samples"]
@@ -150,7 +151,8 @@ class FittedSystem(NamedSamples):
         Raises
         ------
         FileError
-            If the text is damaged, has another format, or belongs to another simulator.
+            If the text is damaged, has another format, belongs to another simulator, or counts effects from old
+            origins.
         """
         try:
             document = parse_strict_json(text)
@@ -220,7 +222,7 @@ def write_fitted_system(fitted: FittedSystem, path: str | os.PathLike[str]) -> N
 
 
 def require_fitted_system(fitted: object) -> None:
-    """Raise ParameterError, with the way to obtain one, unless `fitted` is a FittedSystem."""
+    """Raise ParameterError unless `fitted` is a FittedSystem; the message says how to obtain one."""
     allowed = "a FittedSystem: repaired_of(diagnosis), calibrated_of(diagnosis), of probewise.diagnosis"
     if isinstance(getattr(fitted, "fitted", None), FittedSystem):
         allowed = f"a FittedSystem: take its .fitted, this is the {type(fitted).__name__}"
@@ -240,7 +242,7 @@ def _stored_fit_to_json(known: StoredFit) -> dict[str, Any]:
 
 
 def _column_to_json(values: NDArray[Any]) -> list[Any]:
-    """Convert a column to JSON; missing numbers are null."""
+    """Return a column as a list for JSON: numbers, None where one is not finite; or texts."""
     if values.dtype != np.float64:
         return [str(value) for value in values.tolist()]
     return [value if math.isfinite(value) else None for value in values.tolist()]
@@ -263,14 +265,13 @@ def _column_from_json(values: list[Any]) -> NDArray[Any]:
 
 
 def _mask_from_sample_numbers(rows: list[int], n_samples: int) -> BoolArray:
-    """Return the mask, (n_samples,), of the samples with these numbers."""
     out = np.zeros(n_samples, dtype=np.bool_)
     out[np.array(rows, dtype=np.int64)] = True
     return out
 
 
 def samples_csv(fitted: FittedSystem) -> str:
-    """Return the posterior samples as CSV text: one column per parameter, and the sd of the noise."""
+    """Return the posterior samples as CSV text: a row per sample; a column per parameter, then `noise_sd`."""
     columns = {name: fitted.samples[:, k] for k, name in enumerate(fitted.names)}
     columns["noise_sd"] = fitted.noise_sd
     return csv_text({name: [number_text(value) for value in values] for name, values in columns.items()})

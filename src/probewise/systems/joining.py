@@ -19,7 +19,8 @@ _FILE = "file"
 def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:
     """Concatenate tables: columns are those of the first, and runs of different tables remain distinct.
 
-    A column that a later table lacks is missing there. Without a column of runs, each table is one run.
+    A column that a later table lacks is missing there; one that only a later table has is left out. Without a column of
+    runs, each of several tables is one run.
 
     Parameters
     ----------
@@ -30,7 +31,7 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
 
     Returns
     -------
-    The table, and notes on columns that some tables lack.
+    The table, and notes on the missing and the omitted columns.
 
     Raises
     ------
@@ -61,7 +62,7 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
 
 
 def append_tables(table: RunTable, more: Sequence[RunTable]) -> RunTable:
-    """Append the rows of tables with the same columns to a table; names of runs are unchanged."""
+    """Append the rows of tables with the same columns to a table; runs of one name become one run."""
     columns = {name: np.concatenate([t.columns[name] for t in (table, *more)]) for name in table.columns}
     return replace(table, columns=columns, like={key: value for t in (table, *more) for key, value in t.like.items()})
 
@@ -104,7 +105,6 @@ def unused_name(name: str, taken: Iterable[str]) -> str:
 
 
 def _same_tables(first: RunTable, second: RunTable) -> bool:
-    """Return whether two tables hold the same rows."""
     if len(first) != len(second) or set(first.columns) != set(second.columns):
         return False
     return all(_equal_columns(values, second.columns[name]) for name, values in first.columns.items())

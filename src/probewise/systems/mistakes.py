@@ -50,7 +50,6 @@ def user_function_error(
 
 
 def _files_of_user_functions(simulator: Simulator) -> set[str]:
-    """Return the names of the files that hold the user's functions."""
     functions: list[Any] = [simulator.simulate]
     if simulator.law is not None:
         functions += [simulator.law.rates, simulator.law.observe]

@@ -24,7 +24,7 @@ Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 class Limit:
     """A bound of a state: `level` (n_samples, 1), an upper bound if `upper`, else a lower bound.
 
-    The rate beyond the bound is lost, except for the shares `spilt` (n_samples, 1) that other states, by name, take up.
+    The rate beyond the bound is lost, except for shares that other states take up: `spilt`, by state, (n_samples, 1).
     """
 
     state: str
@@ -65,7 +65,7 @@ class LawWithEffects:
         return not (self.terms or self.friction or self.limits)
 
     def directions_of_motion(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the direction of motion of each state with friction during the next step: 1, -1, or 0 if it sticks."""
+        """Return, by state with friction, the direction of motion in the next step: 1, -1, or 0 if it sticks."""
         if not self.friction:
             return {}
         free = self.rates(s, p, u, {})
@@ -79,7 +79,7 @@ class LawWithEffects:
     def rates(
         self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
     ) -> Mapping[str, Any]:
-        """Return the rate of each state, with bounds, and with friction against the directions `ways`."""
+        """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`."""
         given = self.law.rates(s, p, u)
         if self._has_no_effects:
             return given
@@ -97,7 +97,7 @@ class LawWithEffects:
         return out
 
     def clip_and_stop_states(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
-        """Clip the states after a step to their bounds, stop those that friction brought to rest, and return them."""
+        """Return the states after a step: clipped to their bounds, and 0 where they reversed against friction."""
         for state, way in ways.items():
             after[state] = np.where(way * after[state] < 0, 0.0, after[state])
         for limit in self.limits:
@@ -115,14 +115,14 @@ class RowsInRuns:
     Raises
     ------
     ParameterError
-        If time decreases within a run.
+        On first use, if time decreases within a run.
     """
 
     table: RunTable
 
     @cached_property
     def row_by_position_and_run(self) -> IntArray:
-        """Row of the table at each position of each run, (n_places, n_runs)."""
+        """Row of the table at each position of each run, (n_places, n_runs); after its end, a run's last row."""
         table, by_run = self.table, self.table.rows_by_scan()
         for name, rows in zip(table.scan_names, by_run, strict=True):
             falls = np.flatnonzero(np.diff(table.time_s[rows]) < 0)
@@ -135,7 +135,7 @@ class RowsInRuns:
 
     @cached_property
     def gaps(self) -> FloatArray:
-        """Time from each position to the next, (n_places - 1, n_runs)."""
+        """Time from each position to the next, (n_places - 1, n_runs), in the unit of time."""
         return np.diff(self.table.time_s[self.row_by_position_and_run], axis=0)
 
     @cached_property
@@ -147,7 +147,7 @@ class RowsInRuns:
         return place, self.table.scan
 
     def step_schedule(self, max_step: float) -> StepSchedule:
-        """Return the number of steps from each position to the next, as `max_step` asks for, and their method."""
+        """Return the number of steps from each position to the next, and their method, for a largest step."""
         longest = self.gaps.max(axis=1, initial=0.0)
         return StepSchedule.from_fourth_order_steps(
             np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
@@ -252,7 +252,7 @@ def time_gaps(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatA
 def initial_states(
     law: Law, places: RowsInRuns, parameters: Mapping[str, FloatArray], n_samples: int
 ) -> dict[str, FloatArray]:
-    """Return the states in which runs start, (n_samples, n_runs) each."""
+    """Return the states in which the runs start, by name, (n_samples, n_runs) each."""
     start = {}
     for state, given in law.states.items():
         first = places.row_by_position_and_run[:1]
@@ -267,8 +267,9 @@ def initial_states(
 class Stepper:
     """Steps of a law by a Runge-Kutta method within a gap between rows.
 
-    `gap` is the gap's time; `between` is a function of a share of it that returns parameters and columns. In the
-    methods `begin` and `length` are shares of the gap: numbers, or one for each column of the states.
+    `gap` is its time, (1 or n_samples, n_runs); `between` is a function of a share of the gap that returns parameters
+    and columns. In the methods `begin` and `length` are shares of the gap: numbers, or one for each column of the
+    states.
     """
 
     motion: LawWithEffects
@@ -295,7 +296,7 @@ class Stepper:
             def margin_to_transition(
                 at: Mapping[str, Any], share: Any, state: str = state, way: Any = way, at_rest: Any = at_rest
             ) -> Any:
-                """Return how much is left until the state comes to rest or breaks loose."""
+                """Return the margin, negative after the transition, until the state comes to rest or breaks loose."""
                 moving = way * at[state]
                 if not at_rest.any():
                     return moving
@@ -340,7 +341,7 @@ class Stepper:
 def _advanced_states(
     s: Mapping[str, Any], width: Any, terms: Terms, rates: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Return states moved for the time `width` along a weighted sum of rates."""
+    """Return the states after the time `width` at a constant rate, the weighted sum `terms` of `rates`."""
     (first, weight), *others = terms
     if not others:  # of one stage, as all of fourth order are: one product less
         share = weight * width
@@ -355,7 +356,7 @@ def _advanced_states(
 
 
 def _zero_of_straight_line(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:
-    """Return where a straight line between two values of opposite sign is zero; `low` if both are equal."""
+    """Return where a straight line through (low, at_low) and (high, at_high) is 0; `low` if it does not fall."""
     apart = at_low - at_high
     return low + (high - low) * np.where(apart > 0, at_low / np.where(apart > 0, apart, 1.0), 0.0)
 
@@ -387,7 +388,7 @@ class LawInputs:
     ) -> LawInputs:
         """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
 
-        Columns that the law does not read are left out; it is evaluated once, at the states `start`, to find them.
+        Columns that the law does not read are left out; the law is evaluated once, at the states `start`, to find them.
         """
         rows, law, time = places.row_by_position_and_run, motion.law, places.table.time
         constant: dict[str, Any] = {}
@@ -409,13 +410,13 @@ class LawInputs:
         return cls(constant, moving, held, sloping)
 
     def interpolator_of_gap(self, k: int) -> Callable[[Any], Pair]:
-        """Return the function that maps a share of the gap from position k to the next to parameters and columns."""
+        """Return a function from a share of the gap between positions k and k + 1 to parameters and columns."""
         moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
         sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
         return _interpolator(self.constant, moving, {name: v[:, k] for name, v in self.held.items()}, sloping)
 
     def interpolator_of_steps(self, gap: IntArray) -> Callable[[Any], Pair]:
-        """Return the same function for many steps at once, in the gaps from the positions `gap`, (n_steps,).
+        """Return the function of `interpolator_of_gap` for many steps at once, in the gaps `gap`, (n_steps,).
 
         Its arrays have a column for each step and run, the runs of a step in turn.
         """
@@ -473,9 +474,9 @@ def _interpolator(
     held: Mapping[str, Any],
     sloping: Mapping[str, tuple[Any, Any]],
 ) -> Callable[[Any], Pair]:
-    """Return the function that maps a share of a gap to parameters and columns.
+    """Return a function from a share of a gap to the parameters and the columns there, by name.
 
-    Those in `moving` and `sloping` are pairs, of the value at the beginning of the gap and its rise over the gap.
+    `moving` and `sloping` hold pairs: the value at the beginning of the gap, and its rise over the gap.
     """
     if not (moving or sloping):
         throughout = constant, held
@@ -490,7 +491,7 @@ def _interpolator(
 
 
 def _values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
-    """Index values, (n_points,) or (n_samples, n_points), by rows (n_places, n_runs); constants become (n, 1, 1)."""
+    """Index values (n_points,) or (n_samples, n_points) by rows (n_places, n_runs); (n, 1) becomes (n, 1, 1)."""
     if values.ndim == 1:
         return np.asarray(values[rows][None])
     return values[:, :, None] if values.shape[1] == 1 else np.asarray(values[:, rows])

@@ -59,12 +59,12 @@ class SystemPrediction(ShowsItself):
     n_failed: int = 0
 
     def summary(self) -> str:
-        """Return the number of predicted readings, and chi-square and log density per recorded one."""
+        """Return a text: the number of predicted readings; chi-square and log density per recorded reading."""
         return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
 
 
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
-    """Build a recording from a table, with unit, range and step; readings are NaN if the table has none.
+    """Build a recording from a table, with the simulator's unit, range and step; readings are NaN without a column.
 
     Raises
     ------
@@ -194,7 +194,7 @@ def predict_system(
 
 
 def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
-    """Return the number of a table's first row, counted from the first of the recording that the model was fitted to.
+    """Return the number of a table's first row, counted from the first row of the recording of the fit.
 
     A table that begins with the recording's rows, or is a contiguous part of them, readings included, is that
     recording; any other comes after its end.
@@ -217,7 +217,7 @@ def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
 def _first_column_of_block(block: FloatArray, within: FloatArray) -> int | None:
     """Return the first column from which `within` (n, n_columns) holds `block` (n, n_block); None if it does not.
 
-    What is NaN in the block fits anything: an input that the recording lacked was interpolated when it was fitted.
+    A NaN in the block fits anything: an input that the recording lacked was interpolated for the fit.
     """
     starts = np.arange(within.shape[1] - block.shape[1] + 1)
     for k, column in enumerate(block.T):
@@ -269,13 +269,13 @@ def _table_with_interpolated_inputs(simulator: Simulator, table: RunTable) -> Ru
 
 
 def _incomplete_input_columns(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
-    """Return the columns of numbers, except readings and their sd, in which cells are missing."""
+    """Return, by name, the columns of numbers with missing cells, except readings and their sd."""
     columns = {k: v for k, v in table.covariates.items() if k not in (simulator.reading, simulator.noise.sd)}
     return {name: values for name, values in columns.items() if not np.isfinite(values).all()}
 
 
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
-    """Bind the effects of a fitted simulator to the runs of a table, in their order.
+    """Bind the effects of a fitted simulator to the runs of a table, in the order of `fitted.effects`.
 
     Raises
     ------
@@ -315,7 +315,7 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
 
 
 def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
-    """Return the names of the recording's columns of numbers that effects read: targets, and those in formulas."""
+    """Return the names of the recording's columns of numbers that effects act on or name in formulas."""
     assert fitted.known is not None
     known_names = [name for name in fitted.effects if not name.startswith(PROPOSAL)]
     targets = [f"{name.removesuffix(AGAIN)}:" for name in known_names]
@@ -380,7 +380,7 @@ def draw_value_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> Fl
 def _noise_parameters(
     fitted: FittedSystem, chain: SystemChain, theta: FloatArray, mean: FloatArray, sd: FloatArray, table: RunTable
 ) -> NoiseParameters:
-    """Return the noise of each reading: its sd with the noise effects applied."""
+    """Return the noise of each sample's readings: sd, scaled by a declared sd column, with noise effects applied."""
     low, high = fitted.level
     seen = np.clip((mean - low) / ((high - low) or 1.0), 0.0, 1.0)
     declared = fitted.simulator.noise.sd

@@ -27,12 +27,12 @@ class RungeKutta:
 
     @cached_property
     def stages(self) -> tuple[Terms, ...]:
-        """For each stage, the numbers and weights of the earlier rates that lead to it."""
+        """For each stage, (index, weight) of the earlier stages whose rates lead to it."""
         return tuple(map(_nonzero_terms, self.a))
 
     @cached_property
     def weights(self) -> Terms:
-        """Numbers and weights of the rates that lead to the end of the step."""
+        """(Index, weight) of the stages whose rates lead to the end of the step."""
         return _nonzero_terms(self.b)
 
 
@@ -60,7 +60,7 @@ def eighth_order_method() -> RungeKutta:
 
 @dataclass(frozen=True, eq=False)
 class StepSchedule:
-    """The number of steps in each gap between rows, (n_gaps,), and the method that takes them."""
+    """The number of steps in each gap between rows, (n_gaps,), and the Runge-Kutta method that takes the steps."""
 
     n_steps: IntArray
     method: RungeKutta

@@ -125,7 +125,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Extra:
-    """A user's own effect: an extra parameter that `simulate` or `rates` finds in p.
+    """A user's own effect: an extra parameter that `simulate` or `rates` finds among the parameters.
 
     `null` is its value when the effect is absent; `says` is a sentence that contains {value}.
     """
@@ -235,13 +235,13 @@ class Simulator:
 
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
-    """Build a table from columns by name (a dict of arrays, a DataFrame), with a simulator's time and run columns."""
+    """Build a simulator's table from columns by name (a dict of arrays, a DataFrame); return a RunTable as it is."""
     require_simulator(simulator)
     return data if isinstance(data, RunTable) else RunTable(data, simulator.time, simulator.run)
 
 
 def require_simulator(simulator: object) -> None:
-    """Raise ParameterError, with the way to obtain one, unless `simulator` is a Simulator."""
+    """Raise ParameterError unless `simulator` is a Simulator; the message says how to obtain one."""
     allowed = "a Simulator(reading, unit, parameters, simulate=...), or read_simulator('FILE.py'), of probewise.systems"
     require_kind("simulator", simulator, Simulator, f"{allowed}; then comes the table")
 
@@ -270,7 +270,7 @@ def parse_prior(name: str, given: object) -> Marginal:
 
 
 def _is_finite_number(value: object) -> bool:
-    """Return whether a value is a finite number, also an array without an axis."""
+    """Return whether a value is a finite number, or an array without an axis that holds one."""
     array = np.asarray(value)
     return array.ndim == 0 and array.dtype.kind in "biuf" and bool(np.isfinite(array))
 

@@ -1,4 +1,4 @@
-"""A simulator over the runs of a table as a null model, and its chain of effects."""
+"""A simulator over the runs of a table as a model without effects (null model), and its chain with effects."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _CONVERGING = 4.0  # factor by which halving the step reduces the change at leas
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A null model: a simulator with one value of each `per_run` parameter for every run.
+    """A null model, without effects: a simulator with one value of each `per_run` parameter for every run.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class System:
     caller
         Caller of `simulate`, if there is no law.
     first
-        Coordinates of an earlier fit, used as the start.
+        Standard-normal coordinates of an earlier fit, (n_params,), from which fits start.
     tally
         Counts of a law's integration steps, and of samples at which it raises an error.
     trajectories
@@ -71,7 +71,8 @@ class System:
         ShapeError
             If it does not return one reading per row.
         FileError
-            If it raises an error at a trial call, and no other gives a finite reading; a law: at every one.
+            If `simulate` raises an error at a trial call and no other call gives a finite reading, or a law raises at
+            every one.
         """
         declared = simulator.noise.sd
         if isinstance(declared, str) and declared not in table.covariates:
@@ -140,7 +141,7 @@ class System:
 
     @cached_property
     def marginals(self) -> dict[str, Marginal]:
-        """Prior of each column of theta: shared parameters, then `name[run]` for every run."""
+        """Prior of each column of theta, by name: shared parameters, then `name[run]` for every run."""
         own = self.simulator
         out = {name: prior for name, prior in own.parameters.items() if name not in own.per_run}
         for name in own.per_run:
@@ -173,7 +174,7 @@ class System:
 
     @property
     def n_params(self) -> int:
-        """Number of coordinates."""
+        """Number of parameters, each value per run counted."""
         return len(self.marginals)
 
     @property
@@ -198,12 +199,12 @@ class System:
 
     @property
     def nuisance_names(self) -> tuple[str, ...]:
-        """Parameters per run, which apply to this table only."""
+        """Names of the parameters per run, `name[run]`, which apply to this table only."""
         return tuple(name for name in self.marginals if name not in self.simulator.parameters)
 
     @cached_property
     def starts(self) -> FloatArray:
-        """Coordinates to fit from, (n_starts, n_params): an earlier fit, or the prior's centre and scattered points."""
+        """Standard-normal coordinates to fit from, (n_starts, n_params): an earlier fit, or 0 and seven scattered."""
         if self.first is not None:
             return self.first[None, :]
         # Roberts's sequence (additive recurrence by the root of x^(d+1) = x + 1): uniform in any number of dimensions.
@@ -215,7 +216,7 @@ class System:
 
     @property
     def least_readings(self) -> int:
-        """Three readings per shared parameter and one per parameter of a run; at least 12."""
+        """Least number of readings for a fit: three per shared parameter, one per parameter of a run; at least 12."""
         n_own = len(self.simulator.per_run) * len(self.runs)
         return max(12, 3 * (self.n_params - n_own) + n_own)
 
@@ -230,15 +231,15 @@ class System:
         return self.caller is None
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Return whether an effect acts at a stage of this system."""
+        """Return whether an effect acts at a stage of this system: False for one on rates without a law."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None
 
     def theta(self, z: FloatArray) -> FloatArray:
-        """Map standard-normal coordinates, (n_samples, n_params), to parameters."""
+        """Map standard-normal coordinates, (n_samples, n_params), to parameters of that shape."""
         return self.prior.from_unit_cube(ndtr(z))
 
     def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
-        """Return the system with effects, ordered by stage; the table and `n_nodes` are not used."""
+        """Return the chain of the system with effects, ordered by stage; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
     def with_converged_step(
@@ -250,7 +251,7 @@ class System:
         tolerance: float,
         or_finest: bool = False,
     ) -> System:
-        """Return the system with its integration step halved until predictions change by less than a tolerance (rms).
+        """Return the system with a step so short that halving it changes predictions by a tolerance (rms) at most.
 
         Parameters
         ----------
@@ -306,7 +307,7 @@ def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, 
 
 @dataclass(frozen=True, eq=False)
 class SystemChain:
-    """A system with effects, in their order: input and clock, parameters, law, reading."""
+    """A system with effects, applied in this order: input and clock, parameters, law, reading."""
 
     system: System
     effects: tuple[AnyEffect, ...]

@@ -42,8 +42,8 @@ class RunTable:
     like
         Planned runs, each with the recorded run whose per-run parameters it is assumed to share.
     first_row
-        Number of the first row, counted from that of the recording about which effects are bound: 0 for the recording
-        itself, its length for a table that follows it.
+        Number of the first row, counted from the first row of the recording to which effects are bound: 0 for that
+        recording, its length for a table that follows it.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -89,12 +89,12 @@ class RunTable:
 
     @cached_property
     def time_s(self) -> FloatArray:
-        """Time as recorded, in its own unit; the row's number if none was recorded, (n_points,)."""
+        """Time as recorded, in the unit of the time column; the row's number if none was recorded, (n_points,)."""
         return read_only_floats(np.arange(float(len(self))) if self.time is None else self.columns[self.time])
 
     @property
     def row_number(self) -> FloatArray:
-        """Number of each row, counted from the first of the recording about which effects are bound, (n_points,)."""
+        """Number of each row, counted from the first of the recording to which effects are bound, (n_points,)."""
         return self.first_row + np.arange(float(len(self)))
 
     @cached_property
@@ -108,28 +108,28 @@ class RunTable:
 
     @property
     def scan(self) -> IntArray:
-        """Number of each row's run, from 0 in the order in which they begin, (n_points,)."""
+        """Number of each row's run, (n_points,), from 0 in the order in which the runs begin."""
         return self._run_numbers_and_names[0]
 
     @property
     def scan_names(self) -> tuple[str, ...]:
-        """Names of the runs."""
+        """Names of the runs, in the order in which they begin; "all" for a table without a run column."""
         return self._run_numbers_and_names[1]
 
     @cached_property
     def covariates(self) -> dict[str, FloatArray]:
-        """Columns of numbers, not all missing, without time and run; the reading is one of them."""
+        """Columns of numbers by name, not all missing, without time and run; the reading is one of the columns."""
         kept = {k: v for k, v in self.columns.items() if k not in (self.time, self.run)}
         numbers = {name: values for name, values in kept.items() if values.dtype == np.float64}
         return {name: values for name, values in numbers.items() if np.isfinite(values).any()}
 
     @cached_property
     def time_begins_anew(self) -> bool:
-        """Whether time decreases from any row to the next, as where it is counted from the start of each run."""
+        """Whether time decreases from some row of the table to the next, as if counted from the start of each run."""
         return bool((np.diff(self.time_s) < 0).any())
 
     def rows_by_scan(self) -> list[IntArray]:
-        """Row numbers of each run, in the order of the table."""
+        """Return the row indices of each run, in the order of the table."""
         return [np.flatnonzero(self.scan == k) for k in range(len(self.scan_names))]
 
     def require_rising_time(self) -> None:
@@ -159,7 +159,7 @@ class RunTable:
         return out
 
     def take(self, rows: IntArray | BoolArray) -> RunTable:
-        """Return a table of these rows, given by numbers or by a mask, in their order."""
+        """Return a table of these rows, given by indices or by a mask, in this order."""
         return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
 
     def with_columns(self, columns: Mapping[str, FloatArray]) -> RunTable:
@@ -169,7 +169,7 @@ class RunTable:
 
 @dataclass(frozen=True, eq=False)
 class RunRecording(Recording):
-    """A table with its readings; it has the interface of a recording that the diagnosis needs."""
+    """A table with its readings, as a recording for the diagnosis."""
 
     sd_column: str = ""
     """Column with the sd of each reading; "": all have the same sd."""
@@ -191,13 +191,13 @@ class RunRecording(Recording):
 
 
 def covariate_of_column(name: str) -> str:
-    """Return the name of the covariate that a column of a table is: its own, or "column:NAME" if that has a meaning."""
+    """Return the covariate's name for a column: as it is, or "column:NAME" if reserved ("time", "level", ...)."""
     taken = name in _NOT_COLUMNS | _OF_LIGHT_SENSOR or name.startswith(("state:", _OF_COLUMN))
     return f"{_OF_COLUMN}{name}" if taken else name
 
 
 def published_covariate(name: str) -> str:
-    """Return the name of a covariate as results have it: a column's own, unless it is a table's time, run, level ..."""
+    """Return a covariate's name for results: without "column:" if only a light sensor's recordings reserve the name."""
     own = name.removeprefix(_OF_COLUMN)
     return own if own in _OF_LIGHT_SENSOR else name
 
@@ -225,12 +225,12 @@ def _checked_column(name: str, values: Any) -> NDArray[Any]:
 
 
 def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str | None) -> RunTable:
-    """Read a CSV file with one header row; a column is numeric if every cell is a number, empty or nan.
+    """Read a CSV file with one header row; a column is numeric if every cell is a number, empty or nan, else text.
 
     Raises
     ------
     FileError
-        If the file is unusable or lacks a column; the message gives row, column, content and what is allowed.
+        If the file is unusable, lacks the column `time` or `run`, or a time is no number; the message says where.
     """
     table = read_table(checked_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)"))
     if not len(table):

@@ -1,4 +1,4 @@
-"""The vocabulary of forms: effects that a simulator may leave out, bound to columns, parameters, states, reading."""
+"""Forms: generic effects that a simulator may leave out, each bound to a column, parameter, state or the reading."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WORDS: Mapping[str, str] = MappingProxyType(readings.WORDS | inputs.WORDS | para
 
 
 def bind_forms(about: ReferenceFit) -> dict[str, Form]:
-    """Bind every form that could be detectable about this fit; return them by name, waves also as a second copy."""
+    """Return every form that could be detectable near this fit, by name; each wave twice, as two may act."""
     named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
     found = [*named, *forms_of_extras(about)]
     waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]

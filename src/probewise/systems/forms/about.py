@@ -1,4 +1,4 @@
-"""The reference fit about which forms are bound: how its readings respond to a form sets the form's prior."""
+"""The reference fit to which forms are bound: how its readings respond to a form sets the form's prior."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFit:
-    """The reference fit about which forms are bound: coordinates `z` (n_params,), and the `sd` of a reading.
+    """The fit to which forms are bound: standard-normal coordinates `z` (n_params,), and the noise sd of a reading.
 
     A form of typical size changes its readings by one sd (rms), so that no quantity needs a declared range. `misfit` is
     the rms of the fit's residuals in sds: amplitudes may be larger by this factor.
@@ -45,7 +45,7 @@ class ReferenceFit:
 
     @cached_property
     def predicted(self) -> FloatArray:
-        """Predicted readings, (n_points,)."""
+        """Readings that the fit predicts, (n_points,), without noise and effects."""
         predicted: FloatArray = self.system.chain(self.table, ()).predict(self.theta, self.table)[0]
         return predicted
 
@@ -104,7 +104,7 @@ class ReferenceFit:
         return float(np.median(gaps)) if gaps.size else 1.0
 
     def is_held_between_rows(self, column: str) -> bool:
-        """Return whether the model holds a column from row to row: readings depend on its earlier rows alone."""
+        """Return whether the model holds a column until the next row, so that a value acts on later readings only."""
         if self.system.simulator.law is not None:
             return self.system.simulator.law.hold == "previous"
         rows = max(self.table.rows_by_scan(), key=len)
@@ -116,15 +116,15 @@ class ReferenceFit:
         return bool(np.any(change[rows] != 0) and not np.any(change[there > 0]))
 
     def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
-        """Return the rms change of the readings by each setting, (n_settings,), in sds; NaN or infinite if it diverges.
+        """Return the rms change of the readings in noise sds, (n_settings,); not finite where predictions diverge.
 
-        `settings` (n_settings, n_params) are values of a trial form's parameters.
+        The change is that of a trial form, which applies `act` with the parameters `settings` (n_settings, n_params).
         """
         with np.errstate(over="ignore", invalid="ignore"):  # a setting may carry a law away: it is not finite
             return np.asarray(np.sqrt(np.mean(self.change_of_readings(stage, act, settings) ** 2, axis=1)) / self.sd)
 
     def change_of_readings(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
-        """Return the change of the readings by each setting (n_settings, n_params): (n_settings, n_points)."""
+        """Return the readings' change, (n_settings, n_points), by `act` with parameters (n_settings, n_params)."""
         trial = Form(
             "trial",
             stage,
@@ -153,12 +153,15 @@ class ReferenceFit:
         return _TYPICAL * guess / float(np.median(rms[rms > _UNSEEN]))
 
     def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
-        """Return the prior of an amplitude of this typical size, the wider the larger the misfit."""
+        """Return the heavy-tailed prior of an amplitude of this typical size; a misfit above 1 widens its tails."""
         plain = HeavyTailedPrior(typical, positive=positive)
         return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
 
     def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
-        """Return the least and the largest tried size, (n_tried,), that changes the readings plausibly; or None."""
+        """Return the range of those sizes `tried` that change the readings by 0.05 to 10,000 sds (rms); or None.
+
+        A misfit above 1 raises the upper limit. If one size alone qualifies, the range ends at the next.
+        """
         rms = self.rms_change_in_sds(stage, act, tried[:, None])
         there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST * max(self.misfit, 1.0)))
         if not there.size:
@@ -167,6 +170,6 @@ class ReferenceFit:
         return float(tried[low]), float(tried[min(high + 1, len(tried) - 1)] if high == low else tried[high])
 
     def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
-        """Return a log-uniform prior over the range of tried sizes that change the readings plausibly; or None."""
+        """Return a log-uniform prior over `range_of_plausible_sizes`; None if there is no range."""
         between = self.range_of_plausible_sizes(stage, act, tried)
         return None if between is None or not between[0] < between[1] else LogUniform(*between)

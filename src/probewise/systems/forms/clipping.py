@@ -23,24 +23,24 @@ class ClippingLevels:
 
     @property
     def least_ceiling(self) -> float:
-        """Level above which clipping is from above, a ceiling, and below which it is from below, a floor."""
+        """Level at 40 % of the range: a clipping level above it is a ceiling, otherwise a floor."""
         return self.low + _LOWER_PART * (self.high - self.low)
 
     @property
     def trial_levels(self) -> FloatArray:
-        """Trial levels for the template bank, (n_levels,): dense at both ends."""
+        """Trial levels for the template bank, (n_levels,): ceilings, then floors, densest at the ends of the range."""
         range_ = self.high - self.low
         ceilings = self.high - range_ * np.geomspace(_LEAST, 0.97 * (1 - _LOWER_PART), _N_LEVELS)
         return np.append(ceilings, self.low + range_ * np.geomspace(_LEAST, 0.97 * _LOWER_PART, _N_LEVELS))
 
     @property
     def prior(self) -> Uniform:
-        """Prior of the level."""
+        """Uniform prior of the level, from `low` to `high`."""
         return Uniform(self.low, self.high)
 
     @property
     def level_out_of_reach(self) -> float:
-        """A level out of reach, which has no effect."""
+        """A level far above the range: a ceiling without effect."""
         return self.high + (self.high - self.low)
 
 

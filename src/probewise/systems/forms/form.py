@@ -62,13 +62,13 @@ class Form:
     stage
         Stage of the chain at which it acts.
     marginals
-        Prior of each parameter.
+        Prior of each parameter, by name.
     units
         Unit of each parameter.
     covariates
-        Covariates along which its residual is visible.
+        Names of the covariates along which the residual shows if the effect is left out.
     act
-        The function that applies it.
+        Function of the stage's value, parameters (n_samples, n_params) and table; returns the value with the effect.
     entries
         Template bank: trial settings, (n_entries, n_columns, n_params).
     amplitudes
@@ -76,7 +76,7 @@ class Form:
     says
         Function that describes it in a sentence.
     absent
-        Parameter values at which it has no effect, if these are not zero amplitudes.
+        Parameter values, by index, at which it has no effect, if these are not zero amplitudes.
     change_points
         Candidate positions of its change point, if it has one.
     joined
@@ -118,11 +118,11 @@ class Form:
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
-        """Parameter values at which it has no effect: all amplitudes 0, or `absent`."""
+        """Parameter values, by index, at which it has no effect: `absent`, else all amplitudes 0; else None."""
         return dict(self.absent) or dict.fromkeys(self.amplitudes, 0.0) or None
 
     def apply(self, value: Any, theta: FloatArray, plan: Any) -> Any:
-        """Apply the effect with parameters theta (n_samples, n_params)."""
+        """Return the value of its stage with the effect applied, with parameters theta (n_samples, n_params)."""
         return self.act(value, theta, plan)
 
     def bank(self) -> FloatArray:
@@ -144,28 +144,28 @@ class Form:
 
     @property
     def n_peaks(self) -> int:
-        """Number of equivalent modes: two for a wave, whose phase spans two turns; four if two waves may swap."""
+        """Number of equivalent posterior modes: 1; 2 for a wave (its phase spans two turns); 4 for its second copy."""
         if self.joined is None:
             return 1
         return 2 if name_of_first_copy(self.name) is None else 4
 
     @property
     def scans(self) -> tuple[str, ...]:
-        """Names of the runs to which it is restricted: (), it acts in all."""
+        """Names of the runs to which it is restricted: always (), for it acts in all."""
         return ()
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """Names of the patterns to which it is restricted: (), tables have none."""
+        """Names of the patterns to which it is restricted: always (), for tables have none."""
         return ()
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Names of further columns that it needs: (), none."""
+        """Names of further columns that it needs: always ()."""
         return ()
 
     def variants(self) -> tuple[Form, ...]:
-        """Return the form and its alternatives, or one variant for each interval in which its change point may lie."""
+        """Return itself and its alternatives, or one variant for each interval in which its change point may lie."""
         if self.change_points is None:
             return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
         last = list(self.marginals)[-1]
@@ -177,11 +177,11 @@ class Form:
         return tuple(out)
 
     def with_fewer_variants(self) -> Form:
-        """Return the form with a thinned set of change points."""
+        """Return the form with its change points thinned to at most 48 intervals."""
         return self if self.change_points is None else replace(self, change_points=self.change_points.thinned())
 
     def variant_masks(self, plan: Any) -> VariantMasks | None:
-        """Return the masks of the rows after each change point, at the middle of its interval; None if not gated."""
+        """Return the mask of the rows after each variant's change point, (n_variants, n_points); None if not gated."""
         if self.change_points is None or not self.change_points.gated:
             return None
         always = self.entries[0].copy()
@@ -192,7 +192,7 @@ class Form:
         )
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the change point of each sample: an interval with probability `weights`, then a position within it."""
+        """Redraw theta's last column, the change point: an interval by `weights`, (n_variants,), uniform within it."""
         if self.change_points is None:
             return theta
         at = np.array(self.change_points.at)
@@ -202,6 +202,6 @@ class Form:
 
 
 def mean_with_sd(mean: float, sd: float, unit: str) -> str:
-    """Return "mean ± sd unit", rounded to two significant digits of the sd, or mean to three where it is below 1e-7."""
+    """Return "mean ± sd unit" to two significant digits of the sd; for an sd up to 1e-7, the mean to three digits."""
     digits = value_with_sd(mean, sd) if sd > 1e-7 else f"{mean:.3g} ± {sd:.1g}"
     return f"{digits} {unit}" if unit not in ("", "1") else digits

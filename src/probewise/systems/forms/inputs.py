@@ -133,12 +133,12 @@ def _scaled_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatAr
 
 
 def _clock_scaler(origin: float) -> Change:
-    """Return the function of a clock that runs fast or slow, and is right at the origin."""
+    """Return the function that scales times about the origin by 1 + a: a clock that runs fast or slow."""
     return lambda c, theta, table: np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
 
 
 def _column_changer(name: str, change: Change) -> Act:
-    """Return the function that changes one column of the inputs."""
+    """Return the function that applies `change` to the column `name` of the inputs."""
     return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
 
 
@@ -286,7 +286,7 @@ def column_with_play(c: FloatArray, theta: FloatArray, table: RunTable) -> Float
 
 
 def _moves_both_ways(values: FloatArray, table: RunTable) -> bool:
-    """Return whether a column rises and falls, each from at least 2 % of the rows to the next."""
+    """Return whether a column both rises and falls, each at more than 2 % of the steps from row to row."""
     moves = np.concatenate([np.diff(values[rows]) for rows in table.rows_by_scan()])
     if not moves.size:
         return False

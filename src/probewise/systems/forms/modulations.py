@@ -1,4 +1,4 @@
-"""Variation over the rows: drift, step, per run, wave, or in proportion to a column."""
+"""Variations of a quantity over the rows: drift, step, per run, wave, or in proportion to a column."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _single_entry_bank(size: float) -> FloatArray:
 
 
 def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
-    """Return a linear drift in time as recorded: a t, with t from `time_origin`."""
+    """Return a linear drift a t, with recorded time t from `time_origin`: 0, or the first time if far from 0."""
     origin = time_origin(table)
     return Modulation(
         at_rows=lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
@@ -147,17 +147,17 @@ def trial_frequencies(
 
 
 def max_n_trial_frequencies(n_points: int) -> int:
-    """Return how many trial frequencies of a form a law can afford; it is solved for the sine and cosine of each."""
+    """Return the affordable number of trial frequencies of a form of a law: 64 to 1,024, fewer for more rows."""
     return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, _MOST_FREQUENCIES))
 
 
 def frequency_prior(frequencies: FloatArray) -> LogUniform:
-    """Return the prior of a frequency: the range of the trial ones, and a little beyond."""
+    """Return the log-uniform prior of a frequency: over the trial frequencies and a little beyond."""
     return LogUniform(float(0.9 * frequencies[0]), float(frequencies[-1] * 1.02))
 
 
 def sinusoid_modulation(table: RunTable, time_unit: str) -> Modulation:
-    """Return a sinusoid in time: a sin(2 pi hz t + phase), with t from `time_origin`."""
+    """Return a sinusoid in time: a sin(2 pi hz t + phase), hz per unit of time, t from `time_origin`."""
     origin = time_origin(table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan())
 

@@ -1,4 +1,4 @@
-"""Origins from which times and columns are counted, and numbers rounded no coarser than the spread about them."""
+"""Origins from which times and columns are counted, and numbers rounded finely against a spread."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _ALL = 17  # digits of a number in double precision
 def origin_of_column(values: FloatArray) -> float:
     """Return the origin from which an effect counts a column, (n_points,), in its unit: 0 unless that is far away.
 
-    Where all its values are more than ten of its ranges from 0, as times in seconds of the epoch are, the origin is the
-    least of them. Counted from 0, a drift would be a constant, and a phase would turn with the last digit of a
+    Where all values are more than ten times the column's range from 0, as times in seconds of the epoch are, the origin
+    is the least of them. Counted from 0, a drift would be a constant, and a phase would turn with the last digit of a
     frequency.
     """
     least = float(np.nanmin(values))
@@ -25,20 +25,20 @@ def origin_of_column(values: FloatArray) -> float:
 
 
 def time_origin(table: RunTable) -> float:
-    """Return the origin from which drifts and waves count the time of a recording, as `origin_of_column` does.
+    """Return the origin from which drifts and waves count the time of a recording: `origin_of_column` of the times.
 
-    Effects keep the origin of the recording that they are bound about, for whatever table they predict.
+    Effects keep the origin of the recording to which they were bound, whatever table they predict.
     """
     return origin_of_column(table.time_s)
 
 
 def origin_in_words(name: str | None, origin: float, unit: str = "") -> str:
-    """Return from where an effect counts the column `name`, "" for 0."""
+    """Return a phrase on the origin from which an effect counts the column `name`; "" for 0."""
     return f"{name} counts from {origin:.12g} {unit}".rstrip() if origin else ""
 
 
 def rounded_to_spread(value: float, spread: float, least: int) -> float:
-    """Return a number rounded to `least` digits, or to more if that would move it by a twentieth of the spread."""
+    """Round a number to `least` significant digits, or to more if that would move it by a twentieth of the spread."""
     return float(text_rounded_to_spread(value, spread, least))
 
 

@@ -15,7 +15,7 @@ from probewise.systems.forms.readings import modulated_form
 
 
 def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
-    """Yield a form for each way in which a parameter may vary: drift, step, per run, with a column."""
+    """Yield a form for each way in which a parameter may vary: drift, step, one value per run, with a column."""
     system, table = about.system, about.table
     own = system.simulator
     values = system.parameters(about.theta, table)

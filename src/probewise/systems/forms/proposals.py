@@ -31,7 +31,7 @@ _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter
 
 @dataclass(frozen=True)
 class _ScaledVariable:
-    """A column, a state or the reading in a formula: minus `middle`, over `scale`."""
+    """A column, a state or the reading `name`, which a term takes as (value - middle) / scale."""
 
     name: str
     middle: float
@@ -50,7 +50,7 @@ class _ScaledVariable:
 
 @dataclass(frozen=True)
 class _Term:
-    """A function of scaled variables, over `scale`; `text` is its formula without the amplitude."""
+    """A function of scaled variables, divided by `scale`; `text` is its formula without the amplitude."""
 
     text: str
     variables: tuple[_ScaledVariable, ...]
@@ -62,7 +62,7 @@ class _Term:
 
 
 def formula_forms(about: ReferenceFit) -> Iterator[Form]:
-    """Yield a form for each term that could be added to the reading or to the rate of a state."""
+    """Yield all proposals: terms of the reading or of a state's rate, thresholds, and shapes in time or of a column."""
     yield from _reading_formula_forms(about)
     columns = _varying_columns_by_name(about)
     for name in columns:
@@ -97,7 +97,7 @@ def _terms_of_variables(variables: list[_ScaledVariable]) -> Iterator[_Term]:
 
 
 def _varying_columns_by_name(about: ReferenceFit) -> dict[str, FloatArray]:
-    """Return the covariates that vary and are never missing, without the reading and its declared sd."""
+    """Return the columns of numbers that vary and are never missing, except the reading and its declared sd."""
     own = about.system.simulator
     kept = {c: v for c, v in about.table.covariates.items() if c not in (own.reading, own.noise.sd)}
     return {c: v for c, v in kept.items() if np.isfinite(v).all() and np.ptp(v) > 0}
@@ -130,7 +130,7 @@ def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
-    """Yield a shift of the reading where a column is above an unknown threshold."""
+    """Yield a shift of the reading where a column, of three values or more, exceeds an unknown threshold."""
     own, values = about.system.simulator, np.unique(about.table.covariates[name])
     if len(values) <= 2:
         return
@@ -164,7 +164,7 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
 
 
 def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
-    """Yield terms of a state's rate that grow with its distance beyond a threshold, either way: a stop, a spring."""
+    """Yield terms `a max(state - at, 0)` and `a max(at - state, 0)` of a state's rate, as of a stop or a spring."""
     values = about.states[state]
     low, high = float(values.min()), float(values.max())
     if not low < high:
@@ -220,7 +220,7 @@ def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
 
 
 def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
-    """Add a term's values at the rows to `known` unless constant or a duplicate; return whether it was added."""
+    """Append a term's centred values at the rows to `known`, unless constant or collinear; return whether it was."""
     centred = shape - shape.mean()
     size = float(np.linalg.norm(centred))
     if not np.isfinite(size) or size <= 1e-9 * float(np.linalg.norm(shape)):
@@ -233,7 +233,7 @@ def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
 
 
 def _covariate_name_of_variable(about: ReferenceFit, side: str, name: str) -> str:
-    """Return the name of the covariate that a variable of a term is."""
+    """Return the covariate along which a term's variable shows: "level", "time", a state's or a column's."""
     reading = about.system.simulator.reading
     if name in about.states and (side == "rate" or name == reading):
         return f"state:{name}"

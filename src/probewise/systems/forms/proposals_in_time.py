@@ -26,7 +26,7 @@ _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart
 
 
 def formula_forms_in_time(about: ReferenceFit) -> Iterator[Form]:
-    """Yield the proposals that add to the reading along time."""
+    """Yield proposals of a change of the reading in time: square wave, swept wave, two settlings."""
     yield from _square_wave_form(about)
     yield from _swept_wave_form(about)
     yield from _double_settling_form(about)
@@ -77,7 +77,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
-    """Yield a sinusoid whose frequency rises or falls steadily along the recording, by a machine that runs up, say."""
+    """Yield a sinusoid in the reading whose frequency rises or falls linearly along the recording."""
     own, table = about.system.simulator, about.table
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
     begin, end = float(table.time_s.min()), float(table.time_s.max())

@@ -1,4 +1,4 @@
-"""Proposals of a column: an influence that varies with the reading, a dose. They count as out of vocabulary."""
+"""Proposals of a column: an influence that varies with the reading, or by dose. They count as out of vocabulary."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the 
 
 
 def formula_forms_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
-    """Yield proposals of what each column could add to the reading, together with the reading or with its own past."""
+    """Yield proposals that add to the reading: each column's influence, varying with the reading, and its dose."""
     for name, values in columns.items():
         yield from _varying_influence_form(about, name, values)
         yield from _dose_forms(about, name, values)
 
 
 def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
-    """Yield a column's influence on the reading, its coefficient a quadratic function of the reading."""
+    """Yield a form in which a column adds to the reading, by a coefficient quadratic in the reading."""
     own, level = about.system.simulator, about.predicted
     middle, half = 0.5 * float(level.max() + level.min()), 0.5 * float(np.ptp(level))
     centre, spread = float(np.mean(values)), float(np.std(values))
@@ -66,7 +66,7 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
 
 
 def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
-    """Yield a change of the reading that saturates with the column's integral (dose) since the start of the run."""
+    """Yield changes of the reading that saturate with a dose: the integral of |column - mean|, or |column|."""
     own, table = about.system.simulator, about.table
     spread = float(np.std(values))
     centre = rounded_to_spread(float(np.mean(values)), spread, 6)

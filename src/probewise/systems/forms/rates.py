@@ -151,7 +151,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
 
 
 def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator[Form]:
-    """Yield a bound of a state: the rate beyond it is lost, or a state downstream takes up a share (overflow)."""
+    """Yield a bound of a state: the rate beyond it is lost, or a state that it drives takes up a share (overflow)."""
     ends = clipping_levels(float(np.nanmin(values)), float(np.nanmax(values)))
     if ends is None:
         return
@@ -212,7 +212,7 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
 
 
 def _spilling_in_words(others: Sequence[str], mean: FloatArray, sd: FloatArray) -> str:
-    """Return a phrase on the states that take up what a bound stops; their shares follow its level in `mean`."""
+    """Return a phrase on the states that take up what a bound stops; `mean` holds its level, then their shares."""
     return "".join(
         f"; {other} takes up {mean_with_sd(mean[k], sd[k], '')} of the rest"
         for k, other in enumerate(others, 1)
@@ -221,7 +221,7 @@ def _spilling_in_words(others: Sequence[str], mean: FloatArray, sd: FloatArray) 
 
 
 def _rms_rate(about: ReferenceFit, state: str) -> float:
-    """Return the rms rate of a state, from its values at the rows."""
+    """Return the rms rate of a state, by differences from row to row; 1 if that is 0."""
     values, time = about.states[state], about.table.time_s
     rates = []
     for rows in about.table.rows_by_scan():

@@ -29,7 +29,7 @@ def modulated_form(
     unit: str,
     covariates: tuple[str, ...] = (),
 ) -> Iterator[Form]:
-    """Yield the form in which the quantity that `act` changes varies by `how`; none if the readings do not change."""
+    """Yield the form by which a quantity varies over the rows as `how`, applied by `act`; none if without effect."""
     entries = how.entries(guess)
     typical = about.typical_amplitude(stage, act, entries, guess)
     if typical is not None and np.isfinite(typical) and typical > 0:
@@ -109,7 +109,7 @@ def time_since_start_of_run(table: RunTable) -> FloatArray:
 
 
 def settling_time_prior(about: ReferenceFit) -> LogUniform:
-    """Return the prior of a time constant of settling, from half a gap between rows to twice the longest run.
+    """Return the log-uniform prior of a settling time constant, from half a gap between rows to twice the longest run.
 
     It begins at a hundredth of the longest run if that is less.
     """
@@ -200,7 +200,7 @@ def _delay_form(about: ReferenceFit) -> Iterator[Form]:
 
 
 def delayed_values(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Return readings or a column, (n_points,) or (n_samples, n_points), delayed by theta[:, 0] within each run."""
+    """Return readings or a column, (n_points,) or (n_samples, n_points), delayed within runs by theta[:, 0]."""
     values = np.atleast_2d(values)
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
@@ -209,7 +209,7 @@ def delayed_values(values: FloatArray, theta: FloatArray, table: RunTable) -> Fl
 
 
 def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
-    """Interpolate values (1 or n_samples, n) at times (n,) linearly to times earlier by `by` (n_samples,).
+    """Interpolate values (1 or n_samples, n), given at times (n,), at times earlier by `by`: (n_samples, n).
 
     Before the first time, the first value holds.
     """
@@ -227,7 +227,7 @@ def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray
 def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
     """Return the sign of the change from the previous row of the run, (n_samples, n_points).
 
-    Where values do not change it is the sign before; before the first change of a run, the sign of that.
+    Where values do not change, the sign of the last change holds; before a run's first change, the sign of that one.
     """
     out = np.zeros_like(values)
     for rows in table.rows_by_scan():

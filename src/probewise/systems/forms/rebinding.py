@@ -24,9 +24,9 @@ _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_r
 
 @dataclass(frozen=True, eq=False)
 class StoredFit:
-    """What rebinding needs of a reference fit: its table, and its predicted readings and states, (n_points,).
+    """The part of a reference fit that rebinding needs: its table, and predicted readings and states, (n_points,) each.
 
-    `held` are the columns that the model holds from row to row.
+    `held` are the columns that the model holds constant from row to row.
     """
 
     table: RunTable
@@ -37,7 +37,7 @@ class StoredFit:
 
 @dataclass(frozen=True, eq=False)
 class _StoredReferenceFit(ReferenceFit):
-    """A reference fit known by its recorded predictions: nothing is simulated; sizes (for priors) are arbitrary."""
+    """A reference fit known by its stored predictions: nothing is simulated; sizes, for priors only, are arbitrary."""
 
     known: StoredFit | None = None
 
@@ -70,7 +70,7 @@ class _StoredReferenceFit(ReferenceFit):
 
 
 def extract_stored_fit(about: ReferenceFit) -> StoredFit:
-    """Return what rebinding the forms of a reference fit needs of it."""
+    """Return the part of a reference fit from which its forms can be bound again."""
     held = tuple(name for name in driving_columns(about) if about.is_held_between_rows(name))
     return StoredFit(about.table, about.predicted, about.states, held)
 
@@ -78,7 +78,7 @@ def extract_stored_fit(about: ReferenceFit) -> StoredFit:
 def rebind_forms(
     names: Iterable[str], simulator: Simulator, known: StoredFit, *, more_runs: Iterable[str] = ()
 ) -> dict[str, Form]:
-    """Rebind forms about a recording, by name; names of other effects are left out.
+    """Bind the forms of these names to a recording again; return them by name, without names of other effects.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def rebind_forms(
     simulator
         The simulator.
     known
-        The recording that they were bound about.
+        The recording, and the predictions of the fit, to which they were bound.
     more_runs
         Runs outside the recording, for which forms with one value per run also get a value.
 
@@ -112,12 +112,12 @@ def rebind_forms(
 
 
 def counts_from_far_origin(names: Iterable[str], simulator: Simulator, known: StoredFit) -> bool:
-    """Return whether any of these forms counts a time or a column of the recording from elsewhere than 0."""
+    """Return whether any of these forms counts a time or a column of the recording from an origin other than 0."""
     return any(form.counted_from for form in _bind_wanted_forms(list(names), simulator, known).values())
 
 
 def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit) -> dict[str, Form]:
-    """Bind those forms and proposals about a recording that are wanted, and that this version has, by name."""
+    """Bind the forms and proposals of the `wanted` names to a recording; leave out those that this version lacks."""
     if not wanted:
         return {}
     system = System(simulator, known.table.scan_names)
@@ -129,7 +129,7 @@ def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit
 
 
 def has_value_per_run(name: str) -> bool:
-    """Return whether a form has one value per run."""
+    """Return whether the effect of this name has one value per run."""
     return name.partition(":")[0] in _WITH_VALUE_PER_RUN
 
 

@@ -28,8 +28,8 @@ _OFTEN = 0.1
 class MeterStop(NoiseEffect):
     """Saturation of a meter at `level`, after the noise: its readings there are exactly equal.
 
-    Readings at the stop are left out of the fit, so that the noise model does not change. In the stored model it is
-    the form `saturation` of the reading.
+    Readings at the stop are left out of the fit, so that the noise model does not change. In the stored model, the stop
+    is the form `saturation` of the reading.
     """
 
     level: float
@@ -46,7 +46,7 @@ class MeterStop(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return None: it is built where readings show it."""
+        """Return None: readings alone show a stop; see `find_meter_stop_and_mask`."""
         return None
 
     @property
@@ -65,21 +65,22 @@ class MeterStop(NoiseEffect):
         return value
 
     def change_of_readings(self, predicted: FloatArray) -> FloatArray:
-        """Return the change of the readings by the stop, for predictions without it, any shape."""
+        """Return the change of predicted readings, of any shape, by the stop: 0 or level - predicted."""
         beyond = np.maximum if self.is_ceiling else np.minimum
         return -beyond(predicted - self.level, 0.0)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Return a sentence on the level at which the readings end."""
+        """Return a sentence on the level at which the readings end; mean and sd are not used."""
         way = "rises" if self.is_ceiling else "falls"
         return f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip() + ", where the meter stops"
 
 
 def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading") -> tuple[MeterStop, BoolArray] | None:
-    """Find an extreme value that readings repeat exactly, and the mask of the rows at it, (n_points,).
+    """Find a stop at the largest or smallest reading; return it and the mask of the rows there, (n_points,), or None.
 
-    Noise makes successive readings differ, unless the meter saturates after the noise. None if no extreme value is
-    repeated in succession, if rounding is too coarse to tell, or if that end of the range was declared.
+    At least eight readings, five of them in succession, must equal that reading exactly: noise makes readings differ,
+    unless the meter saturates after the noise. None also if rounding is too coarse to tell, or if that end was
+    declared.
     """
     usable = np.flatnonzero(recording.usable)
     readings, scan = recording.readings[usable], recording.plan.scan[usable]

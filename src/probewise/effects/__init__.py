@@ -106,12 +106,12 @@ AGAIN = "~again"
 
 
 def name_without_copy_suffix(name: str) -> str:
-    """Return the vocabulary's name of an effect, without the suffix of a second copy."""
+    """Return an effect's name without the suffix of a second copy, "~again"."""
     return name.removesuffix(AGAIN)
 
 
 def spoken_name(name: str) -> str:
-    """Return an effect's name with spaces for underscores; unchanged if it names a user's target ("drifts:k_1")."""
+    """Return an effect's name without a copy's suffix; spaces for underscores, unless with a target ("drifts:a_1")."""
     own = name_without_copy_suffix(name)
     return own if ":" in own else own.replace("_", " ")
 

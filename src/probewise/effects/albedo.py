@@ -46,7 +46,7 @@ class AlbedoGradient(CountsPlaceFromOrigin, LinearEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical slope to 2 % over the longest scan."""
+        """Return the effect with a typical slope of 2 % over the length of the longest scan."""
         return cls(typical_per_mm=0.02 / extent.length_mm, origin=extent.origin)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
@@ -76,7 +76,7 @@ class AlbedoPatch(PatchEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search along the straight scans; None where there are none."""
+        """Return the effect with a bank on the straight scans; None without any."""
         lines = distinct_scan_lines(extent.plan)
         return cls(line=lines[0], lines=lines) if lines else None
 
@@ -112,7 +112,7 @@ class RegionWithGradient:
         return self.region.albedo(points_mm) * self._albedo_factor_at_points(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over pixels, with the gradient's value at their centres: (n_regions, n_points)."""
+        """Return the mean albedo over pixels, the gradient taken at their centres: (n_regions, n_points)."""
         return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._albedo_factor_at_points(centers_mm)
 
     def _albedo_factor_at_points(self, points_mm: FloatArray) -> FloatArray:
@@ -121,9 +121,10 @@ class RegionWithGradient:
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Return the mean albedo under each Gaussian, by Stein's lemma.
+    """Return the mean albedo under each Gaussian, (n_samples, n_points), by Stein's lemma.
 
-    It is the gradient's factor at the centre times the region's mean albedo, plus a central difference of the latter.
+    The mean is the gradient's factor at the centre times the region's mean albedo, plus a central difference of the
+    region's mean along the gradient.
     """
     a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
     x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
@@ -158,7 +159,7 @@ class RegionWithPatch:
         return self.region.albedo(points_mm) + self._added_albedo(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over pixels, with the patch's value at their centres: (n_regions, n_points)."""
+        """Return the mean albedo over pixels, the patch taken at their centres: (n_regions, n_points)."""
         return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added_albedo(centers_mm)
 
     def _added_albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -179,7 +180,7 @@ def _mean_albedo_with_patch(region: RegionWithPatch, gaussian: LabGaussian, n_no
 
 
 def _regions_with_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
-    """Return the regions, by pattern, that lie under at least one reading."""
+    """Return the regions over which at least one reading is taken, by the pattern's name."""
     return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
 
 
@@ -188,5 +189,5 @@ def _regions_with_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
 def _distance_to_unchanged_edge(
     region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
 ) -> FloatArray:
-    """Return the distance of points from the nearest edge of the region itself, which the effect leaves in place."""
+    """Return the distance of points from the nearest edge of the region, which the effect leaves in place, mm."""
     return edge_distance(region.region, x_mm, y_mm)

@@ -31,7 +31,7 @@ class OrientationError(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scale: three degrees are typical of a mount set by eye."""
+        """Return the effect with its default scale: three degrees are typical of a mount set by eye."""
         return cls()
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -60,7 +60,7 @@ class ScanAngleError(ScanGroupEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take each mounting and each scan as a candidate; None for a single scan."""
+        """Return the effect with each mounting and each scan as a candidate; None for a single scan."""
         choices = candidate_scan_groups(extent.plan)
         return cls(choices=choices) if choices else None
 

@@ -39,23 +39,23 @@ class ChangePointEffect(NamedEffect[V]):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """Indices of all parameters but the time."""
+        """Indices of all parameters but the last, the time."""
         return tuple(range(len(self.typical_sizes)))
 
     @cached_property
     def prior(self) -> Product:
-        """Prior of amplitudes, of either sign, and time, uniform over the recording or between two chosen readings."""
+        """Prior of the amplitudes, heavy-tailed with either sign, and of the time, uniform in `change_interval_s`."""
         sizes = {name: HeavyTailedPrior(size) for name, size in self.typical_sizes.items()}
         return Product({**sizes, "at_s": Uniform(*self.change_interval_s)})
 
     def bank(self) -> FloatArray:
-        """Return one entry, (1, n_amplitudes, n_params): a column for each amplitude, the time amid its interval."""
+        """Return one entry, (1, n_amplitudes, n_params): a column per amplitude, the time amid its interval."""
         sizes = np.diag(list(self.typical_sizes.values()))
         return np.column_stack([sizes, np.full(len(sizes), sum(self.change_interval_s) / 2)])[None, :, :]
 
     @property
     def change_interval_s(self) -> tuple[float, float]:
-        """Bounds of the interval in which the change point may lie, s."""
+        """Bounds of the interval in which the change point may lie, s: `between_s`, else the whole recording."""
         return self.between_s or (self.times_s[0], self.times_s[-1])
 
     @staticmethod
@@ -64,7 +64,7 @@ class ChangePointEffect(NamedEffect[V]):
         return np.asarray(plan.time_s > theta[:, -1:])
 
     def variants(self) -> tuple[Self, ...]:
-        """Return one variant for each pair of consecutive readings."""
+        """Return one variant for each interval between consecutive `times_s`."""
         return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
 
     def with_fewer_variants(self) -> Self:
@@ -73,9 +73,9 @@ class ChangePointEffect(NamedEffect[V]):
         return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
 
     def variant_masks(self, plan: Plan) -> VariantMasks:
-        """Return the masks of the readings after each candidate change point, and a bank entry that acts on all.
+        """Return the masks of readings after each candidate change point, (n_intervals, n_points).
 
-        A candidate is put at the middle of its interval.
+        A candidate is the middle of its interval. The bank entry beside the masks acts on all readings.
         """
         always = self.bank()[0]
         always[:, -1] = -np.inf
@@ -94,7 +94,7 @@ class ChangePointEffect(NamedEffect[V]):
 
 
 def candidate_change_times_s(extent: Extent) -> tuple[float, ...] | None:
-    """Return the times of a recording's readings, thinned to at most 512 intervals; None where there is only one."""
+    """Return the distinct times of a recording's readings, thinned to at most 512 intervals; None for one time."""
     times = np.unique(extent.plan.time_s)
     if len(times) < 2:
         return None

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 
 
 def log_gaussian_density(readings: FloatArray, mean: FloatArray | float, sd: FloatArray | float) -> FloatArray:
-    """Return the natural log of the normal density, per unit of the reading; the arrays broadcast."""
+    """Return the natural log of the normal density of readings, per unit of the reading; the arrays broadcast."""
     z = (readings - mean) / sd
     return np.asarray(-0.5 * z * z - np.log(sd) - 0.5 * math.log(2 * math.pi))
 
@@ -32,6 +32,6 @@ def log_rounding_cell_density(
 
 
 def log_gaussian_mass_between(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the log of a standard normal's mass from `low` to `high`; inexact where both lie far in the upper tail."""
+    """Return the natural log of a standard normal's mass from `low` to `high`; inexact if both are far above 0."""
     log_low, log_high = log_ndtr(low), log_ndtr(high)
     return np.asarray(log_high + np.log(-np.expm1(np.minimum(log_low - log_high, -1e-15))))

@@ -42,7 +42,7 @@ class EdgeBlur(LinearEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical sd to 2 % of the length of the longest scan."""
+        """Return the effect with a typical sd of 2 % of the length of the longest scan."""
         return cls(typical_mm=0.02 * extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
@@ -55,7 +55,7 @@ class EdgeBlur(LinearEffect[Footprint]):
         return ratio is None or float(np.ptp(ratio)) == 0.0
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Return the sd, (1,), with its square scaled by the fitted amount."""
+        """Return a starting sd, (1,): the entry's, its square scaled by the fitted amount."""
         return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -64,10 +64,7 @@ class EdgeBlur(LinearEffect[Footprint]):
 
 @dataclass(frozen=True)
 class Halo(NamedEffect[Footprint]):
-    """Light scattered in the lens: a share of it comes from a Gaussian of sd r_mm about the footprint's centre.
-
-    It adds this Gaussian to the footprint's mixture.
-    """
+    """Light scattered in the lens: `share` of the footprint becomes one more Gaussian, of sd r_mm about its centre."""
 
     least_share: float = 1e-3
     narrowest_mm: float = 10.0
@@ -81,7 +78,7 @@ class Halo(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search radii from a tenth of the length of the longest scan to all of it."""
+        """Return the effect with radii from a tenth of the length of the longest scan to all of it."""
         return cls(narrowest_mm=0.1 * extent.length_mm, widest_mm=extent.length_mm)
 
     @cached_property
@@ -143,7 +140,7 @@ class EdgeShadow(NamedEffect[View]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search widths from a hundredth to a third of the length of the longest scan.
+        """Return the effect with widths from a hundredth to a third of the length of the longest scan.
 
         Raised edges may belong to all kinds of pattern, to one kind, or to all kinds but one.
         """
@@ -189,7 +186,7 @@ class EdgeShadow(NamedEffect[View]):
 
 
 def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
-    """Return the names of the plan's patterns that have edges, one group for each kind of pattern."""
+    """Return the names of patterns with edges under readings, one group for each type of pattern."""
     kinds: dict[type, list[str]] = {}
     for name, _ in plan.rows_by_pattern():
         if isinstance(pattern := plan.patterns.get(name), HalfPlane | Quadrant | Disc | Polygon | Stripes):

@@ -15,7 +15,7 @@ from probewise.recordings.plan import Plan, Recording
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """Scales of a recording: the range of its readings, and its plan.
+    """Scales of a recording, from the range of its usable readings and from its plan.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Extent:
 
     @property
     def reading_unit(self) -> str:
-        """Unit of a reading, as it is written after a number."""
+        """Unit of a reading, as written after a number."""
         return self.plan.instrumentation.unit_after_number
 
     unit = reading_unit  # its earlier name
@@ -68,7 +68,7 @@ class Extent:
 
     @cached_property
     def length_mm(self) -> float:
-        """Diagonal of the X and Y ranges of the longest scan, mm; 1 where nothing moves."""
+        """Diagonal of the X and Y ranges of the longest scan, mm; 1 if nothing moves."""
         plan = self.plan
         ends = [(plan.x_mm[rows], plan.y_mm[rows]) for rows in plan.rows_by_scan() if rows.size]
         return max(float(np.hypot(np.ptp(x), np.ptp(y))) for x, y in ends) or 1.0

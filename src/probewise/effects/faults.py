@@ -21,7 +21,7 @@ _FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
 
 @dataclass(frozen=True)
 class Outliers(NoiseEffect):
-    """A heavy tail: with probability `share` a reading's noise is `size` times as wide."""
+    """A heavy tail: with probability `share`, a reading's noise is `size` times as wide (sd)."""
 
     name = "outliers"
     words = "outlying readings"
@@ -67,7 +67,7 @@ class Dropouts(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Allow values from 1 % below the range of the readings to 1 % above, and note the declared range's ends."""
+        """Return the effect with values within the readings' range, 1 % wider each way, and with the declared ends."""
         low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
         return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.reading_unit)
 
@@ -83,7 +83,7 @@ class Dropouts(NoiseEffect):
         return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
 
     def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
-        """Return the commonest outlying value with each of twelve shares, (12, 2).
+        """Return twelve pairs (share, value), (12, 2), with the commonest value of readings beyond four noise sds.
 
         There is no node, (0, 2), unless an outlying value occurs twice or is an end of the declared range.
         """

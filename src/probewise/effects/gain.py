@@ -24,7 +24,7 @@ _REFERENCE_MV = 8000.0
 
 @dataclass(frozen=True)
 class GainDrift(CountsTimeFromOrigin, NamedEffect[FloatArray]):
-    """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since `origin`."""
+    """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since `origin`, 0 before it."""
 
     typical: float = 0.02
     shortest_s: float = 5.0
@@ -38,7 +38,7 @@ class GainDrift(CountsTimeFromOrigin, NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search time constants from a hundredth of the recording's duration to twice the duration."""
+        """Return the effect with time constants from a hundredth of the recording's duration to twice the duration."""
         duration_s = extent.duration_s
         return cls(shortest_s=0.01 * duration_s, longest_s=2 * duration_s, origin=extent.origin)
 
@@ -81,7 +81,7 @@ class BatterySag(LinearEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical change to 2 % over the recorded voltages; None where there are none or they do not vary."""
+        """Set the typical change to 2 % over the recorded voltages; None if there are none or all are equal."""
         above = _volts_above_reference(extent.plan)
         fall = float(np.ptp(above))
         return cls(typical_per_volt=0.02 / fall) if fall > 0 else None
@@ -98,6 +98,6 @@ class BatterySag(LinearEffect[FloatArray]):
 
 
 def _volts_above_reference(plan: Plan) -> FloatArray:
-    """Return the battery voltage minus V0, 0 where it is not recorded, (n_points,)."""
+    """Return the battery voltage minus V0 in V, (n_points,); 0 where none is recorded."""
     millivolts = plan.covariates.get(_BATTERY, np.full(len(plan), _REFERENCE_MV))
     return np.where(np.isfinite(millivolts), (millivolts - _REFERENCE_MV) / 1000, 0.0)

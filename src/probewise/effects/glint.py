@@ -31,7 +31,7 @@ class Glint(PatchEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical height to 2 % of the readings' range; search along straight scans, None without any."""
+        """Set the typical height to 2 % of the readings' range, and the bank on straight scans; None without any."""
         lines = distinct_scan_lines(extent.plan)
         return cls(0.02 * extent.span, lines[0], lines, unit=extent.reading_unit) if lines else None
 

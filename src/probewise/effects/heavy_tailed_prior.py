@@ -101,7 +101,7 @@ class _QuantileTable:
 
 
 def _relative_component_sds(smallest: float, largest: float) -> FloatArray:
-    """Return the sds of the mixture, in typical sizes."""
+    """Return the sds of the mixture's components, in typical sizes: evenly spaced in their logarithm."""
     decades = math.log(largest / SMALLEST_AND_LARGEST[1]) / math.log(SMALLEST_AND_LARGEST[1] / SMALLEST_AND_LARGEST[0])
     return np.asarray(np.geomspace(smallest, largest, _N_SCALES + max(math.ceil((_N_SCALES - 1) * decades), 0)))
 

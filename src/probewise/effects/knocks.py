@@ -70,7 +70,7 @@ class GainStep(ChangePointEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search all times between readings; None if all readings share one time."""
+        """Return the effect with a change between any two readings; None if all readings share one time."""
         times = candidate_change_times_s(extent)
         return None if times is None else cls(times)
 

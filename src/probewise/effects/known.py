@@ -19,10 +19,7 @@ V = TypeVar("V")
 
 @dataclass(frozen=True)
 class Known(WrappedEffect[V]):
-    """An effect with fixed parameters, so that the robot can use a repaired sensor like any other.
-
-    `values` are in the order of `effect.prior.names`.
-    """
+    """An effect with fixed parameters, none of them free; `values` are in the order of `effect.prior.names`."""
 
     effect: Effect[V]
     values: tuple[float, ...]
@@ -42,7 +39,7 @@ class Known(WrappedEffect[V]):
 
 @dataclass(frozen=True)
 class Informed(WrappedEffect[V]):
-    """An effect with the prior `own`, from earlier knowledge of its parameters, in place of its usual one."""
+    """An effect with the prior `own`, from earlier knowledge of its parameters, in place of the usual prior."""
 
     effect: Effect[V]
     own: Prior
@@ -54,7 +51,7 @@ class Informed(WrappedEffect[V]):
 
 @dataclass(frozen=True)
 class Estimated(Known[V]):
-    """An effect fixed at an estimate of its parameters, with their uncertainty.
+    """An effect fixed at an estimate of its parameters, which also holds their uncertainty.
 
     `marginals` are the distributions of the parameters, in the order of `values`. A run that trusts its sensor uses the
     values; one that doubts it infers the parameters along with the shape (`informed`).
@@ -69,5 +66,5 @@ class Estimated(Known[V]):
 
     @property
     def informed(self) -> Informed[V]:
-        """The effect with free parameters again, these marginals as its prior."""
+        """The effect with free parameters again, and `marginals` as its prior."""
         return Informed(self.effect, Product(dict(zip(self.effect.prior.names, self.marginals, strict=True))))

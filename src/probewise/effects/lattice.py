@@ -40,7 +40,7 @@ class Quantisation(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search steps from a thousandth to a fifth of the readings' range; None where a step is declared."""
+        """Return the effect with steps from 0.1 to 20 % of the readings' range; None if a step is declared."""
         if extent.plan.instrumentation.step is not None:
             return None
         return cls(1e-3 * extent.span, 0.2 * extent.span, unit=extent.reading_unit)
@@ -53,7 +53,7 @@ class Quantisation(NoiseEffect):
         return replace(value, step=theta[:, :1])
 
     def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
-        """Return the step of the readings' lattice as the only node, (1, 1); (0, 1) where it is too fine to matter."""
+        """Return the step of the readings' lattice as the only node, (1, 1); (0, 1) for a step below 0.3 noise sds."""
         step = lattice_step(rows.predicted + rows.sd * residuals)
         return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
 
@@ -66,9 +66,9 @@ class Quantisation(NoiseEffect):
 def lattice_step(readings: FloatArray) -> float:
     """Find the step of a lattice that holds all readings; 0 where there is none.
 
-    It is 0 also for a step below 1e-5 of the range, and for fewer than three distinct readings. Readings printed to
-    some digits lie on a lattice too; a coarser lattice is found through it, since printing moves each value by at most
-    half a digit.
+    The result is 0 also for a step below 1e-5 of the range, and for fewer than three distinct readings. Readings
+    printed to some digits lie on a lattice too; a coarser lattice is found through it, since printing moves each value
+    by at most half a digit.
     """
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 3:
@@ -81,7 +81,7 @@ def lattice_step(readings: FloatArray) -> float:
 def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
     """Estimate the sd of a lattice's step, as fitted to distinct readings that were printed to some digits.
 
-    It is the sd of the printing's rounding error over the norm of the readings' lattice numbers, centred; at least a
+    The result is the printing's rounding error (sd) over the norm of the readings' centred lattice numbers; at least a
     millionth of the step.
     """
     values = np.unique(readings[np.isfinite(readings)])
@@ -91,7 +91,7 @@ def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
 
 
 def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:
-    """Find the step of a lattice of rounded values, from the two closest outwards; 0 where there is none.
+    """Fit the step of a lattice to rounded values, from the two closest outwards; 0 if one of them is off the lattice.
 
     `rounding` is the full width of the rounding error of each value.
     """
@@ -113,7 +113,7 @@ def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:
 
 
 def _greatest_common_step(values: FloatArray, tolerance: float) -> float:
-    """Find the greatest common step of sorted values; 0 where it is below ten times the tolerance.
+    """Find the greatest step of which all gaps of sorted values are multiples; 0 if at most ten times the tolerance.
 
     Euclid's algorithm on their differences; a remainder below the tolerance counts as rounding.
     """

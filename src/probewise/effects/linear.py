@@ -48,9 +48,9 @@ class LinearEffect(NamedEffect[V]):
 
 @dataclass(frozen=True)
 class ScanGroupEffect(LinearEffect[V]):
-    """Base of linear effects on one scan, or on the scans of one mounting: which of them is a discrete choice.
+    """Base of linear effects on one scan, or on all scans of one mounting (orientation).
 
-    `scans` are the affected scans; `choices` are the candidate groups of scans.
+    `scans` are the affected scans, chosen among the groups of scans in `choices`.
     """
 
     scans: tuple[str, ...] = ()

@@ -19,7 +19,7 @@ from probewise.sensor.stages import SceneView, Stage
 
 @dataclass(frozen=True)
 class EdgeMisplacement(LinearEffect[SceneView]):
-    """Every pattern is shifted by offset_mm along its edge's normal, or along X where it has no single normal."""
+    """Every pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X (all others)."""
 
     typical_mm: float = 0.3
 
@@ -44,7 +44,7 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
 @dataclass(frozen=True)
 class ScanMisplacement(ScanGroupEffect[SceneView]):
-    """In one scan the pattern is shifted by offset_mm along its edge's normal, or along X where it has none."""
+    """In one scan the pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X."""
 
     typical_mm: float = 0.3
 

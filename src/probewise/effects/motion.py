@@ -9,7 +9,7 @@ from probewise.recordings.plan import Plan
 
 
 def sign_of_motion(plan: Plan) -> FloatArray:
-    """Return the sign of the last motion along X, or along Y where X did not move; 0 without motion, (n_points,)."""
+    """Return the sign of each reading's last motion, (n_points,): along X, or Y where X stays; 0 without motion."""
     along_x, along_y = np.sign(plan.direction_of_motion).T
     return np.asarray(np.where(along_x != 0, along_x, along_y))
 
@@ -26,9 +26,9 @@ def scan_indicator(plan: Plan, names: tuple[str, ...]) -> FloatArray:
 
 
 def orientation_deg(plan: Plan) -> FloatArray:
-    """Return the orientation of each reading to 1e-6 degrees, (n_points,); of those whole turns apart, the least.
+    """Return the orientation of each reading, rounded to 1e-6 degrees, (n_points,).
 
-    So 0 and 360 degrees are one orientation, and so are -180 and 180.
+    Orientations of the plan that differ by whole turns become the least of them: 0 and 360 degrees are both 0.
     """
     turned = np.degrees(plan.orientation_rad)
     # Rounded after the turns are taken off, since most decimals have another last digit a turn on; 359.9999999 is 0.
@@ -40,11 +40,11 @@ def orientation_deg(plan: Plan) -> FloatArray:
 
 
 def candidate_scan_groups(plan: Plan) -> tuple[tuple[str, ...], ...]:
-    """List candidate groups of scans: each mounting (the scans that share an orientation) and each single scan.
+    """List groups of scan names as candidates: each mounting (all scans of one orientation) and each single scan.
 
     Of several recordings that were joined, each mounting of each recording and each whole recording are candidates too:
-    who comes back later may have mounted the sensor anew, or may not. A group of all scans is left out, since nothing
-    remains to compare it with. A scan in which the sensor turns belongs to no mounting.
+    the sensor may have been mounted anew in between, or not. A group of all scans is left out, since nothing remains
+    for comparison. A scan in which the sensor turns belongs to no mounting.
     """
     turned_deg = orientation_deg(plan)
     sessions = plan.sessions or (0,) * len(plan.scan_names)

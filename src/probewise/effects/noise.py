@@ -78,8 +78,9 @@ class SignalDependentNoise(NoiseEffect):
 class DriftingNoise(NoiseEffect):
     """Noise whose sd grows or shrinks exponentially in time: sd x growth^(time / duration - 1/2).
 
-    It is outside the vocabulary: a nuisance that keeps the tests of the mean valid. Time counts from the first reading
-    to the last of the plan; no repaired model holds it, so that it never acts on another plan than the recording's.
+    The effect is outside the vocabulary: a nuisance that keeps the tests of the mean valid. Time counts from the first
+    reading to the last of the plan; no repaired model holds it, so that it never acts on another plan than the
+    recording's.
     """
 
     least: float = 0.2
@@ -142,7 +143,7 @@ _NEWTON_STEPS = 40
 
 @dataclass(frozen=True)
 class NoisePerRun(NoiseEffect):
-    """A noise sd of its own in each run: sd x the run's value; the logarithm of a value has a heavy-tailed prior.
+    """Noise that differs between runs: sd x the run's value, whose logarithm has a heavy-tailed prior.
 
     Parameters
     ----------
@@ -162,7 +163,7 @@ class NoisePerRun(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take the runs of a recording; None where there is only one."""
+        """Return the effect for the runs of a recording; None if there is only one."""
         plan = extent.plan
         names = tuple(plan.scan_names)
         return cls(names, tuple(np.bincount(plan.scan, minlength=len(names)).tolist())) if len(names) > 1 else None
@@ -194,7 +195,7 @@ class NoisePerRun(NoiseEffect):
     def weighed_nodes(self, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
         """Return the runs' most probable values, (n_nodes, n_runs), and log Laplace weights, (n_nodes,).
 
-        There is one node for each assumed sd, between runs, of the logs of the values.
+        There is one node for each of five assumed sds, between runs, of the values' logs; none for a single run.
         """
         n_runs = len(self.runs)
         counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)

@@ -50,7 +50,7 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
 
 @renamed_arguments(level="noise")
 def reading_variance(noise: NoiseParameters) -> FloatArray:
-    """Return the variance of a reading that is not lost, with outliers, random walk and rounding; it broadcasts."""
+    """Return the variance of a reading that is not lost, with outliers, random walk and rounding; arrays broadcast."""
     noise = _noise_with_walk_variance(noise)
     wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
     return np.asarray(noise.sd**2 * wide + noise.step**2 / 12)

@@ -36,8 +36,8 @@ class Origin:
     def of(cls, plan: Plan) -> Self:
         """Choose the origin for a recording by its plan, for each axis on its own.
 
-        It is 0 where the recording comes within ten of its own lengths of 0: its duration, or the diagonal of its
-        places. Farther away it is the first time, and the middle of the places.
+        The origin is 0 where the recording comes within ten of its own lengths of 0: its duration, or the diagonal of
+        its places. Farther away, the origin is the first time, and the middle of the places.
         """
         length_mm = float(np.hypot(np.ptp(plan.x_mm), np.ptp(plan.y_mm)))
 
@@ -61,7 +61,7 @@ class Origin:
 class CountsFromOrigin:
     """Base of effects whose formula holds the time or the place itself: they count from `origin`.
 
-    It belongs to the recording that is diagnosed, so that the effect means the same in any other plan.
+    The origin belongs to the recording that is diagnosed, so that the effect means the same in any other plan.
     """
 
     name: ClassVar[str]
@@ -69,7 +69,7 @@ class CountsFromOrigin:
 
     @property
     def counted_from(self) -> str:
-        """Say from where the effect counts; "" for 0."""
+        """Phrase on the origin from which the effect counts; "" for 0."""
         raise NotImplementedError
 
 
@@ -78,7 +78,7 @@ class CountsTimeFromOrigin(CountsFromOrigin):
 
     @property
     def counted_from(self) -> str:
-        """Say from which time the effect counts; "" for 0."""
+        """Phrase on the time from which the effect counts, s; "" for 0."""
         return f"time counts from {self.origin.time_s:.12g} s" if self.origin.time_s else ""
 
 
@@ -87,7 +87,7 @@ class CountsPlaceFromOrigin(CountsFromOrigin):
 
     @property
     def counted_from(self) -> str:
-        """Say from which place the effect counts; "" for (0, 0)."""
+        """Phrase on the place from which the effect counts, mm; "" for (0, 0)."""
         x_mm, y_mm = self.origin.x_mm, self.origin.y_mm
         return f"X and Y count from ({x_mm:g}, {y_mm:g}) mm" if x_mm or y_mm else ""
 
@@ -99,5 +99,5 @@ def origins_of(effects: Iterable[object]) -> dict[str, Origin]:
 
 
 def is_far_from_zero(values: FloatArray, length: float) -> bool:
-    """Return whether all values, (n_points,), lie more than ten lengths from 0; with length 0 none do."""
+    """Return whether all values, (n_points,), lie more than ten times `length` from 0; False for length 0."""
     return float(np.nanmin(np.abs(values))) > _FAR * length > 0.0

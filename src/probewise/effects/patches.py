@@ -34,7 +34,8 @@ def gaussian_bump(squared_distance: FloatArray, radius: FloatArray) -> FloatArra
 class ScanLine:
     """A line at `angle_rad` to X, `offset_mm` beside the origin, from `low_mm` to `high_mm` along it.
 
-    Its places are s t + offset_mm n, s from low_mm to high_mm; t is its unit vector, n is t turned by 90 degrees.
+    Its points are s t + offset_mm n, s from low_mm to high_mm; t is the unit vector along the line, n is t turned by 90
+    degrees.
     """
 
     angle_rad: float
@@ -48,12 +49,12 @@ class ScanLine:
         return self.high_mm - self.low_mm
 
     def lab_coordinates_mm(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return X and Y of places given by their position along the line and their distance from it; all broadcast."""
+        """Return X and Y of points given by their position along the line and distance from it; arrays broadcast."""
         c, s, n = np.cos(self.angle_rad), np.sin(self.angle_rad), self.offset_mm + beside_mm
         return c * along_mm - s * n, s * along_mm + c * n
 
     def line_coordinates_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the position along the line and the distance from it of places X, Y: `lab_coordinates_mm` inverted."""
+        """Return the position of points X, Y along the line, and their distance from it; arrays broadcast."""
         c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
         return c * x_mm + s * y_mm, c * y_mm - s * x_mm - self.offset_mm
 
@@ -63,7 +64,7 @@ ALONG_X = ScanLine(0.0, 0.0, -50.0, 50.0)
 
 
 def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
-    """Return the distinct lines of the straight scans of eight places or more."""
+    """Return the distinct lines of the plan's straight scans that have eight distinct places or more."""
     found: dict[tuple[float, float], ScanLine] = {}
     for rows in plan.rows_by_scan():
         places = np.unique(np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1), axis=0)
@@ -100,7 +101,7 @@ class PatchPrior:
 
     @property
     def radius_prior(self) -> LogUniform:
-        """Prior of the radius."""
+        """Log-uniform prior of the radius, mm: from 0.02 to 0.5 of the line's length."""
         return LogUniform(_RADII[0] / 2 * self.line.length_mm, _RADII[-1] * 2 * self.line.length_mm)
 
     @cached_property

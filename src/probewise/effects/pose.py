@@ -18,7 +18,7 @@ from probewise.sensor.stages import Poses, Stage
 
 @dataclass(frozen=True)
 class Backlash(LinearEffect[Poses]):
-    """Play in the gears: place = commanded place - (width_mm / 2) direction, on each axis.
+    """Play in the gears: position = commanded position - (width_mm / 2) d, d the sign of the last motion of each axis.
 
     The width is positive: the arm lags behind the motion, never ahead.
     """
@@ -72,7 +72,7 @@ class PositionScale(CountsPlaceFromOrigin, LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scale: 1 % is a typical error; a wrong wheel size makes tens of percent."""
+        """Return the effect with its default scale: 1 % is a typical error, a wrong wheel size makes tens of %."""
         return cls(origin=extent.origin)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:

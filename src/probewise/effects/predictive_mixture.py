@@ -74,6 +74,5 @@ class PredictiveMixture:
 
 
 def _noise_of_rows(noise: NoiseParameters, rows: BoolArray) -> NoiseParameters:
-    """Return the noise of some rows, given by their mask (n_points,)."""
     sd = noise.sd if noise.sd.shape[-1] == 1 else noise.sd[:, rows]
     return replace(noise, sd=sd, walked=noise.walked if len(noise.walked) == 1 else noise.walked[rows])

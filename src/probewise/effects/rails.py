@@ -41,7 +41,7 @@ class BentRails(CountsPlaceFromOrigin, LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical quadratic error to 0.5 % of the longest scan's length L, at X = L / 2 or 10 mm if more."""
+        """Set the typical quadratic error at X = max(L / 2, 10 mm) to 0.5 % of L, the length of the longest scan."""
         typical_mm = 0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2
         return cls(typical_mm=typical_mm, origin=extent.origin)
 
@@ -60,7 +60,7 @@ class BentRails(CountsPlaceFromOrigin, LinearEffect[Poses]):
 
 @dataclass(frozen=True)
 class MissingTooth(NamedEffect[Poses]):
-    """A jump at one place of an axis: beyond it all positions are off, X + amp_mm 1(X > at_mm), or along Y.
+    """A jump at one place of an axis, which shifts all positions beyond: X + amp_mm 1(X > at_mm), or likewise Y.
 
     `places_mm` are the recorded positions of each axis: between which two the jump lies (`between_mm`) is a discrete
     choice. `along` is 0 for X, 1 for Y.
@@ -85,7 +85,7 @@ class MissingTooth(NamedEffect[Poses]):
 
     @cached_property
     def prior(self) -> Product:
-        """Prior of the jump, of either sign, its place, and its axis: 0 for X, 1 for Y."""
+        """Prior of the jump (of either sign), of its place, and of its axis, near 0 for X or near 1 for Y."""
         axis = Uniform(self.along - 0.5, self.along + 0.5)
         return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "at_mm": Uniform(*self.between_mm), "axis": axis})
 

@@ -23,7 +23,7 @@ from probewise.sensor.stages import Stage
 class Hysteresis(LinearEffect[FloatArray]):
     """A reading that depends on the direction of motion: reading + amp d.
 
-    d is the sign of the last motion along X, or along Y where X did not change; 0 without motion.
+    d is the sign of the last motion along X, or along Y if X did not change; 0 without motion.
     """
 
     typical: float = 0.5
@@ -56,7 +56,7 @@ class Hysteresis(LinearEffect[FloatArray]):
 class Lag(NamedEffect[FloatArray]):
     """First-order lag of the electronics: v_k = a v_(k-1) + (1 - a) y_k with a = exp(-(t_k - t_(k-1)) / tau_s).
 
-    A reading after one of another scan has no lag.
+    Here y_k are the readings without lag. The first reading of a scan has no lag.
     """
 
     shortest_s: float = 0.2
@@ -75,7 +75,7 @@ class Lag(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search time constants from a sixth of the time between readings (a = 1/400) to thirty times it."""
+        """Return the effect with time constants from a sixth of the median time between readings to thirty times it."""
         return cls(shortest_s=extent.gap_s / 6, longest_s=30 * extent.gap_s)
 
     @cached_property

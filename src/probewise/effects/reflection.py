@@ -22,7 +22,7 @@ _ANGLES = 8
 
 @dataclass(frozen=True)
 class Reflection(NamedEffect[Footprint]):
-    """A share of the light comes from a copy of the footprint displaced by (dx_mm, dy_mm) in the lab frame."""
+    """`share` of the light comes from a copy of the footprint, displaced by (dx_mm, dy_mm) in the lab frame."""
 
     typical: float = 0.02
     farthest_mm: float = 20.0
@@ -35,7 +35,7 @@ class Reflection(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search displacements up to half the length of the longest scan, along X and along Y."""
+        """Return the effect with displacements up to half the length of the longest scan, along X and along Y."""
         return cls(farthest_mm=0.5 * extent.length_mm)
 
     @cached_property

@@ -39,12 +39,12 @@ class Saturation(NamedEffect[FloatArray]):
 
     @property
     def nothing(self) -> Mapping[int, float]:
-        """A level out of reach, at any softness."""
+        """A level out of reach, by the index of the level, for any softness."""
         return {0: self.highest + 100 * self.softest}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search levels from 20 % of the readings' range to 30 % above it: a soft limit acts below its level."""
+        """Return the effect with levels from 20 % up the readings' range to 30 % above its top."""
         return cls(
             lowest=extent.low + 0.2 * extent.span,
             highest=extent.high + 0.3 * extent.span,

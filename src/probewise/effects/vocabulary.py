@@ -55,14 +55,14 @@ class NamedEffect(Effect[V], Protocol[V]):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Columns of a plan that it reads besides place, time and scan; by default none."""
+        """Names of the plan's columns that it reads besides place, time and scan; by default none."""
         return ()
 
     @property
     def counted_from(self) -> str:
         """From where it counts a time, a place or a column, in words; "" for 0, or if it does not count: the default.
 
-        The recording that is diagnosed sets it, so that the effect means the same in any other plan.
+        The recording that is diagnosed sets this origin, so that the effect means the same in any other plan.
         """
         return ""
 
@@ -76,7 +76,7 @@ class NamedEffect(Effect[V], Protocol[V]):
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
-        """Values of parameters, by index, at which it has no effect; None where there are none.
+        """Values of parameters, by index, at which it has no effect; None if there are no such values.
 
         By default all amplitudes are 0.
         """
@@ -92,10 +92,7 @@ class NamedEffect(Effect[V], Protocol[V]):
         return cls()
 
     def is_absorbed_by_ssf(self, plan: Plan) -> bool:
-        """Return whether a free SSF absorbs the effect completely under this plan, so that it cannot be identified.
-
-        By default False.
-        """
+        """Return whether a free SSF absorbs the effect under this plan, which hides it; by default False."""
         return False
 
     def bank(self) -> FloatArray:
@@ -134,7 +131,7 @@ class NamedEffect(Effect[V], Protocol[V]):
         return (self,)
 
     def variant_masks(self, plan: Plan) -> VariantMasks | None:
-        """Return the masks of variants that differ only in the readings they act on; None for other variants."""
+        """Return the masks of variants that differ only in the readings they act on; None, the default, for others."""
         return None
 
     def with_fewer_variants(self) -> Self:
@@ -161,7 +158,7 @@ class NamedEffect(Effect[V], Protocol[V]):
 
 
 def require_effect_classes(effects: object) -> None:
-    """Raise ParameterError unless `effects` maps names to classes of effects that define all required members."""
+    """Raise ParameterError unless `effects` maps each name to a class of that name with all required members."""
     allowed = "classes of effects by name, such as {**VOCABULARY, 'overflow': Overflow}, of probewise.effects"
     require_mapping("effects", effects, allowed)
     assert isinstance(effects, Mapping)
@@ -216,12 +213,12 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
         return nodes, np.full(len(nodes), -np.log(max(len(nodes), 1)))
 
     def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
-        """Draw parameters about sampled nodes, both (n_samples, n_params); None where the nodes are dense enough."""
+        """Draw parameters about sampled nodes, both (n_samples, n_params); None, the default, if nodes are dense."""
         return None
 
 
 def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
-    """Describe an effect by samples of its parameters, (n_samples, n_params), and say from where it counts if not 0."""
+    """Describe an effect by samples of its parameters, (n_samples, n_params), and its origin, if that is not 0."""
     sentence = effect.sentence(samples.mean(axis=0), samples.std(axis=0))
     return f"{sentence} ({effect.counted_from})" if effect.counted_from else sentence
 

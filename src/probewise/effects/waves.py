@@ -35,7 +35,7 @@ def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:
 
 
 def starting_point_of_wave(entry: FloatArray, amounts: FloatArray) -> FloatArray:
-    """Return the parameters, (n_params,), of the wave that a bank entry's sine and cosine add up to, by fitted amounts.
+    """Return the parameters, (n_params,), of the sum of a bank entry's sine and cosine, times the fitted amounts (2,).
 
     The amplitude is the first, the phase the last; those between are the entry's.
     """
@@ -46,7 +46,7 @@ def starting_point_of_wave(entry: FloatArray, amounts: FloatArray) -> FloatArray
 
 
 class _WaveEffect(NamedEffect[V]):
-    """Base of effects with amplitude, frequency or period, and phase; an entry has a sine and a cosine column."""
+    """Base of effects with amplitude, frequency or period, and phase; bank entries hold a sine and a cosine."""
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
         return starting_point_of_wave(entry, amounts)
@@ -73,7 +73,7 @@ class Flicker(CountsTimeFromOrigin, _WaveEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search from 0.01 Hz to half the median rate of readings, two frequencies per 1 / duration; None if empty."""
+        """Return the effect for 0.01 Hz to half the median rate of readings; None if that range is empty."""
         highest = 0.5 / extent.gap_s
         if highest <= cls.lowest_hz:
             return None
@@ -105,7 +105,7 @@ class Flicker(CountsTimeFromOrigin, _WaveEffect[FloatArray]):
 
 @dataclass(frozen=True)
 class PeriodicPositionError(CountsPlaceFromOrigin, _WaveEffect[Poses]):
-    """A gear or lead screw that is not round: X + amp_mm sin(2 pi X / period_mm + phase), X in it from `origin`."""
+    """A gear or lead screw that is not round: X + amp_mm sin(2 pi (X - X0) / period_mm + phase), X0 of `origin`."""
 
     typical_mm: float = 0.3
     shortest_mm: float = 3.0
@@ -120,7 +120,7 @@ class PeriodicPositionError(CountsPlaceFromOrigin, _WaveEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search periods from three steps of X to twice its range; None where X takes fewer than eight positions."""
+        """Return the effect with periods from three steps of X to twice its range; None for under eight positions."""
         shortest, reach = _shortest_period_and_range_mm(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 2 * reach, origin=extent.origin) if reach > 0 else None
 
@@ -134,7 +134,7 @@ class PeriodicPositionError(CountsPlaceFromOrigin, _WaveEffect[Poses]):
         return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
-        """Return sines and cosines, their periods evenly spaced in wave number up to the range, then in log period."""
+        """Return sines and cosines: periods up to the range, evenly in wave number, and longer ones, in log period."""
         n_even = self.n_periods - 8
         waves = np.linspace(1.0, self.longest_mm / 2 / self.shortest_mm, n_even + 1)[1:]
         periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))
@@ -149,7 +149,7 @@ class PeriodicPositionError(CountsPlaceFromOrigin, _WaveEffect[Poses]):
 
 @dataclass(frozen=True)
 class StickSlip(CountsPlaceFromOrigin, NamedEffect[Poses]):
-    """Stick-slip of the slide: X + amp_mm saw(X / period_mm + phase), a sawtooth from 1 to -1 of X from `origin`."""
+    """Stick-slip of the slide: X + amp_mm saw((X - X0) / period_mm + phase), a sawtooth of 1 to -1, X0 of `origin`."""
 
     typical_mm: float = 0.3
     shortest_mm: float = 3.0
@@ -165,7 +165,7 @@ class StickSlip(CountsPlaceFromOrigin, NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search periods from three steps of X to a quarter of its range; None where that is empty."""
+        """Return the effect with periods from three steps of X to a quarter of its range; None if that is empty."""
         shortest, reach = _shortest_period_and_range_mm(extent.plan)
         if 0.25 * reach <= shortest:
             return None

@@ -19,7 +19,7 @@ from probewise.sensor.stages import Footprint, Poses, Stage
 
 @dataclass(frozen=True)
 class SlowTurn(CountsTimeFromOrigin, LinearEffect[Poses]):
-    """The sensor turns in its holder: orientation + deg_per_hour t, t the time since `origin`."""
+    """The sensor turns in its holder: orientation + deg_per_hour t, t the hours since `origin`."""
 
     typical_deg_per_hour: float = 2.0
 
@@ -47,7 +47,7 @@ class SlowTurn(CountsTimeFromOrigin, LinearEffect[Poses]):
 class SlowSinking(CountsTimeFromOrigin, LinearEffect[Footprint]):
     """The sensor sinks or rises: per_hour t h0 adds to the height; footprint x h/h0, signal x (h0/h)^2.
 
-    t is the time since `origin`.
+    t is the time since `origin` in hours; h0 and h are those of `HeightGradient`.
     """
 
     typical_per_hour: float = 0.1

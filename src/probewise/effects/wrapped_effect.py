@@ -13,7 +13,7 @@ V = TypeVar("V")
 
 
 class WrappedEffect(Effect[V]):
-    """An effect that passes everything on to `effect`, except what a subclass overrides."""
+    """An effect that has everything from `effect`, except what a subclass overrides."""
 
     effect: Effect[V]
 
@@ -27,7 +27,7 @@ class WrappedEffect(Effect[V]):
 
     @property
     def prior(self) -> Prior:
-        """The effect's prior."""
+        """The prior of the wrapped effect."""
         return self.effect.prior
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:

@@ -17,7 +17,7 @@ _BLOCK = 2**14  # elements that fit the cache together with the table
 
 
 def _tabulate_normal_cdf() -> tuple[FloatArray, FloatArray]:
-    """Tabulate the cumulative and its derivative per cell; the slope is 0 at both ends."""
+    """Return the standard normal's cumulative at the table's nodes, and its derivative per cell, 0 at both ends."""
     z = (np.arange(_CELLS + 1) - CENTRE) / PER_SD
     value, slope = ndtr(z), np.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * PER_SD)
     value[0], value[-1] = 0.0, 1.0
@@ -29,10 +29,10 @@ _VALUE, _SLOPE = _tabulate_normal_cdf()
 
 
 def normal_cdf_of_cells_in_place(cells: FloatArray) -> None:
-    """Replace z PER_SD + CENTRE by the cumulative of z, in place; `cells` is contiguous float64.
+    """Replace `cells`, z PER_SD + CENTRE, by the standard normal's cumulative of z; `cells` is contiguous float64.
 
-    For callers that compute z as a product and can fold the table's scale into it. About the nearest entry z0
-    the cumulative is the parabola value + slope t (1 - z0 t / 2), t the distance from it.
+    For callers that compute z as a product and can fold the table's scale into it. About the nearest entry z0 the
+    cumulative is the parabola value + slope t (1 - z0 t / 2), t the distance from it.
     """
     entry, near = np.empty(cells.shape, dtype=np.intp), np.empty(cells.shape)
     np.clip(cells, 0.0, _CELLS, out=cells)

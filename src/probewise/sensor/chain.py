@@ -55,7 +55,7 @@ class Levels(Protocol):
         ...
 
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return I_min and I_max, each broadcasting to (n_samples, n_points)."""
+        """Return I_min and I_max from the levels' columns of theta, each broadcasting to (n_samples, n_points)."""
         ...
 
 
@@ -97,12 +97,12 @@ class FixedLevels:
 
 
 def require_levels(levels: object, order: str) -> None:
-    """Raise ParameterError unless `levels` has `names` and `values`."""
+    """Raise ParameterError, with the hint `order` in its text, unless `levels` has `names` and `values`."""
     require_like("levels", levels, ("names", "values"), f"FreeLevels() or FixedLevels(i_min, i_max), {order}")
 
 
 def require_scene(scene: object, order: str) -> None:
-    """Raise ParameterError unless `scene` has `names` and `regions`; a bare shape is the usual mistake."""
+    """Raise ParameterError, with the hint `order` in its text, unless `scene` has `names` and `regions`."""
     allowed = f"a scene such as HypothesisScene(Circle()) or KnownScene(plan.patterns), {order}"
     require_like("scene", scene, ("names", "regions"), allowed)
 
@@ -151,7 +151,7 @@ class Chain:
         return replace(self, effects=(*self.effects, *effects))
 
     def plan_at_calibrated_height(self, plan: Plan) -> Plan:
-        """Return a plan as this model reads it: described at its calibrated height, another declared one commanded."""
+        """Return the plan with the calibrated height as the declared one; the plan's own, if another, is commanded."""
         return with_declared_height_commanded(plan, self.calibrated_height_mm)
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -190,7 +190,7 @@ class Chain:
         )
 
     def _n_hypotheses_at_once(self, theta: FloatArray, plan: Plan) -> int:
-        """Return how many hypotheses to predict at once; memory limits it where footprints differ between readings."""
+        """Return how many hypotheses to predict in one block: fewer, for memory, with effects on the footprint."""
         if not any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
             return len(theta)
         return max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
@@ -223,11 +223,11 @@ class Chain:
         return reading
 
     def white_fraction(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Return the white fraction R that the sensor sees, before any effect on it, (n_samples or 1, n_points)."""
+        """Return the white fraction R seen before effects at stage SEEN or later, (n_samples or 1, n_points)."""
         return self.simulated_view(theta, plan).seen
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> View:
-        """Compute the sensor's view of the scene: the stages of `predict` before SEEN, with their effects."""
+        """Return the sensor's view of the scene: the stages of `predict` before SEEN, with their effects."""
         require_theta_columns(theta, self.names)
         plan = self.plan_at_calibrated_height(plan)
         layout = self._layout_under_poses(theta, plan)
@@ -248,7 +248,7 @@ class Chain:
     look, read, seen = simulated_view, readings_from_simulated_view, white_fraction  # their earlier names
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
-        """Return the sensor's true poses: the chain up to stage POSE; arrays (n_samples or 1, n_points), lab frame."""
+        """Return the true poses, the plan's with effects on the pose applied: lab frame, (n_samples or 1, n_points)."""
         plan = self.plan_at_calibrated_height(plan)
         told = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
         found: Poses = self._stage_applier(theta, plan)(Stage.POSE, told)
@@ -275,7 +275,7 @@ class Chain:
         return None if len(first) < len(theta) and any(moved) else _HypothesesByGeometry(first, which)
 
     def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> SceneLayout:
-        """Lay out the scene under the poses; cached for the last plan if no parameter moves scene or poses."""
+        """Return the regions and the poses over them; cached for the last plan if no parameter moves scene or poses."""
         fixed = not self.scene.names and all(effect.stage > Stage.SCENE for effect in self.effects)
         known = self._layout_cache.get(plan) if fixed else None
         if known is not None:
@@ -298,7 +298,7 @@ class Chain:
         return {}
 
     def noise_parameters(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseParameters:
-        """Return the noise of each reading: `sd`, broadcasting to (n_samples, n_points), and the effects on it."""
+        """Return the noise of each reading: `sd`, broadcasting to (n_samples, n_points), with effects on the noise."""
         require_theta_columns(theta, self.names)
         plan = self.plan_at_calibrated_height(plan)
         start = NoiseParameters(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
@@ -323,7 +323,7 @@ class Chain:
 
     @cached_property
     def _effects_and_columns(self) -> list[tuple[AnyEffect, slice]]:
-        """Each effect with its columns of theta."""
+        """Each effect with the slice of its columns of theta."""
         first = len(self.ssf.names) + len(self.levels.names) + len(self.scene.names)
         return effects_with_columns(self.effects, first)
 
@@ -332,7 +332,7 @@ class Chain:
 class SceneLayout:
     """The region under each reading and the sensor's pose relative to it: all that does not depend on the SSF.
 
-    Its use raises ParameterError if the plan has a pattern that the regions lack.
+    Using the layout raises ParameterError if the plan has a pattern that the regions lack.
 
     Parameters
     ----------
@@ -357,12 +357,12 @@ class SceneLayout:
 
     @cached_property
     def rows_and_regions(self) -> list[tuple[IntArray, Region]]:
-        """Rows of the readings over each region, and the region."""
+        """Row indices of the readings over each region, and the region: a pair for each pattern of the plan."""
         return [(rows, region_named(self.regions, name)) for name, rows in self.plan.rows_by_pattern()]
 
     @cached_property
     def straight_batches(self) -> tuple[StraightEdges | StraightCorners, ...]:
-        """Known straight edges and corners of all patterns, batched: the common case of calibration.
+        """Straight edges and corners of all patterns that are the same for all hypotheses, in a batch of each kind.
 
         Empty where orientations differ between hypotheses.
         """
@@ -378,7 +378,7 @@ class SceneLayout:
 
     @cached_property
     def rows_and_regions_outside_batches(self) -> list[tuple[IntArray, Region]]:
-        """Rows of readings over the regions not in `straight_batches`, and the region, split by orientation."""
+        """The other regions, not in `straight_batches`, as pairs of row indices and region, split by orientation."""
         taken = (
             np.concatenate([part.rows for part in self.straight_batches])
             if self.straight_batches
@@ -434,7 +434,7 @@ def response(layout: SceneLayout, footprint: Footprint, *, n_nodes: int = ACCURA
 class _HypothesesByGeometry:
     """Groups of hypotheses that differ only in the weights of their Gaussians, in which the response is linear.
 
-    `first` is the first hypothesis of each group, (n_geometries,); `which` the group of each, (n_samples,).
+    `first` is the index of each group's first hypothesis, (n_geometries,); `which` each one's group, (n_samples,).
     """
 
     first: IntArray
@@ -483,9 +483,9 @@ def _discrete_response(layout: SceneLayout, ssf: DiscreteSSF) -> FloatArray:
 
 
 def region_named(regions: Mapping[str, Region], name: str) -> Region:
-    """Return the region of a pattern.
+    """Return the region of the pattern `name`.
 
-    Raises ParameterError, which says how to describe the pattern, if it has none.
+    Raises ParameterError, which says how to describe the pattern, if there is no such region.
     """
     try:
         return regions[name]

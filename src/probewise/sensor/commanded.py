@@ -27,7 +27,7 @@ def has_commanded_height_or_led(plan: Plan) -> bool:
 def led_state(plan: Plan) -> FloatArray:
     """Return the LED's state at each reading, 0 to 1, (n_points,), or (1,) without a column `led`; 1 at NaN.
 
-    Raises ParameterError for another state, which would multiply the signal.
+    Raises ParameterError for a state outside 0 to 1: it multiplies the signal.
     """
     led = plan.covariates.get("led")
     if led is None:
@@ -51,9 +51,10 @@ def height_ratio(plan: Plan) -> FloatArray | None:
 
 @lru_cache(maxsize=32)  # models are predicted many times over one plan, and recognise it
 def with_declared_height_commanded(plan: Plan, calibrated_mm: float | None) -> Plan:
-    """Return a plan described at the height of a calibration, its own declared height as a command where it differs.
+    """Return a plan that declares the calibrated height, and commands the height that it declared before.
 
-    Rows that command a height keep theirs. The plan itself is returned where one of both heights is unknown.
+    Rows that command a height keep theirs. If either height is unknown, or both are equal, the plan is returned as it
+    is.
     """
     own_mm = plan.instrumentation.height_mm
     if own_mm is None or calibrated_mm is None or own_mm == calibrated_mm:
@@ -67,13 +68,12 @@ def with_declared_height_commanded(plan: Plan, calibrated_mm: float | None) -> P
 
 
 def _require_values_allowed(name: str, values: FloatArray, beyond: BoolArray, allowed: str) -> None:
-    """Raise ParameterError that names the first of the values of a column that are `beyond` what is allowed."""
     if beyond.any():
         raise ParameterError(name, float(values[beyond][0]), allowed)
 
 
 def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint:
-    """Scale the footprint by the commanded height over the description's, and divide its brightness by the square."""
+    """Scale the footprint by h/h0 of the plan's commanded heights, and divide its brightness by the square."""
     ratio = height_ratio(plan)
     return footprint if ratio is None else _scaled_footprint(footprint, ratio[None, :])
 
@@ -81,16 +81,17 @@ def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint
 def footprint_at_height_ratio(footprint: Footprint, ratio: FloatArray) -> Footprint:
     """Scale the footprint by h/h0, (n_samples or 1, n_points), and divide its brightness by the square.
 
-    A ratio below 0.1 or above 10 counts as that.
+    Ratios are clipped to 0.1 to 10.
     """
     # A fit may try heights that no arm can take: the result only has to stay finite.
     return _scaled_footprint(footprint, np.clip(ratio, 0.1, 10.0))
 
 
 def footprint_at_added_height(footprint: Footprint, added: FloatArray, plan: Plan) -> Footprint:
-    """Add a height to the commanded one: `added` is a share of the description's h0, (n_samples or 1, n_points).
+    """Scale the footprint for a height `added` to the commanded one, in h0, (n_samples or 1, n_points).
 
-    The footprint given is that at the commanded height h, so it is scaled by (h + added h0) / h.
+    The given footprint is that at the commanded height h, so it is scaled by (h + added h0) / h; h0 is the
+    description's.
     """
     commanded = height_ratio(plan)
     return footprint_at_height_ratio(footprint, 1 + (added if commanded is None else added / commanded))

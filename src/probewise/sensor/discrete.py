@@ -1,8 +1,8 @@
 """The paper's sum over a discrete SSF matrix (paper, eq. discrete R), for any field and any region.
 
-The second of the two independent routes to the response; it shares only the region's geometry with
-the closed forms of `probewise.sensor.gaussian`. The albedo of a pixel is its covered share, so the
-error falls as the square of the pixel size.
+The second of two independent routes to the response; the other, the closed forms of `probewise.sensor.gaussian`, shares
+only the region's geometry. The albedo of a pixel is its covered share, so the error falls as the square of the pixel
+size.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from probewise.sensor.ssf import footprint_of
 
 
 def _places_and_widths_on_rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return places (n, 2) and widths (n,); each ring is (radius, number, width, rotation in steps)."""
+    """Return Gaussians' places (n, 2) and widths (n,); a ring is (radius, number, width, rotation in spacings)."""
     places = [
         (radius * np.cos(turn), radius * np.sin(turn))
         for radius, n, _, first in rings
@@ -31,7 +31,7 @@ _PLACES, _WIDTHS = _places_and_widths_on_rings(
 
 
 def _moment_preserving_basis() -> FloatArray:
-    """Find an orthonormal basis of the shares that change neither mean nor covariance, (N_FREE_FORM - 1, N_BENDS)."""
+    """Return an orthonormal basis of the shares that change neither mean nor covariance, (N_FREE_FORM - 1, N_BENDS)."""
     x, y = _PLACES.T
     moments = np.stack([x, y, x * x + _WIDTHS**2 - 1, y * y + _WIDTHS**2 - 1, x * y])
     return np.ascontiguousarray(np.linalg.svd(moments)[2][len(moments) :].T)
@@ -82,7 +82,7 @@ def bend_coefficients(theta: FloatArray) -> FloatArray:
 
 
 def is_free_form(theta: FloatArray) -> bool:
-    """Return whether all of these mixtures, (n_samples, 6 n), are free forms, by number and widths of the Gaussians."""
+    """Return whether all these mixtures, (n_samples, 6 n), have a free form's number and widths of Gaussians."""
     if theta.shape[1] != 6 * N_FREE_FORM:
         return False
     blocks = theta.reshape(len(theta), N_FREE_FORM, 6)

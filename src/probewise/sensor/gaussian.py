@@ -43,10 +43,9 @@ _REACH = 8.0  # standard deviations beyond which an edge has no effect (Phi(-8) 
 class LabGaussian:
     """One Gaussian of the footprint in the lab frame, at every pose.
 
-    All arrays broadcast to (n_samples, n_points), mm and mm^2: the sensor's position `x_mm`,
-    `y_mm`; the Gaussian's centre relative to it, `dx_mm`, `dy_mm`; its covariance. Position and
-    centre are kept apart because one depends on the reading and the other on the hypothesis:
-    their sum, a larger array, is formed only where it is needed.
+    All arrays broadcast to (n_samples, n_points), mm and mm^2: the sensor's position `x_mm`, `y_mm`; the Gaussian's
+    centre relative to it, `dx_mm`, `dy_mm`; its covariance. Position and centre are kept apart because one depends on
+    the reading and the other on the hypothesis: their sum, a larger array, is formed only on demand.
     """
 
     x_mm: FloatArray
@@ -58,7 +57,7 @@ class LabGaussian:
     cov_xy: FloatArray
 
     def select_samples(self, rows: IntArray) -> LabGaussian:
-        """Select samples; arrays shared by all samples are kept as they are."""
+        """Return the Gaussian of the samples `rows`; arrays shared by all samples are kept as they are."""
         return LabGaussian(*(a[rows] if a.shape[0] != 1 else a for a in self._arrays()))
 
     take = select_samples  # its old name
@@ -79,7 +78,7 @@ Spot = LabGaussian
 def moments_in_lab_frame(
     turn_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Turn mean and covariance anticlockwise into the lab frame: dx, dy, var_x, var_y, cov_xy; all broadcast."""
+    """Turn means and covariances by `turn_rad` into the lab frame: dx, dy, var_x, var_y, cov_xy; arrays broadcast."""
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     cross = 2 * c * s * cov_uv
     return (
@@ -195,7 +194,7 @@ def _mean_albedo_over_uniform(region: UniformRegion, gaussian: LabGaussian, n_no
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Evaluate the cumulative of the Gaussian's projection on the normal."""
+    """Return the mean albedo over a half-plane: the cumulative of the Gaussian projected on the normal."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     place = cosine * gaussian.x_mm + sine * gaussian.y_mm - region.offset_mm[:, None]
     shift = cosine * gaussian.dx_mm + sine * gaussian.dy_mm
@@ -206,7 +205,7 @@ def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian,
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Evaluate the field at the Gaussian's mean, which is exact for a linear field."""
+    """Return the mean albedo over a ramp: the albedo at the Gaussian's mean, exact for a linear field."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     return region.per_mm[:, None] * (
         cosine * (gaussian.x_mm + gaussian.dx_mm) + sine * (gaussian.y_mm + gaussian.dy_mm)
@@ -215,7 +214,7 @@ def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: i
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_stripes(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Sum cumulatives or, for stripes finer than the footprint, their Fourier series."""
+    """Return the mean albedo over stripes: a sum of cumulatives or, over fine stripes, of a Fourier series."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     period, duty = region.period_mm[:, None], region.duty[:, None]
     along = (
@@ -250,16 +249,14 @@ _TRIANGLE_NODES = 8  # positive half of a 16-node rule: accurate to 1e-12
 def probabilities_beyond_corner_and_sides(
     z1: FloatArray, z2: FloatArray, rho: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the probabilities that two standard normals exceed z1 and z2, that the first exceeds z1, the second z2.
-
-    `rho` is their correlation; the arrays broadcast.
+    """Return P(x > z1, y > z2), P(x > z1), P(y > z2) of standard normals x, y of correlation rho; arrays broadcast.
 
     In the frame in which the Gaussian is the unit one about the origin, the quadrant is the wedge between two rays from
     the corner (Owen 1956). The line of side 1 passes the origin at distance z1; the corner lies `along` it from its
     foot. The mass that a side cuts off is half a half-plane minus the triangle between origin, foot and corner, V of
-    Nicholson (1943): the integral over x from 0 to along/z1 of (1 - exp(-z1^2 (1 + x^2) / 2)) / (2 pi (1 + x^2)),
-    by Gauss-Legendre quadrature. The integrand is smooth up to x = 1; where the corner lies further, V(h, k) is
-    the mass of the rectangle minus V(k, h).
+    Nicholson (1943): the integral over x from 0 to along/z1 of (1 - exp(-z1^2 (1 + x^2) / 2)) / (2 pi (1 + x^2)), by
+    Gauss-Legendre quadrature. The integrand is smooth up to x = 1; where the corner lies further, V(h, k) is the mass
+    of the rectangle minus V(k, h).
     """
     z = np.empty((2, *np.broadcast(z1, z2, rho).shape))
     z[0], z[1] = z1, z2
@@ -292,7 +289,7 @@ def _mean_albedo_over_quadrant(region: QuadrantRegion, gaussian: LabGaussian, n_
 def mass_in_quadrant(
     corner_x: FloatArray, corner_y: FloatArray, dx: FloatArray, dy: FloatArray, gaussian: LabGaussian
 ) -> FloatArray:
-    """Integrate Gaussians over quadrants; corner, direction and the Gaussians' arrays broadcast to any shape.
+    """Return the mass of Gaussians in quadrants, which extend from a corner towards dx, dy, 1 or -1; arrays broadcast.
 
     The mass is a probability of the bivariate normal, reflected so that the inside lies to the upper right.
     """
@@ -304,9 +301,9 @@ def mass_in_quadrant(
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Sum over the edges the angle that each subtends at the mean, less the mass beyond it.
+    """Return the mean albedo over a polygon: a sum over edges of the angle seen from the mean, less the mass beyond.
 
-    This is in the frame in which the Gaussian is the unit one, with its mean at the origin.
+    All is mapped to the frame in which the Gaussian is the unit one, with its mean at the origin.
     """
     sd_x = np.sqrt(gaussian.var_x)
     slope = gaussian.cov_xy / gaussian.var_x
@@ -337,7 +334,7 @@ def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_no
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_region_with_cards(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Integrate over the region and over each card by itself, then lay the cards over the region."""
+    """Return the mean albedo over a region with cards laid on it, from those over the region and each card."""
     covered = [mean_albedo_under_one_gaussian(card.region, gaussian, n_nodes) for card in region.cards]
     return mean_albedo_with_cards(
         mean_albedo_under_one_gaussian(region.region, gaussian, n_nodes), region.cards, covered
@@ -348,7 +345,7 @@ def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -
     """Return the unit Gaussian's signed mass beyond each edge, seen from the origin, (n_edges,), by Owen's T.
 
     `height` is the signed distance of the edge's line from the origin, positive where the edge runs anticlockwise about
-    it, and the mass has the same sign; `start` and `end` are places along the line. An end out of reach counts as
+    it, and the mass has the same sign; `start` and `end` are positions along the line. An end out of reach counts as
     infinitely far, where T is half the mass beyond the line.
     """
     half = 0.5 * ndtr(-np.abs(height))
@@ -372,7 +369,7 @@ def _half_legendre_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_ellipse(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Integrate cumulatives along the normal by quadrature along the tangent, after a map to the unit disc."""
+    """Return the mean albedo over an ellipse: mapped to the unit disc, exact along chords, by quadrature across."""
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
     cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
     round_edge = bool((region.semi_axes_mm[:, 0] == region.semi_axes_mm[:, 1]).all())
@@ -436,7 +433,7 @@ def _sds_covered_by_nodes(n_nodes: int) -> float:
 def _mass_in_disc_by_chords(
     d: FloatArray, var_r: FloatArray, var_t: FloatArray, cov: FloatArray, reach: float, n_nodes: int
 ) -> FloatArray:
-    """Integrate Gaussians over the unit disc, mean at (d, 0), radial and tangential variances; (n_pairs,) each.
+    """Return the mass in the unit disc of Gaussians with mean (d, 0), radial and tangential variances; (n_pairs,) each.
 
     Along parallel chords the integral is a difference of two cumulatives; across them it is a quadrature. The chords
     have the direction in which the mean lies from the nearest point of the edge, nearest in sds (to first order).
@@ -518,7 +515,7 @@ def _mass_in_disc_by_long_chords(
 ) -> FloatArray:
     """Return the mass of Gaussians in the unit disc, (n_pairs,), from chords along the long axis of each Gaussian.
 
-    The integral along them is exact; across them it is a quadrature in u, where y = sin(4 arctan u) removes the root at
+    The integral along chords is exact; across, it is a quadrature in u, where y = sin(4 arctan u) removes the root at
     the end of the chords.
     """
     half, spread = 0.5 * (var_r + var_t), 0.5 * (var_r - var_t)
@@ -546,14 +543,13 @@ def _mass_in_disc_by_long_chords(
 
 
 def _tangent_of_quarter_arcsine(y: FloatArray) -> FloatArray:
-    """Return tan(arcsin(y) / 4)."""
     half = y / (1 + np.sqrt(1 - y * y))
     return np.asarray(half / (1 + np.sqrt(1 + half * half)))
 
 
 @cache
 def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Return nodes and weights for the mean over a standard normal."""
+    """Return Gauss-Hermite nodes and weights for the mean over a standard normal."""
     node, weight = np.polynomial.hermite_e.hermegauss(n_nodes)
     return node, weight / weight.sum()
 

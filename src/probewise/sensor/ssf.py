@@ -129,12 +129,12 @@ class FixedMixture:
 
     @property
     def mean_mm(self) -> FloatArray:
-        """Mean of the whole mixture, (2,)."""
+        """Mean of the whole mixture, mm, (2,)."""
         return np.asarray(self.weights @ self.means_mm)
 
     @property
     def cov_mm2(self) -> FloatArray:
-        """Covariance of the whole mixture by the law of total covariance, (2, 2)."""
+        """Covariance of the whole mixture by the law of total covariance, mm^2, (2, 2)."""
         off = self.means_mm - self.mean_mm
         return np.asarray(np.einsum("n,nij->ij", self.weights, self.covs_mm2 + off[:, :, None] * off[:, None, :]))
 
@@ -193,19 +193,19 @@ class SSFField(ShowsItself):
 
     @cached_property
     def mean_mm(self) -> FloatArray:
-        """Mean position, (2,)."""
+        """Mean position in the sensor frame, weighted by the values, mm, (2,)."""
         return np.asarray(self.values.ravel() @ self.centers_mm)
 
     @cached_property
     def cov_mm2(self) -> FloatArray:
-        """Covariance of the positions of pixel centres, (2, 2)."""
+        """Covariance of the pixel centres, weighted by the values, mm^2, (2, 2)."""
         off = self.centers_mm - self.mean_mm
         return np.asarray((self.values.ravel()[:, None] * off).T @ off)
 
 
 @dataclass(frozen=True)
 class DiscreteSSF:
-    """The SSF of a chain given as a field of pixels: the response is the paper's sum over them."""
+    """The SSF of a chain given as a field of pixels: the response is the paper's sum over the pixels."""
 
     field: SSFField
 
@@ -215,7 +215,7 @@ class DiscreteSSF:
         return ()
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Return the single Gaussian with the field's mean and covariance, negative values left out."""
+        """Return the field as one Gaussian with its mean and covariance, negative values left out."""
         return mixture_of_field(self.field).footprint(theta)
 
 
@@ -280,7 +280,7 @@ def mean_ssf_field(
 
 
 def _reached_slice(centres: FloatArray, mean: float, sd: float) -> slice:
-    """Return the slice of the pixel centres, along one axis, that a Gaussian reaches."""
+    """Return the slice of the pixel centres, along one axis, that lie within 6.5 sds of a Gaussian's mean."""
     return slice(*np.searchsorted(centres, [mean - _REACH * sd, mean + _REACH * sd]))
 
 
@@ -303,7 +303,8 @@ def merged_mean_mixture(
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    Negative values of the field count as 0. Gaussians without mass are left out of the `n_gaussians`.
+    Negative values of the field count as 0. Gaussians without mass are left out of the `n_gaussians`. Raises
+    ParameterError if a Gaussian would have no width, as for a single row of pixels.
     """
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
@@ -312,13 +313,13 @@ def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
 
 
 def _quadratic_form(off: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Compute the quadratic form off' matrix off of each row, off (n, 2)."""
+    """Return the quadratic form off' matrix off for each row of `off`, (n, 2) -> (n,)."""
     x, y = off[:, 0], off[:, 1]
     return np.asarray(matrix[0, 0] * x * x + matrix[1, 1] * y * y + 2 * matrix[0, 1] * x * y)
 
 
 def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
-    """Merge weighted Gaussians (or points, covariance zero) into a few, by expectation-maximisation."""
+    """Merge weighted Gaussians (points: covariance 0) into at most `n_gaussians`, by expectation-maximisation."""
     if n_gaussians < 1:
         raise ParameterError("n_gaussians", n_gaussians, "1 or more")
     w = w / w.sum()

@@ -23,7 +23,7 @@ from probewise.scene.albedo import Region
 
 
 class Stage(IntEnum):
-    """The stage of the chain at which an effect acts."""
+    """The stage of the chain at which an effect acts; effects act in the order of the stages."""
 
     INPUT = 0
     PARAMETER = 1
@@ -139,7 +139,7 @@ class Effect(Protocol[V]):
 
     @property
     def stage(self) -> Stage:
-        """The stage it acts at."""
+        """The stage of the chain at which it acts."""
         ...
 
     @property
@@ -148,7 +148,7 @@ class Effect(Protocol[V]):
         ...
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
-        """Apply the effect with parameters theta (n_samples, n_params of this effect)."""
+        """Return the stage's value with the effect applied, with its parameters theta (n_samples, n_params)."""
         ...
 
 
@@ -162,7 +162,7 @@ def parameter_names_of_effects(effects: Iterable[AnyEffect]) -> Iterator[str]:
 
 
 def effects_with_columns(effects: Sequence[E], first: int = 0) -> list[tuple[E, slice]]:
-    """Return each effect with its columns of theta, which follow one another from column `first` on."""
+    """Return each effect with the slice of its columns of theta, which follow one another from column `first` on."""
     ends = accumulate((len(effect.prior.names) for effect in effects), initial=first)
     return [(effect, slice(*both)) for effect, both in zip(effects, pairwise(ends), strict=True)]
 

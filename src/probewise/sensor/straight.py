@@ -34,7 +34,7 @@ class StraightEdges:
     Parameters
     ----------
     rows
-        Numbers of the readings.
+        Row indices of the readings.
     turn_rad
         Angle of the edge's normal in the sensor frame.
     distance_mm
@@ -51,7 +51,7 @@ class StraightEdges:
 
     @classmethod
     def from_regions(cls, parts: list[tuple[IntArray, HalfPlaneRegion]], poses: Poses) -> StraightEdges:
-        """Batch regions of one hypothesis each, for orientations that are the same for all hypotheses."""
+        """Batch half-planes of one hypothesis each; orientations must be the same for all hypotheses."""
         rows = np.concatenate([r for r, _ in parts])
         of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
         normal = np.array([region.normal_rad[0] for _, region in parts])[of]
@@ -71,7 +71,7 @@ class StraightEdges:
 
     @cached_property
     def _rows_as_slice(self) -> slice | None:
-        """The rows as a slice where they are contiguous, so that the result can be a view instead of a copy."""
+        """The rows as a slice, which gives views instead of copies; None if they are not contiguous."""
         together = bool((np.diff(self.rows) == 1).all())
         return slice(int(self.rows[0]), int(self.rows[-1]) + 1) if together else None
 
@@ -88,7 +88,7 @@ class StraightEdges:
             out[:, self.rows] = seen
 
     def _write_mass_inside_by_hypothesis(self, footprint: Footprint, share: FloatArray) -> None:
-        """Write the shares inside where the position varies with the hypothesis or the footprint with the reading."""
+        """Write the mass inside to `share`, where positions vary by hypothesis or footprints by reading."""
         weight, *moments = (self._own_reading_columns(a) for a in (footprint.weight, *footprint.moments))
         varies = _varies_with_reading(footprint)
         angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
@@ -112,7 +112,7 @@ class StraightEdges:
                 share[block] += cells * _select_hypotheses(weight, block)[:, :, g]
 
     def _own_reading_columns(self, array: FloatArray) -> FloatArray:
-        """Select the columns of these readings, as a view where they are contiguous."""
+        """Select the columns of the readings `rows`, as a view if they are contiguous."""
         if self._rows_as_slice is None or array.shape[1] == 1:
             return select_reading_columns(array, self.rows)
         return array[:, self._rows_as_slice]
@@ -120,11 +120,11 @@ class StraightEdges:
 
 @dataclass(frozen=True, eq=False)
 class _DistinctEdgeViews:
-    """The distinct views of straight edges: scans out and back, and from both sides, share them.
+    """The distinct views of straight edges: readings of scans out and back, or from both sides, share a view.
 
     An edge seen from its other side is the same view with black and white exchanged. `angle_rad` (n_angles,) runs from
     0 to pi; each view has an angle, by index `which`, and a `distance_mm`, (n_views,). Each reading has a `view`, by
-    index, and reads low + gain times its share, `low` and `gain` (n_rows,).
+    index, and reads low + gain times the view's mass, `low` and `gain` (n_rows,).
     """
 
     angle_rad: FloatArray
@@ -148,7 +148,7 @@ class _DistinctEdgeViews:
 
     @cached_property
     def _matrix_from_angles_to_views(self) -> FloatArray:
-        """Matrix from the angles' (1/sd, mean/sd) to the views' table positions, (2 n_angles, n_views)."""
+        """Matrix from the angles' (1/sd, mean/sd) to the views' positions in the table, (2 n_angles, n_views)."""
         own = np.eye(len(self.angle_rad))[:, self.which]
         return np.concatenate([own * self.distance_mm, own])
 
@@ -194,7 +194,7 @@ class StraightCorners:
 
     @classmethod
     def from_regions(cls, parts: list[tuple[IntArray, QuadrantRegion]], poses: Poses) -> StraightCorners:
-        """Batch regions of one hypothesis each."""
+        """Batch quadrants of one hypothesis each with the rows of their readings."""
         rows = np.concatenate([r for r, _ in parts])
         of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
         return cls(
@@ -234,8 +234,8 @@ class _DistinctCornerViews:
     """The distinct views of corners; one view serves all four quadrants about the corner.
 
     Three masses determine every quadrant: beyond the corner along both axes, along x, and along y. `turn_rad` is the
-    sensor's orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, (n_views,). The masses
-    times `readings_from_masses`, (3 n_views, n_rows), plus `low`, (n_rows,), are the responses.
+    sensor's orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, lab frame, (n_views,).
+    The masses times `readings_from_masses`, (3 n_views, n_rows), plus `low`, (n_rows,), are the responses.
     """
 
     turn_rad: FloatArray

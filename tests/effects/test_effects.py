@@ -174,6 +174,7 @@ def test_a_heavy_tail_is_exact_at_both_ends():
     # Twenty-five typical sizes are no surprise: the density there is far above a normal's.
     assert prior.log_prob(np.array([12.5]))[0] > -8
     assert LogHeavyTailedPrior(0.1).from_unit(np.array([0.5]))[0] == pytest.approx(1.0)
+    np.testing.assert_allclose(LogHeavyTailedPrior(0.1).to_unit(np.array([-1.0, 0.0, 1.0])), [0.0, 0.0, 0.5])
 
 
 def test_a_wider_heavy_tailed_prior_reaches_farther_and_loses_little_density_near_zero():

@@ -131,8 +131,9 @@ class LogHeavyTailedPrior:
         return np.exp(self._prior_of_log.from_unit(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape."""
-        return self._prior_of_log.to_unit(np.log(value))
+        """Evaluate the cumulative distribution function, any shape; 0 at and below zero."""
+        value = np.asarray(value, dtype=np.float64)
+        return np.where(value > 0, self._prior_of_log.to_unit(np.log(np.where(value > 0, value, 1.0))), 0.0)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape; -inf at and below zero."""

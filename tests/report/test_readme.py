@@ -2,11 +2,14 @@
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from probewise import experiment
+from probewise.cli import main
 from probewise.cli.diagnose import generators_of_diagnosis
 from probewise.diagnosis import diagnose
 from probewise.experiment import loop
@@ -17,6 +20,8 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 INDEX = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
 QUOTED = json.loads((ROOT / "docs" / "_static" / "pictures.json").read_text(encoding="utf-8"))
+PENDULUM = json.loads((ROOT / "docs" / "_static" / "pendulum.json").read_text(encoding="utf-8"))
+LAW = (ROOT / "examples" / "simulators" / "pendulum.py").read_text(encoding="utf-8")
 
 
 def plain(text):
@@ -26,7 +31,8 @@ def plain(text):
 @pytest.mark.slow
 def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
     """The printed lines and `explore`, given the same randomness, take the same readings to the last bit."""
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    law, code = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert law == LAW
     setup, rest = code.split("\nrng = ")
     printed = {}
     exec(compile(code, "README.md", "exec"), printed)
@@ -57,10 +63,27 @@ def test_the_readme_quotes_what_the_command_says_of_the_shipped_recording():
     assert typeset_numbers(found.reason) == QUOTED["reason"]
 
 
+def test_the_readme_quotes_what_was_said_of_the_pendulum_when_its_picture_was_made():
+    assert f"> {plain(typeset_numbers(PENDULUM['reason']))}" in README
+    assert (PENDULUM["verdict"], PENDULUM["combination"]) == ("named", ["drag:omega"])
+
+
+@pytest.mark.slow
+def test_the_readme_quotes_what_the_command_says_of_the_pendulum(tmp_path):
+    """The README's two commands, up to the digits of the p-value."""
+    swings, example = tmp_path / "swings.csv", ROOT / "examples" / "plot_pendulum.py"
+    subprocess.run([sys.executable, example, "--out", swings], check=True, capture_output=True)
+    law = str(ROOT / "examples" / "simulators" / "pendulum.py")
+    assert main(["diagnose", str(swings), "--simulator", law, "--out", str(tmp_path / "pendulum"), "--quiet"]) == 0
+    found = json.loads((tmp_path / "pendulum" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert found["combination"] == PENDULUM["combination"]
+    assert found["reason"].partition("(p =")[0] == PENDULUM["reason"].partition("(p =")[0]
+
+
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
 def test_pictures_that_the_front_pages_show_are_there(page):
     shown = re.findall(r"(?:!\[.*?\]\(|```\{figure\} )([^)\s]+)", (ROOT / page).read_text(encoding="utf-8"))
-    assert len(shown) == 2
+    assert len(shown) == (3 if page == "README.md" else 2)
     assert all(((ROOT / page).parent / name).is_file() for name in shown)
 
 

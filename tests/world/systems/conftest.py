@@ -49,3 +49,19 @@ def solve():
         return simulate_noise_free(kind, rows, parameters, [(form, numbers)]).readings[0], rows, bare.readings[0]
 
     return run
+
+
+@pytest.fixture
+def simulate_pair():
+    """Readings of the small system with two forms of the vocabulary and their numbers, (n_samples, n_points)."""
+
+    def run(names, numbers, **options):
+        kind, rows, parameters = small(**options)
+        bare = simulate_noise_free(kind, rows, parameters)
+        true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
+        forms = {form.name: form for form in forms_of(true)}
+        return simulate_noise_free(
+            kind, rows, parameters, [(forms[n], v) for n, v in zip(names, numbers, strict=True)]
+        ).readings
+
+    return run

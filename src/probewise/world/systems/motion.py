@@ -144,14 +144,18 @@ class _Integration:
         """Interpolate a column at earlier times, (n_samples, n_runs): held or linear; constant before the start."""
         law = self.kind.law
         assert law is not None
+        column = self.columns[name]
+        n_samples = max(len(t), len(column))
+        t, column = (np.broadcast_to(each, (n_samples, each.shape[1])) for each in (t, column))
         out = np.empty(t.shape)
         for j, number in enumerate(run):
             own = self._rows_by_run_number[int(number)]
-            times, values = self.table.t[own], self.columns[name][0, own]
+            times = self.table.t[own]
             if law.linear:
-                out[:, j] = np.interp(t[:, j], times, values)
+                out[:, j] = [np.interp(at, times, values) for at, values in zip(t[:, j], column[:, own], strict=True)]
             else:
-                out[:, j] = values[np.clip(np.searchsorted(times, t[:, j] + 1e-12, side="right") - 1, 0, None)]
+                before = np.clip(np.searchsorted(times, t[:, j] + 1e-12, side="right") - 1, 0, None)
+                out[:, j] = column[np.arange(n_samples), own[before]]
         return out
 
     def rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Instants) -> dict[str, Any]:

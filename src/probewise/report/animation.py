@@ -12,14 +12,14 @@ from probewise.errors import ParameterError
 
 
 def animated_gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -> bytes:
-    """Join PNGs into an animated GIF that loops for ever, and return its bytes.
+    """Join PNGs into an animated GIF that loops for ever; return its bytes.
 
     Parameters
     ----------
     frames
-        One PNG or more; smaller ones are set on white at the upper left.
+        One PNG or more (ParameterError for none); smaller ones are set at the upper left of a white sheet.
     frame_s, last_s
-        Seconds that each frame is shown, and the last frame.
+        Duration in seconds of each frame but the last, and of the last.
     """
     if not frames:
         raise ParameterError("frames", 0, "one picture or more")
@@ -39,9 +39,9 @@ def animated_gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float
 
 
 def _common_palette(sheets: Sequence[Image.Image]) -> Image.Image:
-    """Return a palette image of 256 colours for all frames: with one palette each, a colour would change between them.
+    """Return a palette image of 256 colours that all frames share; with one palette each, a colour would change.
 
-    They cover all colours, not the most frequent, so that the small square at the next place keeps its colour.
+    The palette covers the range of colours, whatever their frequency, so that small squares keep their rare colours.
     """
     weights = np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     codes = np.unique(np.concatenate([np.unique(np.asarray(sheet) @ weights) for sheet in sheets]))

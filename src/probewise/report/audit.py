@@ -17,7 +17,7 @@ _CURED_BY = "The fewest extra readings that would help"
 
 
 def summary_sentence(audit: PlanAudit) -> str:
-    """Summarise in at most twenty words: how many effects are fine, aliased or invisible, and what would help."""
+    """Count in at most twenty words the fine, aliased and invisible effects, and those that more readings make fine."""
     n_fine, n_aliased = len(audit.effects_with_detectability("fine")), len(audit.effects_with_detectability("aliased"))
     n_invisible = len(audit.effects_with_detectability("invisible"))
     said = (
@@ -30,7 +30,7 @@ def summary_sentence(audit: PlanAudit) -> str:
 
 
 def encoded_figures(audit: PlanAudit) -> dict[str, bytes]:
-    """Draw the figure of an audit; return its PNG by file name."""
+    """Draw the figure of an audit; return it as {"audit.png": PNG}."""
     return {"audit.png": png(draw_detectability_and_aliases(audit))}
 
 
@@ -41,7 +41,7 @@ def draw_detectability_and_aliases(audit: PlanAudit) -> AxesGrid:
 
 
 def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
-    """Return the page's HTML; `drawn` is from `encoded_figures`, `source` names the plan."""
+    """Return the HTML of an audit's page; `drawn` is from `encoded_figures`, `source` the plan's name."""
     shown = figure(
         drawn["audit.png"],
         "Fine: these readings detect the effect and tell it from every other. Aliased: they detect it, but another "

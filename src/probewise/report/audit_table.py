@@ -1,4 +1,4 @@
-"""The table of an audit; the report of a diagnosis shows it too."""
+"""The table of an audit's effects, which the pages of an audit and of a diagnosis show."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _SIZES = {
 
 
 def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:
-    """Build the table of all effects: detectability, aliases, and the size at which each is detectable.
+    """Build the table of all effects, invisible ones first: detectability, detectable share, aliases, size at lambda 8.
 
-    `of` names the model whose own parameters absorb part of an effect. A further column, if computed, gives the number
-    of rows like these that are needed to detect an effect which changes the readings by one noise sd (rms).
+    `of` names the model whose own parameters absorb part of an effect. Where an effect's `rows` were computed, a column
+    more gives the number of rows like these that detect the effect at a change of the readings by one noise sd (rms).
     """
     counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")
@@ -66,7 +66,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
 
 
 def _detectable_size_in_words(parameter: str, unit: str, amount: float | None) -> str:
-    """Write the value of a parameter at which an effect is detectable; with its name if the unit does not tell."""
+    """Write a parameter's name, unless its unit tells, and its value (`amount`) at lambda 8; "at no size" for None."""
     name = _SIZES.get(parameter, "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " "))
     value = "at no size" if amount is None else f"{amount:.2g} {_unit_in_words(unit)}"
     return f"{name} {value}".strip()

@@ -33,7 +33,7 @@ from probewise.report.words import (
 
 
 def summary_sentence(sensor: FittedSensor) -> str:
-    """Summarise in one sentence: number of Gaussians, lead in ln Z, the SSF's centre and sds, and the noise."""
+    """Summarise a calibration: number of Gaussians, lead in ln Z over the next best, SSF's centre and sds, noise."""
     n = sensor.n_gaussians
     said = f"The evidence favours {count_with_noun(n, 'Gaussian')}"
     others = sorted((o for o in sensor.orders if o.n_gaussians != n), key=lambda o: -o.log_z)
@@ -52,7 +52,7 @@ def summary_sentence(sensor: FittedSensor) -> str:
 
 
 def ssf_centre_and_axis_sds_mm(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
-    """Return the centre of the mean SSF and its sds along the long and the short axis (mm)."""
+    """Return u, v of the mean SSF's centre in the sensor's frame, and its sds (long axis, short axis), in mm."""
     u, v = sensor.field.mean_mm
     short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0))
     return float(u), float(v), (float(long), float(short))
@@ -70,7 +70,7 @@ def encoded_figures(calibration: Calibration, recording: Recording, prediction: 
 
 
 def draw_ssf_by_n_gaussians(calibration: Calibration) -> AxesGrid:
-    """Draw the mean SSF of each number of Gaussians, with its evidence; return the axes."""
+    """Draw the mean SSF for each number of Gaussians, with its evidence; return the axes, (n_rows, 1 or 2)."""
     return ssf_by_n_gaussians(
         calibration.fields,
         {o.n_gaussians: o.log_z for o in calibration.orders},
@@ -81,7 +81,7 @@ def draw_ssf_by_n_gaussians(calibration: Calibration) -> AxesGrid:
 def sections(
     sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
 ) -> list[Section]:
-    """Build the page's sections below the first screen; `drawn` is from `encoded_figures`."""
+    """Build the sections of a calibration's page, below the first screen; `drawn` is from `encoded_figures`."""
     ok = recording.usable
     z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
     return [
@@ -153,7 +153,7 @@ def sections(
 
 
 def evidence_table(sensor: FittedSensor) -> Markup:
-    """Build the paper's table: log evidence and number of parameters, by number of Gaussians."""
+    """Build a calibration's table by number of Gaussians: ln Z ± error, distance below the best, parameters."""
     best = max((o.log_z for o in sensor.orders), default=0.0)
     return table(
         ("Gaussians", "ln Z", "below the best", "parameters (with I_min, I_max)"),
@@ -171,7 +171,7 @@ def evidence_table(sensor: FittedSensor) -> Markup:
 
 
 def parameter_table(sensor: FittedSensor) -> Markup:
-    """Build the table of the model's parameters: posterior medians and 95 % intervals."""
+    """Build the table of a fitted sensor model's parameters: posterior medians and 95 % intervals."""
     median, ends = sensor.median(), sensor.interval()
     return table(
         ("parameter", "unit", "median", "95 % interval"),
@@ -198,14 +198,14 @@ def ssf_centre_and_width_table(sensor: FittedSensor) -> Markup:
 
 
 def _printed_unit(unit: str) -> str:
-    """Return a unit as the report prints it: with superscripts, and nothing for "1"."""
+    """Return a unit as the report prints it: "mm⁻²" for "mm^-2", nothing for "1", else `unit_name`."""
     return {"mm^-2": "mm⁻²", "1": ""}.get(unit, unit_name(unit))
 
 
 def page_html(
     calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
 ) -> str:
-    """Return the page's HTML; `drawn` is from `encoded_figures`."""
+    """Return the HTML of a calibration's page; `drawn` is from `encoded_figures`."""
     return page(
         f"Calibration of {PurePath(calibration.sensor.source).name or 'a sensor'}",
         answer=summary_sentence(calibration.sensor),

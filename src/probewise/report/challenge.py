@@ -1,4 +1,4 @@
-"""The page of a challenge: the table of targets, the confusion matrix, and the calibration of probabilities."""
+"""The page of a challenge (diagnoses of simulated cases): table of targets, confusion matrix, reliability diagram."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: "
 
 
 def summary_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
-    """Summarise in one sentence how many targets are met, missed and undecided."""
+    """Summarise a challenge in one sentence: number of cases; how many targets are met, missed and undecided."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
         f"{count_with_noun(n_cases, 'case')} of concealed physics: {count_with_noun(n['met'], 'target')} met, "
@@ -36,7 +36,7 @@ def summary_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
 
 
 def target_table(rows: Sequence[ScoreRow]) -> Markup:
-    """Build the table of all quantities: what was found, its 95 % interval, the target, and whether it is met."""
+    """Build a challenge's table, a row per quantity: value found, 95 % interval, cases, target, whether it is met."""
     header = ("what", "found", "95 % interval", "of", "target", "decision")
     return table(
         header,
@@ -55,13 +55,13 @@ def target_table(rows: Sequence[ScoreRow]) -> Markup:
 
 
 def _indented_row_name(name: str) -> str:
-    """Write a row's name: an em space for indentation, since HTML drops plain spaces, and spaces for underscores."""
+    """Write a row's name with spaces for underscores, indented by an em space, since HTML drops plain spaces."""
     own = name.lstrip()
     return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
 def target_table_csv(rows: Sequence[ScoreRow]) -> str:
-    """Return the table as the text of a CSV file; missing values are empty."""
+    """Return a challenge's table as CSV text: quantity, value, interval, cases, target's bounds, decision."""
     cells = []
     for row in rows:
         numbers, bounds = (row.found.value, row.found.low, row.found.high), (row.least, row.most)
@@ -72,7 +72,10 @@ def target_table_csv(rows: Sequence[ScoreRow]) -> str:
 
 
 def page_html(results: Results, rows: Sequence[ScoreRow], *, command: str, systems: bool = False) -> str:
-    """Return the page's HTML from the cases' results and their table; `systems`: cases are simulators, not sensors."""
+    """Return the HTML of a challenge's page from the cases' results and the table's `rows`.
+
+    `command` is the command line that made the results; `systems`: the cases are simulators, not light sensors.
+    """
     done = [r for r in results if "failed" not in r]
     sections = [Section("The table", (target_table(rows), _table_legend()))]
     if done:

@@ -1,4 +1,4 @@
-"""The page of a study of concealed faults: the robot with and without doubt in its sensor."""
+"""The page of a study of concealed effects: the robot that trusts its sensor model, and the one that doubts it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from probewise.study import ConcealedRow
 
 
 def summary_sentence(rows: Sequence[ConcealedRow]) -> str:
-    """Summarise in one sentence how many runs ended sure and wrong, with full trust in the sensor and with less."""
+    """Count in one sentence the runs that ended by the robot's rule but over 12 mm off: at full trust, and at less."""
     wrong = {
         doubts: _sure_and_wrong_text([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)
     }
@@ -23,7 +23,7 @@ def summary_sentence(rows: Sequence[ConcealedRow]) -> str:
 
 
 def page_html(rows: Sequence[ConcealedRow], *, command: str) -> str:
-    """Return the page's HTML; `command` is the command line that made it."""
+    """Return the HTML of the page of a study of concealed effects; `command` is the command line that made it."""
     drawn = figure(
         png(doubt_against_trust(rows)),
         "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
@@ -37,7 +37,6 @@ def page_html(rows: Sequence[ConcealedRow], *, command: str) -> str:
 
 
 def _sure_and_wrong_text(rows: Sequence[ConcealedRow]) -> str:
-    """Write how many of all runs ended sure and wrong, as in "3 of 40 runs"."""
     n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in rows)
     return f"{n_wrong} of {count_with_noun(sum(row.runs for row in rows), 'run')}"
 

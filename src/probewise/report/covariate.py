@@ -31,7 +31,7 @@ def covariate_in_words(name: str) -> str:
 
 
 def term_family_in_words(family: str) -> str:
-    """Return the name in words of a family of free-form terms: covariate, "scan by scan" if within scans, and form."""
+    """Write a family of bases in words: "time, scan by scan (locally)" for "time within scans, locally"."""
     name, _, how = family.partition(", ")
     stem = name.removesuffix(" within scans")
     said = covariate_in_words(stem) + (", scan by scan" if stem != name else "")
@@ -46,7 +46,7 @@ def covariate_unit(name: str, unit: str) -> str:
 
 
 def covariate_in_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
-    """Return the name of a covariate in words and its unit, "" if none is known."""
+    """Return a covariate's name in words, and its unit, "" if none is known."""
     unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ("scan" if name == "scan" else covariate_in_words(name)), covariate_unit(name, unit)
@@ -55,7 +55,7 @@ def covariate_in_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, s
 
 
 def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
-    """Return an axis label: the covariate, the scan if one is given, and the unit."""
+    """Return an axis label: the covariate in words, the scan (or run) if one is given, and the unit in brackets."""
     said, unit = covariate_in_words_and_unit(diagnosis, name)
     run = diagnosis.apparatus.words.run
     said += f", {run} {scan}" if scan is not None and name != run else ""
@@ -63,11 +63,10 @@ def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
 
 
 def covariate_values_by_place(diagnosis: Diagnosis) -> dict[str, FloatArray]:
-    """Return for each place in `diagnosis.where` the values of its covariate, (n_points,), by the name of its figure.
+    """Return the covariate's values (n_points,) of each place in `diagnosis.where`, by the place's figure file name.
 
-    A value is NaN in rows that the place does not cover. The values are those by which the diagnosis found the place.
-    If they were recomputed from another estimate of the sensor, a slope near an interval's end could fall on its other
-    side.
+    A place is a window of a covariate, or a scan, with significant residuals. Values are those the diagnosis used; NaN
+    in unusable rows and where undefined.
     """
     usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:
@@ -78,7 +77,10 @@ def covariate_values_by_place(diagnosis: Diagnosis) -> dict[str, FloatArray]:
 
 
 def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
-    """Return the name of each value of a categorical covariate (scan, direction, up to 24 orientations), else None."""
+    """Return the names, by value, of a place's covariate if it is scan, run, direction, or up to 24 orientations.
+
+    None for other covariates; of a simulator's covariates, only the run has names.
+    """
     if place.covariate == diagnosis.apparatus.words.run:
         return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}
     if isinstance(diagnosis.apparatus, SimulatorApparatus):

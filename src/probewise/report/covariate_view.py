@@ -1,4 +1,4 @@
-"""Covariates against which residuals are drawn: those of each place, and that of the first figure."""
+"""Covariates against which residuals are drawn: those with significant residuals, and that of the first figure."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _LEAST_PERIODS = 3.0  # least number of periods in a recording for folding it
 class CovariateView:
     """A covariate against which residuals are drawn.
 
-    `at` holds its values, (n_points,), NaN where it has none, and `label` is the axis label. `names` name the values of
-    a categorical covariate. `window` is the interval to shade, in the covariate's unit, or in positions on the axis for
-    a categorical one. `place` is the `Place` of the diagnosis that is shown, if any.
+    `at` holds its values, (n_points,), NaN in rows not drawn; `label` is the axis label. `names` gives each value's
+    name if the covariate is categorical. `window` is the interval to shade, in the covariate's unit or, if categorical,
+    in positions on the axis. `place` is the window with significant residuals that is drawn; None: another view.
     """
 
     at: FloatArray
@@ -45,7 +45,7 @@ class CovariateView:
 
     @property
     def category_names_on_axis(self) -> list[str] | None:
-        """Names of a categorical covariate's values in the order of the axis; None for other covariates."""
+        """Names of a categorical covariate's distinct values, in ascending order of value; None for others."""
         return None if self.names is None else [self.names[v] for v in _distinct_values(self.at)]
 
 
@@ -53,8 +53,8 @@ class CovariateView:
 class ResidualNoise:
     """Noise of residuals, for the band of chance about their means.
 
-    `sd`, (n_points,), is the noise sd of each reading, `rho` the AR(1) correlation. `absorbed`, (n_samples, n_points),
-    holds posterior predictions, whose variance the fit takes from the noise.
+    `sd`, (n_points,), is the noise sd of each reading, `rho` the AR(1) correlation within scans. `absorbed`,
+    (n_samples, n_points), holds posterior predictions, whose variance narrows the band; None: it is not narrowed.
     """
 
     sd: FloatArray
@@ -63,7 +63,7 @@ class ResidualNoise:
 
     @classmethod
     def of_diagnosis(cls, diagnosis: Diagnosis) -> ResidualNoise:
-        """Take the sds, the correlation and the posterior predictions from a diagnosis."""
+        """Take the repaired model's noise sds and correlation, and posterior predictions of the calibrated model."""
         found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
         sd = np.full(len(diagnosis.recording), float(diagnosis.repaired.noise_sd.mean()))
         if "ratio" in found:
@@ -75,7 +75,7 @@ class ResidualNoise:
         return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, diagnosis.recording.plan))
 
     def mean_residuals(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
-        """Average residuals in bins of a covariate; with `after`, also those of the repaired model."""
+        """Average the calibrated model's residuals in bins of a view; with `after`, also the repaired model's."""
         return mean_residuals(
             view.at,
             diagnosis.repair.before.residuals,
@@ -90,12 +90,12 @@ class ResidualNoise:
 
 
 def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
-    """Choose the covariate of the first figure: the first candidate with a mean clearly outside the band of chance.
+    """Choose the covariate of the first figure: the first candidate with a mean residual of 2.3 sds or more.
 
     If there is none, the candidate with the largest mean in sds; without candidates, the predicted reading.
 
-    Candidates in order: a named wave, folded at its period; the places, those whose covariate an unknown effect most
-    probably depends on first; last, the change that the repair makes.
+    Candidates in order: time, X or a column, folded at a named effect's period; covariates with significant residuals,
+    those on which an unknown effect most probably depends first; last, the repair's change of the predicted readings.
     """
     values = covariate_values_by_place(diagnosis)
     alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
@@ -112,10 +112,10 @@ def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> Cov
 
 
 def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
-    """Order the places for the report, each with whether a mean leaves the band of chance.
+    """List the places with significant residuals, each with True if a mean residual reaches 2.3 sds.
 
-    First the covariate of the unknown effect, which the headline names; then visible places; then the others. Of places
-    that are the same interval, one is kept.
+    First those whose covariate the unknown effect most probably depends on; then those with True; then the others. Of
+    places that are the same interval, one is kept.
     """
     values, seen = covariate_values_by_place(diagnosis), {}
     for place in diagnosis.where:
@@ -134,14 +134,13 @@ def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -
 
 
 def _is_same_interval(values: Mapping[str, FloatArray], place: Place, other: Place) -> bool:
-    """Return whether two places are the same interval of the same covariate."""
     ends = (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
     own, others = values[place.figure_name], values[other.figure_name]
     return ends and place.start is not None and np.array_equal(own, others, equal_nan=True)
 
 
 def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
-    """List the views of a place: if it is a whole scan or run, `view_along_scan`; then, always, along its covariate.
+    """List a place's views: `view_along_scan` if it is a whole scan or run; then, for every place, along its covariate.
 
     `at`, (n_points,), holds the covariate's values.
     """
@@ -162,9 +161,9 @@ def view_along_place_covariate(diagnosis: Diagnosis, place: Place, at: FloatArra
 
 
 def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
-    """Build the view of one scan along X or Y; along time where it is no line; of one run along its time or rows.
+    """Build the view of one scan along X or Y, whichever it spans more; along time if the scan is no line.
 
-    It shows residuals that change sign within the scan, whose mean over the scan is zero.
+    A run of a simulator's table is shown along its time or rows. Residuals that change sign within the scan show here.
     """
     plan = diagnosis.recording.plan
     rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
@@ -206,7 +205,10 @@ def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float
 
 
 def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
-    """List views in which time, X, or a table's column is folded at the period of a named wave."""
+    """List views of time, X or a column, folded at the period of each periodic effect of the verdict.
+
+    Only where the recording spans more than three periods.
+    """
     plan, out = diagnosis.recording.plan, []
     for effect in diagnosis.effects:
         found = {p.name: p.mean for p in effect.parameters}
@@ -231,9 +233,9 @@ def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
 def _covariates_and_periods_to_fold(
     diagnosis: Diagnosis, table: RunTable, effect: str, found: Mapping[str, float]
 ) -> list[tuple[FloatArray, float, str, str]]:
-    """List the covariates to fold for an effect on a table: values (n_points,), period, name and unit.
+    """List the covariate to fold for an effect on a simulator: values (n_points,), period, name, unit; empty if none.
 
-    A wave in time folds the time; a column's periodic error folds that column.
+    A wave in time folds the time, a column's periodic error that column. `found`: the effect's parameters by name.
     """
     if found.get("hz", 0.0) > 0:
         return [(table.time_s, 1 / found["hz"], *covariate_in_words_and_unit(diagnosis, "time"))]
@@ -249,9 +251,9 @@ def _view_against_repair_change(diagnosis: Diagnosis) -> CovariateView:
 
 
 def _shaded_interval(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
-    """Return the interval to shade for a window of a covariate; None if it has no ends and no category.
+    """Return the interval of the axis to shade for a place: from its start to its end; None if it has none.
 
-    It is from the window's start to its end or, with `names`, in category numbers, half a category beyond those within.
+    For a categorical covariate (`names`): half a position beyond the first and last category that the place holds.
     """
     ends = None if place.start is None or place.end is None else (place.start, place.end)
     if not names:

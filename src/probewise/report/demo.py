@@ -63,7 +63,7 @@ _SENSOR = (
 
 
 def summary_sentence(searches: Sequence[RobotSearch]) -> str:
-    """Summarise in one sentence how many readings the SSF model saves, after the same first reading."""
+    """State in one sentence how many readings the SSF and the naive robot needed after the same first reading."""
     naive, ssf = (len(s.run.steps) - 1 for s in searches)
     how = "" if all(s.run.reached for s in searches) else " (not every run reached that)"
     return (
@@ -73,7 +73,7 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
 
 
 def sds_after_equal_readings_text(searches: Sequence[RobotSearch]) -> str:
-    """Compare in a sentence both robots' widest posterior sds after as many readings as the SSF robot needed."""
+    """Compare both robots' widest posterior sds (mm) after as many readings as the SSF robot, the second, needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
     widest = naive.run.steps[naive.step_number_after(n) - 1].largest_sd_mm
@@ -91,7 +91,7 @@ def main_findings_by_key(
     concealed: str,
     seed: int,
 ) -> dict[str, str | int]:
-    """Return the page's main findings by key: seed, sentences, verdict and effects, for other pages to quote."""
+    """Return what other pages quote of the demo, by key: seed, verdict, its effects, the concealed one, sentences."""
     return {
         "seed": seed,
         "search": summary_sentence(started_alike),
@@ -106,7 +106,7 @@ def main_findings_by_key(
 
 
 def search_comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
-    """Return the comparison's cells, in the order of `HEADER`, one row per search."""
+    """Return the cells of the table of searches, in the order of `HEADER`, one row per search."""
     return [
         (
             s.model,
@@ -145,14 +145,14 @@ def encoded_figures(
     started_alike: Sequence[RobotSearch],
     geometry: Geometry,
 ) -> dict[str, bytes]:
-    """Draw all figures but the diagnosis's; return their PNGs by file name.
+    """Draw all figures of the demo but the diagnosis's; return their PNGs by file name.
 
     Parameters
     ----------
     calibration, recording, prediction
         The sensor model, the recording it was fitted to, and its prediction of that recording.
     searches
-        Both robots' searches from an empty field.
+        The naive and the SSF robot's search from an empty field.
     started_alike
         Both robots' searches from the same first reading, with places chosen by the paper's rule.
     geometry
@@ -182,7 +182,7 @@ def encoded_figures(
 
 
 def encoded_diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw the figures of the page's section on the diagnosis; return their PNGs by file name."""
+    """Draw the figures of the demo's section on the diagnosis; return their PNGs by file name."""
     likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
     labels = [h.label.replace("+", " + ") for h in likely]
     recording, before, after = diagnosis.recording, diagnosis.repair.before.readings, diagnosis.repair.after.readings
@@ -199,7 +199,7 @@ def encoded_diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
 
 
 def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
-    """Draw the paper's view after each of these numbers of readings, one row each, one column per search."""
+    """Draw the paper's view after each of `numbers` readings (rows) of each search (columns); return the axes."""
     window = window_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
     size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
@@ -231,7 +231,7 @@ def page_html(
     seed: int,
     seconds: float,
 ) -> str:
-    """Return the page's HTML.
+    """Return the HTML of the demo's page.
 
     Parameters
     ----------
@@ -422,7 +422,7 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
 
 
 def search_comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
-    """Write the comparison as lines of text: a table of each search's cost, another of its errors."""
+    """Write the comparison of searches as lines of text: a table of each one's cost, then another of its errors."""
     rows = [HEADER, *search_comparison_rows(searches)]
     costs, errors = [row[:-2] for row in rows], [(row[0], *row[-2:]) for row in rows]
     return [

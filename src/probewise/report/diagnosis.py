@@ -58,12 +58,12 @@ _NOISE_CAPTIONS = {
 
 
 def summary_sentence(diagnosis: Diagnosis) -> str:
-    """Return the verdict in twenty words at most."""
+    """Return a diagnosis's verdict in twenty words at most."""
     return headline(diagnosis)
 
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
-    """Build the page's sections below the first screen; `drawn` is from `encoded_figures`."""
+    """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `encoded_figures`."""
     return [
         Section("What it could be", _explanation_elements(diagnosis)),
         Section("Where it shows", _place_elements(diagnosis, drawn)),
@@ -80,7 +80,7 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
 def page_html(
     diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
 ) -> str:
-    """Return the page's HTML; `drawn` is from `encoded_figures`, `audit` the audit of the recording's plan, if any."""
+    """Return the HTML of a diagnosis's page; `drawn` is from `encoded_figures`, `audit` that of its plan, if any."""
     run = Section(
         "This run",
         (
@@ -123,7 +123,7 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
 
 
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """List a reader's questions, each with its answer in words: what to measure next, what was found, ..."""
+    """List pairs of a reader's question and its answer in words: what to measure next, what was found, ..."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
@@ -155,7 +155,7 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 def _simulator_facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """List, with their terms, the user's simulator and its number of calls; empty for the light sensor."""
+    """List pairs of term and text on the user's simulator and its number of calls; empty for the light sensor."""
     if not isinstance(diagnosis.apparatus, SimulatorApparatus):
         return []
     system = diagnosis.apparatus.system
@@ -176,7 +176,7 @@ def _formula_in_words(formula: Formula) -> str:
 
 
 def _reason_in_words(diagnosis: Diagnosis) -> str:
-    """Return the verdict's reason in words, without its sentence on the next plan, which the page gives elsewhere."""
+    """Return the verdict's reason, effect names with spaces for underscores, without its sentence on the next plan."""
     said = diagnosis.reason.partition(TO_SEPARATE)[0]
     names = "|".join(EFFECTS_IN_WORDS)
     return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
@@ -244,7 +244,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
 
 
 def _hypothesis_label_in_words(label: str) -> str:
-    """Write in words the label of a hypothesis that a plan separates; a label without effect names stays as it is."""
+    """Write a hypothesis's label "A with B" in words; one with any part that is no effect's name keeps its words."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
     said = join_names(map(effect_in_words, names)) if all(effect_has_words(name) for name in names) else named
@@ -301,7 +301,7 @@ def _unknown_candidate_in_words(name: str) -> str:
 
 
 def _unstated_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """Build a paragraph for each correction in posterior samples of the repaired model that no explanation has."""
+    """Build a paragraph for each effect in the repaired model's samples that is not among the diagnosis's `effects`."""
     return tuple(
         paragraph(_as_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.unstated_effects
@@ -331,7 +331,7 @@ def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 
 
 def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    """Build the figures of the places where residuals are significant; all but the first three are folded away."""
+    """Build the figures of the places with significant residuals; all but the first three are folded away."""
     if not diagnosis.where:
         return (paragraph("No residual is larger than noise explains."),)
     shown = [
@@ -453,7 +453,7 @@ def _effect_words_and_name(name: str) -> str:
 
 
 def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
-    """Return two texts: a parameter with its sd (and unit, if asked), and its 95 % interval."""
+    """Return two texts: a parameter's mean ± sd (with its unit if `unit`), and its 95 % interval."""
     low, high = found.interval95
     own = _unit_text(found) if unit else ""
     return typeset_numbers(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset_numbers(
@@ -466,7 +466,7 @@ def _unit_text(found: ParameterFound) -> str:
 
 
 def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """List the aliased pairs: those among the credible explanations first, the others folded away."""
+    """List the aliased pairs, those with effects of the credible set first; all but the first eight are folded away."""
     credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
     ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
@@ -494,7 +494,7 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
 
 
 def _readings_needed_text(n: int) -> str:
-    """Write the number of readings that would separate a pair: a dash for 0, a bound above the largest plan."""
+    """Write the number of readings that would separate a pair: a dash for 0, "102 or more" from the largest plan on."""
     return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
 
 
@@ -531,7 +531,7 @@ def _as_sentence(text: str) -> str:
 
 
 def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
-    """Return a place's caption: where residuals are significant, the p-value, whether a mean leaves the band."""
+    """Return a place's caption: where residuals are significant, p-value, and, if not `seen`, why no mean shows it."""
     run = diagnosis.apparatus.words.run
     covariate, unit = covariate_in_words_and_unit(diagnosis, place.covariate)
     if place.covariate == run:

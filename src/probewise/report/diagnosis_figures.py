@@ -45,10 +45,7 @@ _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readin
 
 
 def encoded_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw all figures; return their SVGs by file name.
-
-    They show: evidence and explanations, before and after, residuals, noise, held-out gain, and each place.
-    """
+    """Draw a diagnosis's figures; return SVGs by file name: first, before and after, residuals, noise, gain, places."""
     chance, values = ResidualNoise.of_diagnosis(diagnosis), covariate_values_by_place(diagnosis)
     drawn = {
         "first.svg": _first_figure_svg(diagnosis, chance),
@@ -72,10 +69,9 @@ def encoded_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
 
 
 def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> CovariateView | str:
-    """Choose the content of the first figure.
+    """Choose the content of a diagnosis's first figure: "readings" if they are too few for a diagnosis.
 
-    It is a view of residuals along a covariate, the name of the largest noise effect, or "readings" if they are too few
-    for a diagnosis.
+    For the verdict `noise` it is the name of the largest noise effect, else a view of residuals along a covariate.
     """
     if diagnosis.judged.too_little:
         return "readings"
@@ -86,7 +82,7 @@ def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = No
 
 
 def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
-    """Draw what shows the verdict best and, below it, the probability of each explanation."""
+    """Draw the first figure's content (`first_figure_content`) and, below it, the probability of each explanation."""
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names = [hypothesis_in_words(h.effects) for h in listed]
     n_bars = min(len(listed), _MOST_BARS) + (len(diagnosis.hypotheses) > min(len(listed), _MOST_BARS))
@@ -112,8 +108,7 @@ def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 def _place_svg(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
     """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
 
-    A whole scan or run is drawn along X, Y, time or rows, which shows residuals that change sign, and below that beside
-    the others.
+    A whole scan or run gets two panels: above, its residuals along X, Y, time or rows; below, its mean beside others.
     """
     by_covariate = view_along_place_covariate(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
@@ -142,7 +137,7 @@ def _draw_means_along(
 
 
 def _spread_within_categories(at: FloatArray) -> FloatArray:
-    """Return positions on the axis, (n_points,): rows of the k-th value spread evenly, in order of time, about k."""
+    """Return positions on the axis, (n_points,): rows of the k-th value spread evenly, in row order, about k."""
     out = np.full(at.shape, np.nan)
     for k, value in enumerate(np.unique(at[np.isfinite(at)])):
         rows = np.flatnonzero(at == value)
@@ -151,7 +146,7 @@ def _spread_within_categories(at: FloatArray) -> FloatArray:
 
 
 def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
-    """Draw the scan that the repair changes most: readings and both models, and below them the residuals."""
+    """Draw the scan that the repair changes most (else the longest): readings, one or both models, residuals below."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
     rows = rows_of_scan_changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
@@ -168,11 +163,9 @@ def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
 
 
 def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
-    """Return the rows of the scan with the largest sum of squared changes; the longest if none changes.
+    """Return row numbers of the scan with the largest sum of squares of `change`; of the longest if nothing changes.
 
-    Scans along a line are preferred.
-
-    `change` is the change of each predicted reading, (n_points,).
+    `change`, (n_points,), is the repair's change of each predicted reading. Scans along a line are preferred.
     """
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
     lines = [rows for rows in scans if is_scan_along_line(plan, rows)]
@@ -202,7 +195,7 @@ def _noise_tests_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 
 
 def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
-    """Return a function that draws on given axes the panel of a noise effect; the default is spread by level."""
+    """Return a function that draws a noise effect's panel on axes; for other names, spread by predicted reading."""
     recording, residuals = diagnosis.recording, np.array(diagnosis.repair.after.residuals)
     unit = unit_name(recording.plan.instrumentation.unit)
     found = {p.name: p.mean for p in diagnosis.report.noise.parameters}

@@ -19,7 +19,7 @@ SATURATION = 40.0
 
 
 def summary_sentence(searches: Sequence[RobotSearch]) -> str:
-    """Say in one sentence how both robots ended, the trusting one first."""
+    """Say in one sentence how both robots ended (readings, largest error, widest sd), the trusting one first."""
     trusting, doubting = (
         f"{count_with_noun(len(s.run.steps), 'reading')}, off by {number_text(s.largest_error_mm, 1)} mm "
         f"(posterior sd up to {number_text(s.run.last.largest_sd_mm, 1)} mm)"
@@ -29,7 +29,7 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
 
 
 def encoded_figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
-    """Draw both final posteriors, and the doubting robot's probabilities of effects; return PNGs by file name."""
+    """Draw both robots' final posteriors, and the doubting one's probabilities of effects; return PNGs by file name."""
     ends = np.array([window_mm([s.run], len(s.run.steps)) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)

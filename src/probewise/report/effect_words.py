@@ -46,10 +46,7 @@ def effect_in_words(name: str) -> str:
 
 
 def hypothesis_in_words(effects: Sequence[str]) -> str:
-    """Return the name in words of a hypothesis.
-
-    It is given by its effects: () for clean, ("unknown",) for an effect out of vocabulary.
-    """
+    """Return a hypothesis in words, given its effects: () for clean, ("unknown",) for an effect out of vocabulary."""
     if not effects:
         return "nothing is missing"
     return "something without a name" if tuple(effects) == ("unknown",) else join_names(map(effect_in_words, effects))

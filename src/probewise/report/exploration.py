@@ -57,7 +57,7 @@ def draw_robot_view(
     title: str = "",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the robot's view of the field after a step (the paper's picture).
+    """Draw the robot's view of the field after a step, as in the paper; return the axes.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def robot_view_png(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the robot's view after one step, with its legend, as a PNG; parameters as in `draw_robot_view`."""
+    """Draw the robot's view after one step, with its legend; return a PNG; parameters as in `draw_robot_view`."""
     ax = draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
     draw_field_legend(ax)
     return png(ax, dpi=90, tight=False)
@@ -118,9 +118,9 @@ def robot_views_by_model_png(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the posteriors of several sensor models from the same readings, one below the other, as a PNG.
+    """Draw the posteriors of several sensor models from the same readings, one below the other; return a PNG.
 
-    Each view is a title, a step and the experiment it belongs to; the rest is as in `draw_robot_view`.
+    Each of `views` is a title, a step and the experiment it belongs to; the rest is as in `draw_robot_view`.
     """
     axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
@@ -131,9 +131,10 @@ def robot_views_by_model_png(
 
 
 def live_page_html(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust: float = 1.0) -> str:
-    """Return the HTML of the page that shows a running exploration: it reloads every second until the run ends.
+    """Return the HTML of a running exploration's page after `step`; it reloads every second until the run ends.
 
-    Where `trust` in the sensor is below 1, the probabilities of sensor faults after every step follow the picture.
+    `picture` is a PNG. If `trust` in the sensor model is below 1, the probabilities of its possible faults follow,
+    after each of the `earlier` steps and this one.
     """
     state = "The robot works" if step.stop_reason is None else f"The robot has stopped: {step.stop_reason}"
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
@@ -167,7 +168,7 @@ def _fault_section(steps: Sequence[Step], trust: float) -> Section:
 
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
-    """Write each parameter's estimate minus its truth, with the posterior sd; those without a truth are left out."""
+    """Write each parameter's estimate minus its truth, ± its posterior sd; those without a truth are left out."""
     step, truth = run.last, _truth_with_angles_near_estimate(run, truth)
     return ", ".join(
         f"{without_unit(_without_shape_prefix(step, name))} "
@@ -178,7 +179,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
 
 
 def _truth_with_angles_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[str, float]:
-    """Return the truth with its angle within half a turn of the estimate's: a rectangle's sides may then be swapped."""
+    """Return the truth by name, its angle nearest the estimate's by the shape's symmetry; two sides may be swapped."""
     step = run.last
     likely, columns = shape_and_columns(run.experiment.shape, step.likely_shape)
     names = [step.names[k] for k in columns]
@@ -189,7 +190,7 @@ def _truth_with_angles_near_estimate(run: Exploration, truth: Mapping[str, float
 
 
 def summary_sentence(run: Exploration) -> str:
-    """Summarise in one sentence: the number of readings, the shape found, and its parameters."""
+    """Summarise an exploration: number of readings, the shape found and its parameters."""
     found = found_shape(run)
     several = f" (probability {probability_text(found.probability)})" if run.last.shapes else ""
     known = ", ".join(
@@ -204,7 +205,7 @@ def summary_sentence(run: Exploration) -> str:
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
-    """Build the table of the shape's parameters with their sds, and the truth where known."""
+    """Build the table of the shape found: each parameter's mean, sd, 95 % interval, and the truth where known."""
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm_error is not None else ()
@@ -227,7 +228,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
 
 
 def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
-    """Build the table of steps: place, reading (in `unit`), then the widest posterior sd and the information so far."""
+    """Build an exploration's table of steps: place, reading (in `unit`), widest posterior sd, bits so far."""
     reading = f"reading ({unit_name(unit)})" if unit else "reading"
     return table(
         ("number", "at (mm)", reading, "widest sd (mm)", "information so far (bits)"),
@@ -255,7 +256,7 @@ def page_html(
     beside: Mapping[str, Sequence[Step]] | None = None,
     unit: str = "LEGO",
 ) -> str:
-    """Return the page's HTML.
+    """Return the HTML of an exploration's page.
 
     Parameters
     ----------
@@ -268,7 +269,7 @@ def page_html(
     truth
         Parameters of the true shape by name, where known.
     beside
-        Steps of other sensor models from the same readings, by name of the model.
+        Steps of other sensor models, updated with the same readings, by name of the model.
     unit
         Unit of the readings.
     """
@@ -357,7 +358,6 @@ def _fit_in_words(p_value: float) -> str:
 
 
 def _without_shape_prefix(step: Step, name: str) -> str:
-    """Drop the shape's name in front of a parameter name."""
     return name.removeprefix(f"{step.likely_shape}.")
 
 

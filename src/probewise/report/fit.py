@@ -1,4 +1,4 @@
-"""The page of a fit: predicted against recorded, posterior, evidence, residuals."""
+"""The page of a fit of a user's simulator: predicted against recorded, posterior, evidence, residuals."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 
 
 def summary_sentence(fit: SystemFit) -> str:
-    """Summarise in one sentence: number of readings, and rms of the residuals."""
+    """Summarise a fit of a simulator in one sentence: number of readings, and rms of the residuals."""
     unit = unit_name(fit.recording.plan.instrumentation.unit)
     n = int(fit.recording.usable.sum())
     return f"The simulator fits {n} readings with residuals of {fit.rms:.3g} {unit} (rms)."
 
 
 def encoded_figures(fit: SystemFit) -> dict[str, bytes]:
-    """Draw recorded against predicted, and residuals; return SVGs by file name.
+    """Draw a fit's recorded against predicted readings, and residuals; return SVGs by file name.
 
-    Residuals are drawn against time, predicted reading, and up to four columns of eight values or more.
+    Residuals are drawn against time, predicted reading, and up to four input columns of eight distinct values or more.
     """
     recording, own = fit.recording, fit.fitted.simulator
     unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
@@ -49,7 +49,7 @@ def _labelled_covariates(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, Flo
 
 
 def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
-    """Return the page's HTML; `drawn` is from `encoded_figures`."""
+    """Return the HTML of a fit's page; `drawn` is from `encoded_figures`."""
     own, evidence = fit.fitted, fit.evidence
     median, interval = np.median(own.samples, axis=0), own.interval()
     error = f" ± {number_text(evidence.error, 2)}" if evidence.error else ""

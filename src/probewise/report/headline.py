@@ -19,12 +19,12 @@ _MOST_RIVALS = 3
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one or two sentences: the most complete version of at most twenty words."""
+    """Return a diagnosis's verdict in one or two sentences: the most complete version of at most twenty words."""
     return next(said for said in _verdict_versions(diagnosis) if len(said.split()) <= MOST_WORDS)
 
 
 def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
-    """List versions of the verdict, the most complete first; the last is always short enough."""
+    """List wordings of a diagnosis's verdict, the most complete first; the last always has at most twenty words."""
     n = int(diagnosis.recording.usable.sum())
     if diagnosis.judged.too_little:
         return [_too_few_readings_sentence(diagnosis, n)]
@@ -99,7 +99,7 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
 
 
 def _join_rival_hypotheses(rivals: Sequence[tuple[str, ...]]) -> str:
-    """Name hypotheses as in "A, B or C", without the effects that all share."""
+    """Name hypotheses, given their effects, as in "A, B or C", without the effects that all share."""
     shared = frozenset.intersection(*map(frozenset, rivals))
     *others, last = (hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals)
     return f"{', '.join(others)} or {last}" if others else last

@@ -12,7 +12,7 @@ from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 def part_with_largest_gain(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
     """Return the held-out part with the largest gain: name, gain in nats per reading, row numbers, (n_rows,).
 
-    None where nothing was repaired, or nothing could be held out.
+    None if the repair changes no prediction, or nothing could be held out.
     """
     gains = diagnosis.improvement.heldout_by_scan
     if not diagnosis.repair.changes_predictions or not gains:

@@ -31,7 +31,10 @@ class Section:
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
-    """Build an element; in names of attributes a trailing underscore is dropped (`class_`), others become hyphens."""
+    """Build an element; of attribute names, a trailing underscore is dropped (`class_`), others become hyphens.
+
+    Children and attribute values are escaped; a child that is `Markup` is kept.
+    """
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items()
     )
@@ -39,20 +42,17 @@ def element(tag: str, *children: str, **attributes: str) -> Markup:
 
 
 def fragment(*children: str) -> Markup:
-    """Join children, escaping those that are plain text."""
+    """Join children into one Markup, escaping those that are plain text."""
     return Markup("".join(c if isinstance(c, Markup) else html.escape(c) for c in children))
 
 
 def paragraph(*children: str, class_: str = "") -> Markup:
-    """Build a paragraph."""
+    """Build a paragraph, with the CSS class `class_` if given."""
     return element("p", *children, class_=class_) if class_ else element("p", *children)
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str = "") -> Markup:
-    """Build a table; numeric cells use digits of equal width.
-
-    On a narrow screen a table of more than three columns is shown row by row, each cell under its heading.
-    """
+    """Build a table, one cell per heading in each row (else ValueError); digits of numeric cells have equal width."""
     wide = len(header) > _MOST_COLUMNS
     head = element("tr", *(element("th", cell, scope="col") for cell in header))
     labels = header if wide else [""] * len(header)
@@ -83,7 +83,7 @@ def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
 
 
 def _least_width_attribute(png: bytes) -> str:
-    """Return a style attribute: the width below which a PNG's text is too small, 0.9 of the width as drawn."""
+    """Return a style attribute: the width (CSS px) below which a PNG's text is too small, 0.9 of the width as drawn."""
     with Image.open(io.BytesIO(png)) as picture:
         dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
         return f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'

@@ -32,7 +32,7 @@ def probabilities_figure_html(found: Investigation) -> Markup:
 
 
 def summary_sentence(found: Investigation) -> str:
-    """Return the last verdict in words, the number of readings beyond the first plan, and whether they settled it."""
+    """Return an investigation's last headline, the readings beyond the first plan, and whether they settled it."""
     extra = found.extra_readings
     taken = (
         f"{count_with_noun(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
@@ -49,12 +49,12 @@ def page_html(
     seed: int,
     concealed: Sequence[str] | None = None,
 ) -> str:
-    """Return the page's HTML.
+    """Return the HTML of an investigation's page.
 
     Parameters
     ----------
     found
-        All rounds.
+        The investigation, with all rounds.
     drawn
         Figures of the last diagnosis, by file name.
     source

@@ -25,7 +25,7 @@ def fine_entropy_map(run: Exploration, number: int) -> UtilityMap:
     Parameters
     ----------
     run
-        A run with a known sensor.
+        A run whose sensor model has no parameters to learn.
     number
         Number of the reading, from 1.
     """
@@ -47,6 +47,8 @@ def paper_view(
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the robot's view after a reading as the paper does: a fine entropy map, with the sampled circles.
+
+    Return the axes.
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ def paper_view(
 
 
 def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:
-    """Return the limits (mm) of a window that holds all readings and each run's circles sampled after reading `first`.
+    """Return limits of a window that holds all readings and each run's circles sampled after reading `first`.
 
     Parameters
     ----------
@@ -99,7 +101,7 @@ def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, fl
 
     Returns
     -------
-    Left, right, lower and upper end.
+    Left, right, lower and upper end in mm, with a margin of 30 mm inside the field.
     """
     grid = runs[0].experiment.grid
     drawn = [outline for run in runs for outline in outlines(run.experiment.shape.region(run.steps[first - 1].samples))]
@@ -110,7 +112,7 @@ def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, fl
 
 
 def _reachable_on_fine_grid(coarse: Grid, fine: Grid, reachable: BoolArray) -> BoolArray:
-    """Return the mask of reachable places on the finer grid, (n_places,), by the nearest place of the robot's grid."""
+    """Return the mask of the fine grid's reachable places, (n_places,): each as the nearest place of the coarse one."""
     rows = np.rint(np.linspace(0, coarse.n_y - 1, fine.n_y)).astype(np.int64)
     columns = np.rint(np.linspace(0, coarse.n_x - 1, fine.n_x)).astype(np.int64)
     return np.asarray(reachable.reshape(coarse.n_y, coarse.n_x)[np.ix_(rows, columns)].ravel())

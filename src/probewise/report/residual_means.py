@@ -34,7 +34,7 @@ class ResidualMeans:
 
     @property
     def largest_mean_in_sds(self) -> float:
-        """Largest absolute mean of the calibrated model's residuals, in sds of that mean under chance."""
+        """Largest absolute mean of `before`, in sds of that mean by chance; 0 without bins."""
         return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
 
 
@@ -93,7 +93,7 @@ def _groups_by_value(values: FloatArray) -> list[IntArray]:
 
 
 def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
-    """Group rows by equal steps of the covariate; small neighbours are joined, but not across the window's ends."""
+    """List row numbers by equal steps of the covariate; groups of few rows are joined, not across the window's ends."""
     if values.size == 0:
         return []
     if window is None:
@@ -107,7 +107,7 @@ def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> 
 
 
 def _groups_of_given_rows(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
-    """Group some of the rows, by equal steps of the covariate; in equal numbers where most rows share a few values."""
+    """Split `rows` by equal steps of the covariate; into equal numbers where most of them share a few values."""
     mine = values[rows]
     share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
     n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
@@ -124,7 +124,7 @@ def _rows_by_step(mine: FloatArray, rows: IntArray, n: int) -> list[IntArray]:
 
 
 def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
-    """Join successive groups until each has `least` rows."""
+    """Join successive groups until each has `least` rows; what remains joins the last."""
     groups: list[IntArray] = []
     waiting = np.empty(0, dtype=np.int64)
     for part in parts:
@@ -136,7 +136,7 @@ def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
 
 
 def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float) -> float:
-    """Return the variance of the mean of some rows' noise, which is AR(1) within scans."""
+    """Return the variance of the mean noise over `rows`; the noise is AR(1) within scans."""
     own = np.zeros(len(scan))
     own[rows] = sd[rows]
     variance = float(own @ own)
@@ -146,7 +146,7 @@ def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float
 
 
 def _longest_lag(rho: float) -> int:
-    """Return the lag at which an AR(1) correlation falls below a hundredth; 0 if it is that small, or not below 1."""
+    """Return the lag at which an AR(1) correlation falls below 0.01; 0 if |rho| is not between 0.01 and 1."""
     return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0
 
 

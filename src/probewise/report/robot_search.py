@@ -13,7 +13,7 @@ from probewise.experiment import Exploration
 class RobotSearch:
     """One robot's search: its sensor model's name, its run, the true shape, and the readings over black and white.
 
-    `truth` holds the shape's parameters by name, `truth_mm` its outline, (n_vertices, 2).
+    `truth` holds the shape's parameters by name, `truth_mm` its outline, (n_vertices, 2); `levels` is (black, white).
     """
 
     model: str
@@ -24,7 +24,7 @@ class RobotSearch:
 
     @property
     def largest_error_mm(self) -> float:
-        """Largest absolute error of a place or length at the end, in mm."""
+        """Largest absolute error, estimate against truth, of the parameters in mm (places, lengths) at the end."""
         last = self.run.last
         return max(
             abs(float(mean) - self.truth[name])

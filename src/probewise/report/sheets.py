@@ -53,13 +53,13 @@ class Sheet:
     outline_mm
         Line to cut along, (n, 2), or None.
     crosses_mm
-        Crosses to bring the sensor or a joint to, (n, 2).
+        Crosses to bring the sensor or a joint to, (n, 2), or None.
     cross_names
         Text beside each cross; empty: its number and place.
     strokes_mm
         Further lines, (n, 2) each.
     words
-        Further texts, with the place of their left end.
+        Further texts, each with x and y (mm) of its left end before it.
     frame
         Origin of x and y, in words.
     orientations_rad
@@ -81,7 +81,7 @@ class Sheet:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height."""
+        """Width and height, in mm."""
         return self.high_mm[0] - self.low_mm[0], self.high_mm[1] - self.low_mm[1]
 
 
@@ -114,7 +114,7 @@ class Tile:
 
 
 def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
-    """Split a sheet into pages, portrait or landscape, whichever needs fewer.
+    """Split a sheet into pages, portrait or landscape, whichever needs fewer; `paper` is "a4" or "letter".
 
     Returns
     -------
@@ -152,7 +152,7 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
-    """Make one sheet per pattern, as large as the plan's readings need.
+    """Make one sheet per pattern, which reaches 40 mm or more beyond the plan's readings.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) ->
 
 
 def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
-    """Make the sheet of the black field with a white target in place, of the given closed outline, (n, 2)."""
+    """Make the sheet of the field: black, with the target white inside its closed outline, (n, 2); None: all black."""
     pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_vertices_without_closing(outline_mm))
     said = "all black" if outline_mm is None else "black, the target white at its place"
     return Sheet("field", pattern, (0.0, 0.0), field_mm, (said,), frame="the field's lower left corner")
@@ -204,7 +204,7 @@ def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
 
 
 def marks_sheet(geometry: Geometry) -> Sheet:
-    """Make the sheet of crosses that `arm fit-geometry` uses."""
+    """Make the sheet, as large as the field, of numbered crosses at which `arm fit-geometry` measures the arm."""
     marks = spread_mark_places(geometry)
     lines = (
         f"{len(marks)} crosses for `probewise arm fit-geometry`, numbered",
@@ -215,7 +215,7 @@ def marks_sheet(geometry: Geometry) -> Sheet:
 
 
 def arm_home_jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
-    """Make the sheets that show an arm at its home angles: its links from the side, its base from above."""
+    """Return two sheets that show an arm at its home angles: its links from the side, and its base from above."""
     base, shoulder, elbow = (joint.home_rad for joint in geometry.joints)
     lower = shoulder + elbow if geometry.elbow_is_relative else elbow
     joints = [np.array(geometry.shoulder_mm)]
@@ -315,7 +315,7 @@ def _n_pages_along(length_mm: float, room_mm: float) -> int:
 
 
 def _points_sheet_must_show(pattern: Pattern) -> FloatArray:
-    """Return places of a pattern that its sheet must show when there is no plan, (n, 2)."""
+    """Return places, (n, 2), in mm that a pattern's sheet must show when there is no plan."""
     match pattern:
         case Disc((x, y), radius):
             return np.array([[x - radius, y - radius], [x + radius, y + radius]])

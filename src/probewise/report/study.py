@@ -41,7 +41,7 @@ def summary_sentence(study: Study) -> str:
 
 
 def result_tables(study: Study) -> Markup:
-    """Build two tables, each with a line for every row of the study: readings needed; information, errors and cost."""
+    """Build two tables, a line for each row of the study: readings needed; information, errors, and time spent."""
     readings = (
         "row",
         "runs",
@@ -70,7 +70,7 @@ def result_tables(study: Study) -> Markup:
 def lower_bound_table(study: Study) -> Markup | None:
     """Build the table of a lower bound, for any strategy, on the mean number of readings, beside the measured mean.
 
-    None if the study has no row to which the bound applies: default options and the correct sensor model.
+    None if no row of the study has default options (but for circles and noise) and the correct sensor model.
     """
     lines = []
     for row, found in study.table().items():
@@ -98,7 +98,7 @@ def lower_bound_table(study: Study) -> Markup | None:
 
 
 def table_csv(study: Study) -> str:
-    """Return the table as text of a CSV file: estimates with bounds; processor times, which vary, are left out."""
+    """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
     bounds = [f"{name}{end}" for name, _ in _COLUMNS for end in ("", "_low", "_high")]
     rows = []
     for row, found in study.table().items():
@@ -110,7 +110,7 @@ def table_csv(study: Study) -> str:
 
 
 def page_html(study: Study, *, command: str) -> str:
-    """Return the page's HTML; `command` is the command line that made it."""
+    """Return the HTML of a study's page; `command` is the command line that made the study."""
     summaries = study.table()
     curves = {
         row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in study.trials[row]]

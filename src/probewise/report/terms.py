@@ -38,10 +38,7 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 def explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
-    """Build the paragraph that explains the terms of an HTML text which are not in `known`, and add them to `known`.
-
-    Empty if there is none.
-    """
+    """Build the paragraph on an HTML text's terms not in `known`, empty if there is none; add the terms to `known`."""
     text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
     new: list[str] = []
     while text:  # an explanation may use a term itself

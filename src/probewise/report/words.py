@@ -10,7 +10,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number_text(value: float, digits: int) -> str:
-    """Write a number with fixed decimals and a true minus sign; a dash for NaN."""
+    """Write a number with fixed decimals and a true minus sign; a dash if it is not finite."""
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
 
 
@@ -31,7 +31,7 @@ def value_with_error(value: float, error: float, unit: str = "") -> str:
 
 
 def interval_text(low: float, high: float) -> str:
-    """Write the ends of an interval, both to the third significant digit of its width."""
+    """Write the ends of an interval, both to the third significant digit of its width; one number if the width is 0."""
     width = high - low
     if not (math.isfinite(width) and width > 0):
         return "–" if not math.isfinite(low) else f"{low:.6g}"
@@ -47,13 +47,13 @@ def value_and_interval_texts(value: float, low: float, high: float) -> tuple[str
 
 
 def unit_of(name: str) -> str:
-    """Return the unit as written that a parameter's name ends with: "mm" of x_mm, "°" of turn_deg; "" if none."""
+    """Return the unit, as written, at the end of a parameter's name: "mm" of x_mm, "°" of turn_deg; "" if none."""
     stem, _, suffix = name.rpartition("_")
     return _UNITS.get(suffix, "") if stem else ""
 
 
 def without_unit(name: str) -> str:
-    """Write a parameter's name as words, without its unit."""
+    """Write a parameter's name without its unit, spaces for underscores and dots."""
     stem = name.rpartition("_")[0] if unit_of(name) else name
     return stem.replace("_", " ").replace(".", " ")
 
@@ -74,7 +74,7 @@ def typeset_numbers(text: str) -> str:
 
 
 def count_with_noun(n: int, noun: str) -> str:
-    """Write a count with its noun, in the plural if needed."""
+    """Write a count with its noun, plus "s" unless the count is 1."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 

@@ -1,4 +1,4 @@
-"""The paper's figures and others, one function each: data first, then the axes to draw on.
+"""The paper's figures and others, one function each: data first, then the axes to draw on, which are returned.
 
 Without axes, a function opens a pyplot figure of suitable size, so that `plt.savefig` and `plt.show` find it; no global
 style is set.

@@ -71,7 +71,7 @@ def arm_and_sensor(
 
 
 def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring it.
+    """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring; return the axes.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Ax
 def _draw_dimension(
     ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, *, side: str = "above"
 ) -> None:
-    """Draw a dimension line with arrows and text, parallel to a part and away from it."""
+    """Draw a dimension line, with arrows and text, parallel to the part from `begin` to `end` and offset by `away`."""
     a, b = begin + away, end + away
     for here, there in ((begin, a), (end, b)):
         ax.plot([here[0], there[0]], [here[1], there[1]], color=GREY, linewidth=0.6, zorder=1)
@@ -174,7 +174,7 @@ def draw_sensor_face(
     center, size
         Middle and width of the package, in the axes' units.
     turned_rad
-        Orientation; at 0 the photodiode is at the top.
+        Orientation, anticlockwise in the drawing; at 0 the photodiode is at the top.
     zorder
         Of the lowest part.
     """

@@ -73,14 +73,14 @@ def reach_map(
 
 
 def _unwrapped_about_mean_deg(degrees: FloatArray) -> FloatArray:
-    """Shift angles by full turns to within 180 degrees of their mean, so that 179 and -179 are neighbours in colour."""
+    """Shift angles (degrees) by full turns to within 180 of their mean, so that 179 and -179 have similar colours."""
     known = np.radians(degrees[np.isfinite(degrees)])
     middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0
     return np.asarray(middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0)
 
 
 def _contour_levels_deg(degrees: FloatArray) -> FloatArray:
-    """Return the multiples of 15 degrees at which contours are drawn, (n_lines,); none if no angle is finite."""
+    """Return the multiples of 15 degrees within the range of the angles, (n_lines,); none if no angle is finite."""
     known = degrees[np.isfinite(degrees)]
     if not known.size:
         return known
@@ -88,5 +88,5 @@ def _contour_levels_deg(degrees: FloatArray) -> FloatArray:
 
 
 def _angle_text(degrees: float) -> str:
-    """Write an angle, taken to between -180 and 180 degrees, without decimals and with a true minus sign."""
+    """Write an angle in degrees, taken to -180 to 180, without decimals and with a true minus sign."""
     return number_text((degrees + 180.0) % 360.0 - 180.0, 0)

@@ -37,7 +37,7 @@ def audit_matrix(
     alias: float,
     axes: AxesGrid | None = None,
 ) -> AxesGrid:
-    """Draw the detectable share of each effect, and how well every other effect imitates it.
+    """Draw the detectable share of each effect, and how well every other effect imitates it; fine effects come first.
 
     The matrix is not symmetric: the row is the effect that is present, at typical parameters; the column is the effect
     it may be mistaken for, at its best-fitting parameters.

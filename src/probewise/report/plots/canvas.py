@@ -102,7 +102,7 @@ def axes_or_grid(
 
 
 def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
-    """Open a pyplot figure, which `png` or `svg` will close."""
+    """Open a pyplot figure, which `png` or `svg` will close, and return it."""
     sheet = plt.figure(figsize=size_in, layout=layout)
     _OPENED.add(sheet)
     return sheet
@@ -133,14 +133,14 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
 
 
 def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
-    """Open a figure and return its axes, one above the other, (n_axes,); `svg` computes their margins."""
+    """Open a figure and return its axes of these heights, one above the other, (n_axes,); `svg` sets their margins."""
     sheet = new_figure((width_in, sum(heights_in)))
     axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
     return np.asarray(axes[:, 0], dtype=np.object_)
 
 
 def svg(drawing: Axes | AxesGrid) -> bytes:
-    """Render the figure of a drawing as SVG, reproducible byte for byte; it is closed as by `png`."""
+    """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
     ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
     sheet = cast(Figure, ax.figure)
     sheet.tight_layout(pad=0.4, h_pad=0.9)
@@ -159,7 +159,7 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
     """Place the legend above the axes, in as many columns as fit, so that it never covers data.
 
     A label that is wider than the axes is broken into lines: otherwise the layout would leave no room for the axes.
-    Returns the number of lines of the longest column.
+    Returns the number of lines of text in the longest column, 0 without labels.
     """
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
@@ -185,18 +185,17 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
 
 
 def _legend_width_letters(labels: Sequence[str], n_columns: int) -> int:
-    """Estimate a legend's width in letters."""
     return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _legend_lines_by_column(labels, n_columns))
 
 
 def _legend_lines_by_column(labels: Sequence[str], n_columns: int) -> list[list[str]]:
-    """Return the lines of text in each column of a legend, which matplotlib fills from the left."""
+    """Return the lines of text in each column of a legend, which is filled column by column."""
     columns = np.array_split(np.array(labels, dtype=np.object_), n_columns)
     return ["\n".join(column).split("\n") for column in columns]
 
 
 def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
-    """Write tick labels in full, without a separate factor or offset."""
+    """Write tick labels in full, without a factor or offset; with a power of ten if the axis is shorter than 1e-5."""
     for axis in ([ax.xaxis] if x else []) + ([ax.yaxis] if y else []):
         low, high = axis.get_view_interval()
         if high - low > _LEAST_IN_FULL:

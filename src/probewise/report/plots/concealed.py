@@ -1,4 +1,4 @@
-"""A study of the robot with concealed faults: with doubt in its sensor beside trust, row by row."""
+"""A study of the robot with concealed faults: runs that doubt the sensor model beside runs that trust it, by effect."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _PANELS = (
 
 
 def effect_and_size_in_words(row: ConcealedRow) -> str:
-    """Name a row: the concealed effect in words, and its size."""
+    """Name a row: the concealed effect in words and, if it has one, its size."""
     name = effect_in_words(row.concealed) if effect_has_words(row.concealed) else row.concealed.replace("_", " ")
     return name if row.size is None else f"{name}, {row.size:g}"
 
 
 def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None = None) -> AxesGrid:
-    """Compare doubt with trust: runs that are sure and wrong, intervals that cover the truth, and readings.
+    """Compare doubt in the sensor model with trust: runs sure and wrong, intervals that hold, median readings.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, 
     """Draw one stacked bar per reading: the probability of each effect that the sensor model may leave out.
 
     A dashed line before a bar marks a reading that changed the most probable effect. The five effects of the highest
-    probability have colours; the others are one part.
+    probability after any reading have colours; the others are one part.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from probewise.report.plots.canvas import BLACK, BLUE, label_axes, legend_above,
 def recorded_against_predicted(
     readings: FloatArray, predicted: FloatArray, sd: FloatArray, *, label: str, unit: str, ax: Axes | None = None
 ) -> Axes:
-    """Draw each reading against its prediction, with one sd of a new reading.
+    """Draw each reading against its prediction, with an error bar of one sd of a new reading.
 
     Parameters
     ----------

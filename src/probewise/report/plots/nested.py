@@ -60,7 +60,7 @@ def trace_plot(
     result
         The run.
     parameters
-        Names of the parameters to draw, in this order; default: all.
+        Names of the parameters to draw, in this order; default: all. ParameterError for an unknown name or none.
     axes
         Axes to draw on, of the shape returned; a new figure without.
 
@@ -143,7 +143,7 @@ def corner_plot(
     result
         The run, or weighted samples.
     parameters
-        Names of the parameters to draw, in this order; default: all.
+        Names of the parameters to draw, in this order; default: all. ParameterError for an unknown name or none.
     axes
         Axes to draw on, (n, n); those above the diagonal are hidden. A new figure without.
 
@@ -219,7 +219,7 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
 
     Every new point is equally likely to take any rank (Fowlie, Handley & Su 2020). Too many low ranks mean that chains
     are too short to leave the likelihood bound; too many high ranks mean that a region was lost. The band holds all
-    bars at once in 99 of 100 correct runs (binomial, Šidák's correction for the number of bars).
+    bars at once in 99 of 100 correct runs (binomial, Šidák's correction); bars outside it are red.
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def _parameter_label(name: str) -> str:
 
 
 def _mass_per_nat(result: NestedResult) -> FloatArray:
-    """Return posterior mass per nat of log volume, (n_dead,): each death shrinks the log volume by 1 / n nats."""
+    """Return the posterior mass per nat of log volume, (n_dead,): a death among n live points takes 1 / n nats."""
     return result.weight * result.n_at_death
 
 
@@ -340,7 +340,7 @@ def _thinned_rows(n: int) -> IntArray:
 
 
 def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
-    """Return the limits of a parameter's axis: 99 % of the posterior with a margin, within the range of the points."""
+    """Return a parameter's axis limits: its central 99 % interval with a margin, within the range of the points."""
     values = result.theta[:, column]
     low, high = result.interval(0.99)[:, column]
     margin = 0.15 * (high - low)
@@ -354,7 +354,7 @@ def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
 def _centres_and_smoothed_density(
     values: FloatArray, weight: FloatArray, span: tuple[float, float], n_eff: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the middles of 80 bins and the smoothed density of weighted values there, (80,) each.
+    """Return the middles of 80 bins and the smoothed weight of the values in each, (80,) each.
 
     The kernel has three quarters of Silverman's width, since posteriors may have several modes. It is reflected at the
     ends, where the prior may cut the density off.
@@ -408,10 +408,9 @@ def _draw_pair(
 
 
 def _new_points_per_bar(rank: IntArray, n_ranked: IntArray, edges: FloatArray) -> FloatArray:
-    """Return the number of new points per bar, (n_bars,).
+    """Return the number of new points per bar, (n_bars,), as fractions.
 
-    With m ranked points, each of the m + 1 ranks is spread evenly over its part of the axis from 0 to 1, so that counts
-    are fractions.
+    With m ranked points, each of the m + 1 ranks is spread evenly over its part of the axis from 0 to 1.
     """
     low, high = rank / (n_ranked + 1.0), (rank + 1.0) / (n_ranked + 1.0)
     below = np.array([np.clip((edge - low) / (high - low), 0.0, 1.0).sum() for edge in edges])

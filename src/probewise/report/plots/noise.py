@@ -1,4 +1,4 @@
-"""Tests of the noise against white noise: autocorrelation, spread by level, tails, rounding."""
+"""Tests of the noise against white noise: autocorrelation, spread by predicted reading, tails, rounding."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PLAIN = "95 % of white noise"
 def residual_autocorrelation(
     residuals: FloatArray, scan: IntArray, *, rho: float | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the autocorrelation of residuals within scans by lag, with the 95 % band of white noise.
+    """Draw the autocorrelation of residuals within scans at lags up to 12, with the 95 % band of white noise.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def lost_readings_against_predicted(
 
 
 def readings_modulo_step(readings: FloatArray, step: float, *, unit: str, ax: Axes | None = None) -> Axes:
-    """Draw a histogram of readings, (n_points,), modulo a step: if they are rounded to it, all fall in one bin."""
+    """Draw a histogram of readings' distances from the nearest multiple of `step`; rounded ones share one bin."""
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     finite = readings[np.isfinite(readings)]
     counts, edges = np.histogram(np.mod(finite / step + 0.5, 1.0) - 0.5, 41, (-0.5, 0.5))

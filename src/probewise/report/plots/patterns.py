@@ -76,11 +76,11 @@ def quadrant_patterns(recording: Recording) -> AxesGrid:
     Parameters
     ----------
     recording
-        A recording with readings over quadrants; several over one quadrant are averaged.
+        A recording with readings over quadrants; usable ones over one quadrant are averaged.
 
     Returns
     -------
-    Axes, two per row.
+    Axes, (n_rows, 2).
 
     Raises
     ------

@@ -48,7 +48,7 @@ def predicted_and_recorded_by_scan(
 
     Returns
     -------
-    Axes, three columns (two where there are two or four panels, one for one panel).
+    Axes, (n_rows, 3) (two columns where there are two or four panels, one for one panel).
     """
     require_recording(recording)
     found, alone = tracks_and_single_rows(recording.plan)
@@ -108,7 +108,7 @@ def _draw_single_readings(ax: Axes, recording: Recording, rows: IntArray, mean: 
 
 
 def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
-    """Draw standardised residuals in order of time; 95 % should lie between the dashed lines.
+    """Draw recorded minus predicted readings over their sd, by reading number; dashed lines at ±1.96 should hold 95 %.
 
     Parameters
     ----------

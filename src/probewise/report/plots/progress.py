@@ -36,7 +36,7 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
 
 
 def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
-    """Label axes of posterior sds (log scale) by number of readings, draw the line of the target; return the axes."""
+    """Label axes of posterior sds (log scale, mm) by number of readings, draw the target's line; return the axes."""
     ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
     ax.annotate(
         f"{target_mm:g} mm,\ntarget",

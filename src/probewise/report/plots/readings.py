@@ -21,10 +21,10 @@ MAX_NAMED = 8  # tracks in the legend; with more there is none
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Rows of one scan over one pattern, which a curve may join: `rows`, (n_rows,), numbers rows of the plan.
+    """Rows of one scan over one pattern, which a curve may join: `rows`, (n_rows,), are row numbers of the plan.
 
-    `along_mm`, (n_rows,), is the signed distance from a half-plane's edge (`from_edge` True); over another pattern, the
-    position along the scan from its mean.
+    `along_mm`, (n_rows,), is the signed distance from a half-plane's edge, positive inside (`from_edge` True); over
+    another pattern, the position along the scan from its mean.
     """
 
     label: str
@@ -38,7 +38,7 @@ def tracks_and_single_rows(plan: Plan) -> tuple[list[Track], IntArray]:
 
     Returns
     -------
-    The tracks, one per scan and pattern with at least three places along it; and the numbers of the other rows.
+    The tracks, one per scan and pattern with three or more distinct positions; and the row numbers of all other rows.
     """
     found: list[Track] = []
     single: list[IntArray] = []
@@ -80,7 +80,7 @@ def _track_label(plan: Plan, rows: IntArray) -> str:
 
 
 def track_axis_label(found: Sequence[Track]) -> str:
-    """Return the label of the horizontal axis along which tracks are drawn."""
+    """Return the horizontal axis's label: distance from the edge if all tracks cross one, else place along the scan."""
     if all(t.from_edge for t in found):
         return "distance from the edge, white side positive (mm)"
     return "place along the scan (mm)"

@@ -141,7 +141,7 @@ def scan_with_residuals(
 
 
 def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
-    """Draw readings in order of time, for recordings too short for any other figure."""
+    """Draw usable readings by reading number, for recordings too short for any other figure."""
     require_recording(recording)
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)
@@ -191,12 +191,12 @@ def residuals_against_covariates(
 def heldout_gain_by_scan(
     scans: Sequence[tuple[str, float]], mean: float, sd: float, *, part: str = "scan", ax: Axes | None = None
 ) -> Axes:
-    """Draw the gain on each held-out scan in nats per reading, and the mean over all with its standard error.
+    """Draw the gain on each held-out scan in nats per reading, largest on top, and the mean with its standard error.
 
     Parameters
     ----------
     scans
-        Name and gain of each. Of more than twelve, those with the largest and smallest gains are drawn.
+        Name and gain of each; of more than twelve, only the six largest and the six smallest gains are drawn.
     mean, sd
         Mean over all held-out readings, and its standard error.
     part

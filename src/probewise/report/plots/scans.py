@@ -34,7 +34,7 @@ def residuals_by_scan(
     before, after
         Predicted readings by the calibrated and by the repaired model, (n_points,).
     most
-        Number of scans drawn: those that the repair changes most, in order of time.
+        Number of scans drawn: those that the repair changes most (mean square), in the plan's order.
     columns
         Panels per row.
 
@@ -124,7 +124,7 @@ def readings_before_and_after_repair(
 
 
 def _x_limits_around_change(found: Sequence[Track], rows: IntArray, change: FloatArray) -> tuple[float, float]:
-    """Return limits of the x axis: the interval in which two models differ, widened by its length on both sides."""
+    """Return limits of the x axis (mm): where models differ by 30 % of the most or more, with as wide a margin."""
     along = np.concatenate([track.along_mm for track in found])
     by_place = np.concatenate([change[rows[track.rows]] for track in found])
     differs = along[by_place >= _TELLING * max(float(by_place.max()), 1e-300)]
@@ -143,7 +143,7 @@ def _positions_and_residuals(
 
 
 def _running_mean_by_position(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean position and mean residual in bins of equal width, since readings are dense where a scan is slow."""
+    """Return mean position and mean residual, (n_bins,) each, in up to 18 bins of equal width, none of them empty."""
     if along.size == 0:
         return along, residual
     edges = np.linspace(along.min(), along.max(), min(_MOST_GROUPS, max(along.size // _LEAST_ROWS, 1)) + 1)

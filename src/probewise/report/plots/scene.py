@@ -47,7 +47,7 @@ def playing_field(
     Parameters
     ----------
     utility
-        Expected information of a reading at each place, shape (n_y, n_x), in bits; NaN where the arm cannot reach.
+        Utility of a reading at each place, such as its bits, (n_y, n_x), lower row first; NaN out of the arm's reach.
     x_mm, y_mm
         Places of the columns and rows, shapes (n_x,) and (n_y,).
     outlines_mm
@@ -143,7 +143,6 @@ def add_colour_bar(ax: Axes, image: ScalarMappable, label: str) -> None:
 
 
 def _add_lego_scale(ax: Axes) -> None:
-    """Add the paper's coordinates, LEGO distance units, on top."""
     lego = ax.secondary_xaxis("top", functions=(_to_lego, _from_lego))
     lego.set_xlabel("LEGO distance units (8 mm)", fontsize=SMALL_PT)
     lego.tick_params(labelsize=SMALL_PT)

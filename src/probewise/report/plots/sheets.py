@@ -31,7 +31,7 @@ _CROSS_MM = 15.0  # long enough to show beyond a block of two LEGO studs
 
 
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
-    """Draw cover pages with instructions, one for five sheets, then every sheet at true scale.
+    """Draw cover pages with instructions, one per five sheets, then every sheet at true scale.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
     Raises
     ------
     ParameterError
-        If a sheet needs too many pages.
+        If a sheet needs more than 400 pages, or the paper size is unknown.
     """
     cut = [(sheet, tiles_of(sheet, paper)) for sheet in sheets]
     n_covers = len(_batches_of_five(cut))
@@ -195,7 +195,7 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
 
 
 def _label_glue_strips(ax: Axes, tiles: Sequence[Tile], tile: Tile, first: int) -> None:
-    """Print on each strip the page to be glued on it: margins are cut off, strips are not."""
+    """Print on each glue strip the number of the page to be glued on it."""
     number = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
     (left, bottom), (right, top) = tile.on_page_mm(np.array([tile.low_mm, tile.high_mm])).tolist()
     upright = ((tile.column + 1, tile.row), (right + OVERLAP_MM / 2, (bottom + top) / 2), 90.0)
@@ -220,8 +220,8 @@ def _draw_sheet_part(
 ) -> None:
     """Draw the part of a sheet between two corners: pattern, lines, crosses and texts.
 
-    `place` maps points, (n, 2), from the sheet to the page; `clip` is the patch beyond which nothing is drawn; `named`
-    says whether texts are drawn in full.
+    `place` maps points, (n, 2), from the sheet to the page; nothing is drawn beyond the patch `clip`; without `named`,
+    crosses have their numbers only, and other texts are left out.
     """
     for corners, albedo in _outlines_with_albedo(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))

@@ -60,7 +60,7 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
 def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
     """Return the half width (mm) of a square about the origin that holds the SSF above 1 % of its peak.
 
-    It is rounded up to a multiple of half the power of ten below it.
+    It has a tenth to spare, and is rounded up to a multiple of half the power of ten below it.
     """
     matters = values > 0.01 * values.max()
     far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), pixel_mm)
@@ -86,7 +86,7 @@ def ssf_by_n_gaussians(
 
     Returns
     -------
-    Axes, two columns; one for a single number of Gaussians.
+    Axes, (n_rows, 2), or (1, 1) for a single number of Gaussians.
     """
     orders = sorted(fields)
     n_columns = min(len(orders), 2)

@@ -44,7 +44,7 @@ def posterior_widths_of_runs(
 
     Returns
     -------
-    Axes, two columns; one for a single name.
+    Axes, (n_rows, 2), or (1, 1) for a single name.
     """
     n_columns = min(len(runs), 2)
     n_rows = -(-len(runs) // max(n_columns, 1))

@@ -68,7 +68,7 @@ def write_text_atomically(path: str | os.PathLike[str], text: str) -> None:
 
 
 def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:
-    """Write to the end of an open, unbuffered file, whose name for messages is `path`, and sync it to the disk.
+    """Write all of `content` to an open, unbuffered file and sync it to the disk; `path` is its name in messages.
 
     Raises
     ------

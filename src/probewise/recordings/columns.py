@@ -39,9 +39,9 @@ class TableLike(Protocol):
 
 
 def columns_by_name(table: TableLike) -> dict[str, Any]:
-    """Return a table's columns by name.
+    """Return a table's columns by name, stripped of blanks.
 
-    Raises ParameterError if it has no columns by name, or two of one name but for the blanks around it.
+    Raises ParameterError if it has no columns by name, or two names that differ only in the blanks around them.
     """
     names: Any = getattr(table, "columns", None)  # of a data frame, pandas or polars
     if isinstance(table, Mapping) or names is None:
@@ -60,7 +60,7 @@ def columns_by_name(table: TableLike) -> dict[str, Any]:
 def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
     """Convert to one number per reading, shape (n_points,); a single number is repeated if `n_points` is given.
 
-    Raises ParameterError if a value is not a number, ShapeError if the length is not n_points.
+    Raises ParameterError if a value is not a number, ShapeError for another shape, or a length other than n_points.
     """
     out = floats(values, name)
     if out.ndim == 0 and n_points is not None:
@@ -73,7 +73,7 @@ def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = Non
 
 
 def texts_to_numbers(values: ArrayLike) -> ArrayLike:
-    """Parse a column of texts as a file's: numbers, and "", "nan", "n/a" and the like, which become NaN.
+    """Parse a column of texts as in a file: numbers, and "", "nan", "n/a" and the like, which become NaN, as does None.
 
     A column without texts, or with a text that is none of these, is returned unchanged.
     """
@@ -99,7 +99,7 @@ def _number_or_nan(cell: Any) -> Any:
 
 
 def dates_to_seconds(values: ArrayLike) -> ArrayLike:
-    """Convert dates to seconds since the first; numbers are returned unchanged.
+    """Convert dates (datetime or NumPy's) to seconds since the first; anything else is returned unchanged.
 
     Raises ParameterError if some dates have a time zone and others none.
     """
@@ -117,7 +117,7 @@ def dates_to_seconds(values: ArrayLike) -> ArrayLike:
 def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
     """Convert a user's covariates to arrays of one number per reading, by name; {} for None.
 
-    Raises ParameterError if they have no names, or if a name is that of a recording's own column, such as "x_mm".
+    Raises ParameterError if they are not given by name, or if a name is a recording's own column, such as "x_mm".
     """
     if columns is None:
         return {}
@@ -149,7 +149,7 @@ def selected_row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
 
 
 def numeric_covariates_and_notes(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    """Return the numeric columns that are not a plan's own fields, by name, and notes on those without numbers."""
+    """Return the numeric columns by name, without a recording's own but for `session`, and notes on the others."""
     out, notes = {}, []
     for name, values in columns.items():
         if name in _KNOWN:
@@ -162,7 +162,7 @@ def numeric_covariates_and_notes(columns: Mapping[str, ArrayLike]) -> tuple[dict
 
 
 def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:
-    """Assign scan numbers: every change of name begins a new scan, even if the name occurred before.
+    """Assign scan numbers: every change of name, even to an earlier one, begins a new scan; a single name is one scan.
 
     Returns
     -------
@@ -178,13 +178,13 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
 
 
 def sessions_of_scans(session: FloatArray, scan: IntArray) -> tuple[int, ...]:
-    """Return the session of each scan, in their order, from that of each reading, (n_points,); () where all are one."""
+    """Return the session of each scan, by scan number, given that of each reading, (n_points,); () if all are one."""
     first = session[np.unique(scan, return_index=True)[1]]
     return tuple(int(number) for number in first) if len(set(first.tolist())) > 1 else ()
 
 
 def no_session_mask(session: FloatArray, scan: IntArray) -> BoolArray:
-    """Mark the readings whose session is not `A_SESSION`, that of their scan's first reading: (n_points,)."""
+    """Mark readings, (n_points,), whose session is no whole number from 0, or not that of their scan's first."""
     _, first, which = np.unique(scan, return_index=True, return_inverse=True)
     whole = np.isfinite(session) & (session >= 0) & (session == np.floor(session))
     return np.asarray(~(whole & (session == session[first][which.reshape(-1)])))
@@ -239,7 +239,7 @@ def how_to_describe_pattern(name: str, known: Sequence[str]) -> str:
 
 
 def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> list[str]:
-    """Return one name per reading, checked."""
+    """Return one name per reading, stripped; ShapeError for another number, ParameterError if one is missing."""
     if not isinstance(values, Iterable):
         raise ParameterError(name, values, "a text, or one per reading")
     cells = list(values)
@@ -252,7 +252,7 @@ def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> li
 
 
 def _checked_name(what: str, text: str) -> str:
-    """Return a name as a file would hold it: without surrounding blanks."""
+    """Return a name without surrounding blanks, as in a file; raise ParameterError if it is not printable."""
     if not text.strip().isprintable():
         raise ParameterError(what, text, "a printable text, without line ends")
     return text.strip()

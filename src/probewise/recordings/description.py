@@ -55,7 +55,7 @@ def shortest_degrees(angle_rad: float) -> float:
 
 
 class _CheckedFields:
-    """A JSON object whose fields are checked as they are read; messages give the field's path."""
+    """A JSON object whose fields are checked as they are read; a FileError gives the field's path."""
 
     def __init__(self, path: Path, where: str, content: object) -> None:
         if not isinstance(content, dict):
@@ -194,7 +194,7 @@ _KIND_OF = {
 
 
 def read_description(path: Path) -> Description:
-    """Read the description beside NAME.csv, NAME.json: instrumentation, patterns, and notes on what is not used.
+    """Read NAME.json, the description beside NAME.csv: instrumentation, patterns, and notes on what is not used.
 
     Raises FileError if it is missing, does not parse, or a field is missing or invalid.
     """
@@ -255,7 +255,7 @@ def _parse_instrumentation(top: _CheckedFields) -> Instrumentation:
 def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pattern]) -> str:
     """Return the text of NAME.json, with numbers in full precision.
 
-    Raises ParameterError if the format does not have a pattern's kind.
+    Raises ParameterError for a pattern that is of none of the format's kinds.
     """
     inst = instrumentation
     reading = {"unit": inst.unit, "min": inst.min, "max": inst.max, "step": inst.step}

@@ -109,7 +109,7 @@ def write_plan(plan: Plan, path: PathLike) -> None:
 
 
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
-    """Format the rows of a plan as cells by column, in full precision.
+    """Format the rows of a plan as cells (texts) by column of its CSV file, in full precision.
 
     Raises ParameterError if the format cannot hold the plan.
     """
@@ -159,7 +159,7 @@ def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> li
 
 
 def _scan_names_made_distinct(plan: Plan) -> dict[int, str]:
-    """Return the scans' names, made distinct where consecutive scans share one: a file would join them."""
+    """Return the scans' names by number; one like the scan's before gains " (again)", as a file would join the two."""
     names: dict[int, str] = {}
     last = ""
     for k in np.unique(plan.scan):
@@ -189,7 +189,7 @@ def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) 
 
 
 def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:
-    """Return the images among patterns by their file.
+    """Return the images among patterns by the name of their file.
 
     Raises ParameterError if a file is no plain name, or two images that differ name one file.
     """
@@ -252,7 +252,7 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
 
 
 def _notes_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> list[str]:
-    """Return a note on the farthest place if it looks mistyped, far from all others: a list of one text or none."""
+    """List one note if the coordinate farthest from the median looks mistyped, far from all others; else none."""
     low, middle, high = np.quantile(places_mm, [0.05, 0.5, 0.95])
     k = int(np.argmax(np.abs(places_mm - middle)))
     if abs(places_mm[k] - middle) <= _FAR_AWAY * max(high - low, 1.0):
@@ -271,7 +271,7 @@ def _readings_column(table: CSVTable, description: Description) -> FloatArray:
 
 
 def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
-    """Assign scan numbers: every change of name begins a new scan, even if the name occurred before."""
+    """Return each row's scan number and the scans' names; every change of name begins a new scan."""
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)
     cells = table.cells("scan")
@@ -304,7 +304,10 @@ def _pattern_codes_in_file(table: CSVTable, description: Description) -> IntArra
 
 
 def _covariate_columns(table: CSVTable, notes: list[str]) -> dict[str, FloatArray]:
-    """Return every other numeric column; a column is numeric if most of its cells hold numbers."""
+    """Return the numeric columns that are not the format's own but for `session`, by name; add `notes` on the rest.
+
+    A column is numeric if most of its cells hold numbers.
+    """
     out: dict[str, FloatArray] = {}
     for name in table.columns:
         if name in _KNOWN:

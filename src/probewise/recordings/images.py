@@ -26,7 +26,7 @@ Bytes8 = NDArray[np.uint8]
 
 
 def is_file_name_without_path(name: str) -> bool:
-    """Return whether `name` names a file in the recording's own folder, on any system."""
+    """Return whether `name` is a plain file name, without a path, on any system."""
     return name not in ("", ".", "..") and PurePosixPath(name).name == name == PureWindowsPath(name).name
 
 
@@ -118,7 +118,7 @@ def _albedo_from_png(path: Path, content: bytes) -> FloatArray:
 
 
 def _decoded_pixels(packed: bytes, width: int, height: int, n_channels: int) -> Bytes8:
-    """Decompress the pixels and undo the line filters, (height, width, n_channels)."""
+    """Decompress a PNG's pixels and undo its line filters: 8 bits, (height, width, n_channels)."""
     from PIL import Image as Pillow  # imported here: most recordings have no image
 
     mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[n_channels]

@@ -56,7 +56,7 @@ locked = hold_lock  # its earlier name
 
 
 def _open_and_lock(lock: Path, path: Path) -> int | None:
-    """Open and lock the lock file, and return its handle; None if another process holds the lock."""
+    """Open and lock the lock file, and return its file descriptor; None if another process holds the lock."""
     while True:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)

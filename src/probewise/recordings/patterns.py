@@ -19,7 +19,7 @@ from probewise.errors import ParameterError
 
 
 class _CheckedPattern:
-    """Base of the patterns: converts numbers to floats and pairs to tuples, and refuses everything else."""
+    """Base of the patterns: converts numbers to floats and pairs to tuples; ParameterError for other values."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]  # every pattern is a dataclass
@@ -127,7 +127,7 @@ class Stripes(_CheckedPattern):
 class Ramp(_CheckedPattern):
     """A linear gradient without bounds: albedo per_mm (x . n), n the unit normal.
 
-    It also describes an encoder, which reads its place.
+    It also stands for the scale of an encoder, a sensor that reads its own position along n.
     """
 
     normal_rad: float

@@ -38,7 +38,10 @@ from probewise.recordings.patterns import Pattern
 
 @dataclass(frozen=True)
 class Instrumentation:
-    """The instrument: unit, range and step of a reading, the sensor, and the columns that can be commanded."""
+    """The instrument: unit, range and step of a reading, the sensor, and the columns that can be commanded.
+
+    None is not declared; `height_mm` is the sensor's height above the surface.
+    """
 
     unit: str = "LEGO"
     min: float | None = None
@@ -66,7 +69,7 @@ class Instrumentation:
 
     @property
     def unit_after_number(self) -> str:
-        """Unit of a reading as it is written after a number: "LEGO units" for the LEGO brick's."""
+        """Unit of a reading as it is written after a number: "LEGO units" for "LEGO", else `unit`."""
         return "LEGO units" if self.unit == "LEGO" else self.unit
 
     @property
@@ -82,8 +85,8 @@ class Plan:
     """Pose, time and pattern of every reading, in the order they are taken (the order matters for lag and backlash).
 
     All arrays have shape (n_points,). `scan` numbers the scans from 0 in the order they are taken
-    (a name that returns later is a new scan); `pattern` indexes `pattern_names`. A pattern
-    name may be missing from `patterns` only where a hypothesis takes its place. `sessions` numbers the recording that
+    (a name that returns later is a new scan); `pattern` indexes `pattern_names`. A pattern name may be missing from
+    `patterns` only if hypotheses describe that pattern. `sessions` numbers the recording that
     each scan is from, from 0, where several were joined; empty for one recording.
     """
 
@@ -232,8 +235,8 @@ class Plan:
     def direction_of_motion(self) -> FloatArray:
         """Unit vector of the last commanded motion within the scan, shape (n_points, 2).
 
-        The first reading of a scan takes the direction of the next motion; a repeat keeps that
-        of the last; a scan that stays at one place has (0, 0).
+        The first reading of a scan takes the direction of the next motion; one at the same place as the reading before
+        keeps the direction; a scan that stays at one place has (0, 0).
         """
         out = np.zeros((len(self), 2))
         place = np.stack([self.x_mm, self.y_mm], axis=-1)
@@ -256,12 +259,12 @@ class Plan:
         return self.direction_of_motion
 
     def rows_by_scan(self) -> list[IntArray]:
-        """Return the row numbers of each scan, in the order they were taken."""
+        """Return a list of each scan's row numbers, in the order they were taken."""
         ends = np.cumsum(np.bincount(self.scan, minlength=len(self.scan_names)))
         return np.split(np.argsort(self.scan, kind="stable"), ends[:-1]) if len(ends) else []
 
     def rows_by_pattern(self) -> list[tuple[str, IntArray]]:
-        """Return the names of the patterns that occur, each with its row numbers."""
+        """Return pairs of the name of each pattern that occurs and its row numbers."""
         pairs = [(name, np.flatnonzero(self.pattern == k)) for k, name in enumerate(self.pattern_names)]
         return [(name, rows) for name, rows in pairs if rows.size]
 
@@ -545,7 +548,7 @@ def require_patterns_described(plan: Plan) -> None:
 
 
 def range_in_words(low: float | None, high: float | None) -> str:
-    """Write a declared range in words; None where an end is not declared."""
+    """Write a declared range in words; `low` or `high` is None if that end is not declared."""
     if low is None and high is None:
         return "any range"
     if low is None:

@@ -38,7 +38,7 @@ _FULL_BATTERY_MV, _DRAIN_MV_PER_S = 8300.0, 0.12
 
 @dataclass(frozen=True)
 class _Scan:
-    """One scan: places (n, 2), patterns (one, or one per reading), seconds per reading, seconds before the scan."""
+    """One scan: places (n, 2), patterns (one, or one per reading), seconds per reading, seconds before its first."""
 
     name: str
     places_mm: FloatArray
@@ -99,7 +99,7 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
 
 
 def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
-    """Return the plan with jittered intervals of time and, if it has a battery voltage, with that recomputed and noisy.
+    """Return the plan with jittered time intervals; its covariate `battery_mv`, if any, is computed anew, with noise.
 
     Parameters
     ----------

@@ -59,12 +59,12 @@ class Prediction(ShowsItself):
         return len(self.plan)
 
     def summary(self) -> str:
-        """Summarise: number of predictions, and for recorded readings chi-square and log density per reading."""
+        """Summarise: number of predictions; for recorded readings, chi-square and log density per reading."""
         return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
 
 
 def prediction_summary(readings: FloatArray, mean: FloatArray, sd: FloatArray, log_density: FloatArray) -> str:
-    """Summarise predictions, and for recorded readings chi-square and log density per reading; all (n_points,)."""
+    """Summarise predictions in a line or two, as `Prediction.summary` does; all arguments have shape (n_points,)."""
     lines = [f"{len(mean)} readings predicted"]
     scored = np.isfinite(log_density) & np.isfinite(readings)
     if scored.any():
@@ -79,7 +79,7 @@ def prediction_summary(readings: FloatArray, mean: FloatArray, sd: FloatArray, l
 
 
 def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:
-    """Write all rows of the plan in order, with `mean`, `sd` and `log_density`, in full precision.
+    """Write a CSV file of the plan's rows in order, with `mean`, `sd` and `log_density`, in full precision.
 
     Raises
     ------
@@ -93,12 +93,12 @@ def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> No
 
 
 def read_prediction_columns(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read `mean`, `sd` and `log_density` from a file of predictions, each (n_points,); an empty density becomes NaN.
+    """Return `mean`, `sd` and `log_density` from a file of predictions, (n_points,) each; an empty density becomes NaN.
 
     Raises
     ------
     FileError
-        If the file is missing, or a cell is not a valid number.
+        If the file is missing, a cell is not a valid number, or an sd is not above 0.
     """
     table = read_table(checked_path("path", path))
     table.require_columns("mean", "sd", "log_density")

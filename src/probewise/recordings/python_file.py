@@ -39,7 +39,7 @@ def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any
 
 
 def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
-    """Run the text of a user's file, as `run_python_file` does."""
+    """Run the text of a user's file and return the names that it defines, as `run_python_file` does."""
     try:
         code = compile(text, str(path), "exec")
     except (SyntaxError, ValueError) as error:

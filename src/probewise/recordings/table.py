@@ -132,8 +132,8 @@ def _cell_in_words(cell: str) -> str:
 def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
     """Read a CSV file with one header row; blank lines are skipped.
 
-    Raises FileError if there is no header, a column is repeated, a row is too short or too long, or quotes do not
-    close.
+    Raises FileError if it cannot be read, has no header or a repeated column, a row is too short or too long, or quotes
+    do not close.
     """
     text = read_text(path, "a CSV file")
     n_lines = text.count("\n")
@@ -171,7 +171,7 @@ def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
 
 
 def _read_in_chunks(text: str) -> Iterator[tuple[list[list[str]], csv.Error | None]]:
-    """Yield chunks of records, each with the error that ended it, if any."""
+    """Yield lists of up to 2,000 records, each list with the error that ended it, if any."""
     # Not StringIO, which takes four bytes per character.
     lines = io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8", newline="")
     reader = csv.reader(lines, strict=True)

@@ -9,7 +9,7 @@ from probewise.errors import FileError, PipeWarning
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Read a whole file.
+    """Read a whole file; `what`, for messages, is what it should be. A pipe gives a PipeWarning.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """Read a whole UTF-8 file, without its byte-order mark.
+    """Read a whole UTF-8 file, without its byte-order mark; `what` is as for `read_bytes`.
 
     Raises
     ------

@@ -73,7 +73,7 @@ def parser() -> OneLineParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit status.
+    """Run one verb of the command line and return the exit status.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _write_complaint(verb: Verb, text: str) -> None:
 
 
 def _discard_unwritable_output() -> None:
-    """Discard output that can no longer be written, which the interpreter would otherwise try to flush."""
+    """Send output that can no longer be written to the null device, so that the interpreter's flush at exit works."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -37,12 +37,12 @@ WAIT_S = 0.5  # longest wait for a person between checks of signals and keep-ali
 
 
 def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that ships") -> None:
-    """Add --geometry, with the default in its help."""
+    """Add --geometry; `default` says in its help which geometry it has otherwise."""
     add_path(parser, "--geometry", "ARM.toml", f"the arm as built: lengths, gears, ports, limits (default: {default})")
 
 
 def read_or_shipped_geometry(arguments: argparse.Namespace) -> Geometry:
-    """Read the geometry given, or the shipped one."""
+    """Read the geometry of --geometry, or the shipped one."""
     from probewise.arm import read_geometry, shipped_geometry_path
 
     return read_geometry(arguments.geometry or shipped_geometry_path())
@@ -62,7 +62,7 @@ class ArmName:
 
     @property
     def may_differ_from_geometry(self) -> bool:
-        """Whether its true geometry may differ from the given one."""
+        """Whether the arm as built may differ from the geometry of --geometry."""
         return self.kind == "nxt" or (self.kind == "emulator" and bool(self.where))
 
     def true_geometry_file(self, geometry_file: Path | None) -> Path | None:
@@ -90,7 +90,7 @@ def parse_arm(text: str) -> ArmName:
 
 
 def open_own_instrument(path: str, *, start_s: float = 0.0) -> OwnInstrument:
-    """Load the instrument of a user's file; its `connect()` is called when the instrument is entered."""
+    """Return the instrument of a user's file; its `connect()` is called when the instrument is entered."""
     from probewise.arm import OwnInstrument
 
     return OwnInstrument.from_file(path, start_s=start_s)
@@ -123,7 +123,7 @@ def open_emulated_arm_and_bench(
 def arm_reporting_table_contact(
     machine: Machine, geometry: Geometry, bench: EmulatedBench, *, clock: Clock, start_s: float
 ) -> LegoArm:
-    """Return the arm on an emulated bench, which warns when it is left if its sensor went through the table."""
+    """Return the arm on an emulated bench; when its `with` block ends, it warns if the sensor hit the table."""
     from probewise.arm import LegoArm
 
     class TableContactReporter(LegoArm):
@@ -142,7 +142,7 @@ def arm_reporting_table_contact(
 
 
 def warn_if_clearance_doubtful(geometry: Geometry) -> None:
-    """Warn if the sensor may touch the table: if its height may be wrong by more than the reading height."""
+    """Warn if the sensor may touch the table: if its height may be wrong by the reading height or more."""
     doubt_mm = geometry.max_height_error_mm
     if doubt_mm < geometry.read_height_mm:
         return
@@ -159,7 +159,7 @@ def warn_if_clearance_doubtful(geometry: Geometry) -> None:
 
 
 def warn_if_place_sd_large(geometry: Geometry, stop_sd_mm: float) -> None:
-    """Warn if the sd of the arm's place is no smaller than the sd at which a run stops."""
+    """Warn if the sd of the arm's position, as fitted to marks, is no smaller than the sd at which a run stops."""
     accuracy = geometry.accuracy
     if accuracy is None or accuracy.place_sd_mm < stop_sd_mm:
         return
@@ -170,7 +170,7 @@ def warn_if_place_sd_large(geometry: Geometry, stop_sd_mm: float) -> None:
 
 
 def enable_confirmed_lowering(arm: LegoArm) -> LegoArm:
-    """Make the arm ask a person to confirm each step of its first lowering; return the same arm."""
+    """Make the arm ask a person, at its first lowering, to confirm each step; return the same arm."""
     ask = prompter(arm)
 
     def confirm(height_mm: float) -> None:
@@ -192,7 +192,7 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
 
 
 def open_nxt_arm(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
-    """Connect to the brick at a port; return its arm."""
+    """Connect to the LEGO brick at a port; return its arm."""
     from probewise.arm import LegoArm
     from probewise.arm.nxt import BrickMachine
 
@@ -200,7 +200,7 @@ def open_nxt_arm(port: str, geometry: Geometry, *, start_s: float = 0.0) -> Lego
 
 
 def open_brick(port: str) -> Brick:
-    """Connect to the brick at a port."""
+    """Connect to the LEGO brick at a port; return the brick."""
     from probewise.arm.nxt import Brick
 
     return Brick.open(port)

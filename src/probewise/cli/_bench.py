@@ -152,7 +152,7 @@ def open_arm_and_bench(
 
 
 def world_and_instrumentation(sensor: Path | None) -> tuple[World, Instrumentation | None]:
-    """Return the world and instrumentation of a sensor.json; None: the world of the shipped recordings, and None."""
+    """Return the world and instrumentation of a sensor.json; for None the shipped recordings' world, and None."""
     if sensor is None:
         from probewise.world.shipped import true_world
 

@@ -66,7 +66,6 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def add_seed_and_quiet(parser: argparse.ArgumentParser) -> None:
-    """Add --seed and --quiet."""
     parser.add_argument(
         "--seed",
         type=parse_seed,
@@ -78,7 +77,6 @@ def add_seed_and_quiet(parser: argparse.ArgumentParser) -> None:
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:
-    """Add --quiet."""
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary; errors still show")
 
 
@@ -90,7 +88,7 @@ def add_count_option(parser: argparse._ActionsContainer, name: str, about: str, 
 def add_path(
     parser: argparse._ActionsContainer, name: str, metavar: str, about: str, *, required: bool = False
 ) -> None:
-    """Add an argument or option that takes the name of a file or directory; `required` is for options."""
+    """Add an argument or option that takes the name of a file or directory; an option may be `required`."""
     action = parser.add_argument(name, type=parse_path, metavar=metavar, help=about)
     action.required |= required
 
@@ -157,9 +155,9 @@ def print_warning(text: str) -> None:
 
 
 def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
-    """Return a message: how much of a run a file holds, and the command that resumes the run.
+    """Return a message: how many readings, marks or tasks (`noun`) a file holds, and the command that resumes the run.
 
-    `options` are added to the words of the command line; `of` is the total number, if known.
+    `options` are added to the words of the command line; `of` is the total number, 1 if it is not known.
     """
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])

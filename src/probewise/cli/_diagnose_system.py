@@ -18,7 +18,7 @@ _OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next.csv")
 
 
 def diagnose_simulator(arguments: argparse.Namespace) -> int:
-    """Diagnose; write diagnosis.json, both models, next.csv, report.html and the figures; return the exit status."""
+    """Diagnose a user's simulator; write diagnosis.json, both models, next.csv and report; return the exit status."""
     from functools import partial
 
     import numpy as np

@@ -1,4 +1,4 @@
-"""Executors of a campaign: this process, worker processes, or a cluster."""
+"""Executors of a campaign (many tasks whose results are kept in a file): this process, workers, or a cluster."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def _open_executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
-    """Yield the executor that the options name; None for this process."""
+    """Yield the executor that --workers or --scheduler asks for; None for this process."""
     if arguments.scheduler is not None:
         with _cluster_executor(arguments.scheduler) as executor:
             yield executor
@@ -44,7 +44,7 @@ def executor_and_progress(
 ) -> Iterator[tuple[Executor | None, Progress]]:
     """Yield a campaign's executor, None for this process, and its progress function.
 
-    If the block is interrupted, the message says what the campaign's file holds.
+    If the block is interrupted, the message says what the campaign's file, `path`, holds.
     """
     from probewise._progress import progress_shown
 

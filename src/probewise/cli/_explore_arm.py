@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class ArmAndTruth:
     """An arm over a field, with the true shape if it is simulated.
 
-    `outline_mm` is the true outline, (n_points, 2), `known` the shape's true parameters by name, and `about` the
-    entries for the journal; None and empty with a real arm.
+    `outline_mm` is the true outline, (n_points, 2), `known` the true parameters by the hypotheses' names, and `about`
+    the entries for the journal; with a real arm, None and empty.
     """
 
     arm: Instrument
@@ -33,7 +33,7 @@ class ArmAndTruth:
 
 
 def open_arm_and_truth(arguments: argparse.Namespace, inputs: ExploreInputs, taken: tuple[Reading, ...]) -> ArmAndTruth:
-    """Open the chosen arm, to continue after the readings `taken`.
+    """Open the chosen arm, to continue after the readings `taken`; with it, if simulated, return its true shape.
 
     Raises ParameterError, FileError or ArmError if a truth was given with a real arm, or the arm cannot be opened.
     """

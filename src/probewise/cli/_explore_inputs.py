@@ -142,9 +142,9 @@ def _checked_setting_choices(
 
 
 def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
-    """Return the field given, or the geometry's, or the paper's.
+    """Return the field given as "WIDTH,HEIGHT" (mm), else the geometry's, else the paper's.
 
-    Raises ParameterError if the one given contradicts the geometry.
+    Raises ParameterError if the one given contradicts the geometry, or is no such text.
     """
     if geometry is None:
         return parse_field("1048,520" if text is None else text)
@@ -157,9 +157,10 @@ def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
 def _naive_levels(
     arguments: argparse.Namespace, chosen: ArmName, sensor: FittedSensor, *, rng: np.random.Generator
 ) -> Naive | None:
-    """Return the levels of the paper's naive model, from a recording or the simulated sensor; None if it is not used.
+    """Return the paper's naive model's readings over black and white, with sds; None if it is not used.
 
-    Raises ParameterError if an option does not apply, or a real arm has no recording.
+    They are from a recording or the simulated sensor. Raises ParameterError if an option does not apply, or a real arm
+    has no recording.
     """
     if arguments.nested_stop is not None and arguments.method != "paper":
         raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")

@@ -38,7 +38,7 @@ class Pictures:
     frames: list[bytes] = field(default_factory=list)
 
     def draw_and_write(self, step: Step, shadow: Step | None) -> None:
-        """Draw a step, with the other sensor model's (`shadow`) if there is one; write its PNG and the live page."""
+        """Draw a step, beside it that of the other sensor model (`shadow`), if any; write PNG and live page."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)
@@ -73,7 +73,7 @@ class Pictures:
     def write_results(
         self, stage: StagedFiles, result: Exploration, *, seed: int, known: Mapping[str, float] | None
     ) -> None:
-        """Write the report, the animation, the result, its samples, and the sensor as the run has learnt it."""
+        """Write report, animation, result.json, posterior samples, and the sensor model as learnt by the run."""
         beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
         page = report.page_html(
             result,

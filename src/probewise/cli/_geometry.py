@@ -22,7 +22,7 @@ def parse_field(text: str) -> Field:
 
 
 def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
-    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card centred at (X, Y) in mm.
+    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card, of known albedo, centred at (X, Y) in mm.
 
     Raises ParameterError if a text is anything else, or a card is not wholly on the field.
     """
@@ -44,9 +44,10 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
 
 
 def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> HiddenShape:
-    """Parse "[SHAPE:]V,V,...", the parameters of the true shape; if `text` is None, draw them from the prior.
+    """Parse the true shape from "[SHAPE:]V,V,...", its parameters; if `text` is None, draw it from the prior.
 
-    Raises ParameterError for an unknown shape, a wrong number of values, or values that the shape's prior excludes.
+    Without SHAPE it is the first of `names`. Raises ParameterError for an unknown shape, a wrong number of values, or
+    values that the shape's prior excludes.
     """
     if text is None:
         return HiddenShape.drawn_from_prior({name: SHAPES[name](field) for name in names}, rng=rng)

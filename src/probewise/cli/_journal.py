@@ -36,7 +36,7 @@ def refuse_journal(path: Path) -> None:
 
 
 def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
-    """Return a journal's readings as a recording by the given sensor, and the hypothesised shape.
+    """Return a journal's readings as a recording by the given sensor, and the shape that the run looked for.
 
     Raises FileError if it is not a journal, has no reading, or has a shape unknown to `explore`.
     """
@@ -52,7 +52,7 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recor
 def find_journal_sensor_file(path: Path) -> Path:
     """Return the path of the sensor.json of a journal's run: its original path, or beside the journal.
 
-    Raises FileError if the journal names none, or the file found is a different one.
+    Raises FileError if the journal names none, or that file is missing or has changed.
     """
     from probewise.calibration import read_sensor
     from probewise.experiment import read_journal, sensor_entry

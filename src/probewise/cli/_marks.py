@@ -54,11 +54,10 @@ def bring_to_mark(
     *,
     named: str,
 ) -> TouchedMark | None:
-    """Bring the sensor over a mark and down to the block on it, as a person directs.
+    """Bring the sensor over a mark and down to the block on it, as a person directs; return the mark as touched.
 
-    Returns the joints' turns from home there, with the mark's place and height; None if the mark is skipped.
-
-    Every move turns the base first and then lowers, as in a reading.
+    That is the joints' turns from home (radians), and the mark's x, y and height in mm, NaN if the answer is "seen".
+    None if the mark is skipped. Every move turns the base first and then lowers, as in a reading.
 
     Parameters
     ----------
@@ -101,9 +100,9 @@ def bring_to_mark(
 
 
 def _place_after_moves(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
-    """Return the sensor's place (x, y, height in mm) after the moves in an answer; None if it is not a list of moves.
+    """Return the sensor's place (x, y, height in mm) after the moves in an answer; None if it is no list of moves.
 
-    An answer is pairs such as "x 5 down 2"; an empty one means one step down.
+    An answer is pairs such as "x 5 down 2", of at most 60 mm each; an empty one means one step of 5 mm down.
     """
     words = answer.split() or ["down", str(STEP_MM)]
     x, y, height = at_mm

@@ -35,7 +35,7 @@ class StagedFiles:
     folder
         The directory.
     kept
-        New name of each input file that a result would have replaced.
+        New path, by old path, of each input file that a result would have replaced.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -46,7 +46,7 @@ class StagedFiles:
         return self.folder / name
 
     def write(self, name: str, content: str | bytes) -> None:
-        """Write a file, a text in UTF-8."""
+        """Write a file into the directory: bytes, or a text in UTF-8."""
         from probewise.recordings import write_bytes_atomically  # imported here, since the help does not need it
 
         write_bytes_atomically(self / name, content.encode() if isinstance(content, str) else content)
@@ -167,7 +167,7 @@ def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[
 
 @dataclass(frozen=True)
 class _Commit:
-    """Changes to make in `out`, with relative names: move `names` in after renaming `aside`, and delete `remove`."""
+    """Changes to make in `out`, by relative names: rename `aside` (old to new), move `names` in, delete `remove`."""
 
     names: Sequence[str]
     aside: Mapping[str, str]
@@ -226,7 +226,7 @@ def _apply_commit(out: Path, folder: Path, commit: _Commit) -> None:
 
 
 def _new_names_of_kept(out: Path, names: Sequence[str]) -> dict[str, str]:
-    """Return, by name, the new name of each file: the first free of NAME_kept, NAME_kept_2, ...
+    """Return each file's new name by its old one: the first free of NAME_kept, NAME_kept_2, ... before the suffix.
 
     Files of one stem get the same ending.
     """

@@ -88,7 +88,7 @@ class PersonAtBench:
         return f" (in the emulator's terminal: {scene})"
 
     def _complaint_after_reading_sheet(self, name: str) -> str | None:
-        """Read over the sheet's white and over its black; return a complaint if a reading is wrong, else None."""
+        """Read over a sheet's white and over its black; return a complaint if a reading is wrong, else None."""
         bounds, origin = reachable_places_of(self._arm), np.array(self._origin)
         values = {}
         for is_white, place in self._sheet_check.white_and_black_places(

@@ -28,7 +28,10 @@ def read_or_shipped_plan(text: str) -> Plan:
 def plan_for_own_instrument(
     plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
 ) -> Plan:
-    """Return the plan for a user's own instrument: instrumentation from its JSON, which the options override."""
+    """Return the plan for a user's instrument: a given unit, range ("LOW,HIGH") or step replaces the plan's own.
+
+    A new unit drops the plan's range, step and sensor. Measured covariates are left out.
+    """
     said: dict[str, object] = {} if unit is None else {"unit": unit}
     if unit is not None:  # the declared values have another unit
         said |= {"min": None, "max": None, "step": None, "sensor": ""}
@@ -41,7 +44,7 @@ def plan_for_own_instrument(
 
 
 def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
-    """Return the plan for the LEGO arm: readings in LEGO units, 0 to 100, at the arm's reading height."""
+    """Return the plan for the LEGO arm: in LEGO units, 0 to 100, at its reading height; no measured covariates."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
         unit="LEGO",
@@ -55,7 +58,7 @@ def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
 
 
 def without_measured_covariates(plan: Plan) -> Plan:
-    """Return the plan with only the covariates that can be commanded; others were measured with earlier readings."""
+    """Return the plan with only the covariates that can be commanded: its controls, "led" and "height_mm"."""
     can = {*plan.instrumentation.controls, "led", "height_mm"}
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
 

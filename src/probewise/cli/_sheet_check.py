@@ -93,7 +93,9 @@ class SheetCheck:
     def white_and_black_places(
         self, name: str, allowed: Callable[[FloatArray], BoolArray]
     ) -> dict[bool, tuple[float, float]]:
-        """Choose where to check a sheet: one reachable place over uniform white (True), one over uniform black (False).
+        """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
+
+        Return (x, y) in mm in the plan's frame, by these keys; a key is missing if there is no such place.
 
         Parameters
         ----------
@@ -142,7 +144,7 @@ class SheetCheck:
 
 
 def uniform_shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
-    """Return the shade, (n,), seen by the sensor at each place, (n, 2): 1 all white, 0 all black, NaN grey or mixed."""
+    """Return the shade that the sensor sees at each place, (n, 2), as (n,): 1 all white, 0 all black, else NaN."""
     seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
     albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
     low, high = albedo.min(axis=1), albedo.max(axis=1)

@@ -34,7 +34,7 @@ def refuse_sensor_options(arguments: argparse.Namespace, *names: str) -> None:
 
 
 def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
-    """Read and join tables of one system; also return notes on their columns.
+    """Read tables of one system; return them joined, and notes on their columns.
 
     Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,
     ParameterError if two tables are the same.

@@ -28,7 +28,7 @@ class Stopped(KeyboardInterrupt):
 
     @property
     def status(self) -> int:
-        """The exit status that shells expect after a signal."""
+        """Exit status that shells expect after a signal: 128 + `number`."""
         return 128 + self.number
 
 
@@ -98,7 +98,7 @@ def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) ->
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
-    """Raise `Stopped` unless this signal is part of the last request."""
+    """Raise `Stopped`, unless this signal came within a second of the last that raised it."""
     now_s = time.monotonic()
     if _request.number is not None and now_s - _request.at_s <= SAME_S:
         return
@@ -107,7 +107,7 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
 
 
 def _stopped_behind(error: BaseException) -> Stopped | None:
-    """Return the `Stopped` behind an exception, after a signal or Ctrl-C; None for any other exception."""
+    """Return the `Stopped` that an exception stands for, if a signal or Ctrl-C came before; else None."""
     if isinstance(error, Stopped):
         return error
     if _request.number is not None:

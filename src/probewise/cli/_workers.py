@@ -14,7 +14,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 @contextlib.contextmanager
 def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of `n` processes with one thread of linear algebra each; if the block raises, they are ended.
+    """Yield a pool of `n` processes with one thread of linear algebra each; if the block raises, end the processes.
 
     Processes are spawned, not forked, for the same behaviour on every system.
     """

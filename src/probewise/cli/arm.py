@@ -73,7 +73,7 @@ _LEGO_ARMS = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise arm` and its tasks."""
     tasks = parser.add_subparsers(dest="task", metavar="TASK", required=True, parser_class=OneLineParser)
 
     check = _add_task(tasks, "check", "Check a geometry file, and a brick; report and draw the arm's reach.")
@@ -192,7 +192,7 @@ def _add_task(
     moves: bool = False,
     arms: str | None = None,
 ) -> OneLineParser:
-    """Add the parser of a task; with `moves` it has --arm, whose help is `arms`, and --dry-run."""
+    """Add the parser of a task, with --geometry and --quiet; if it `moves`, also --arm (help: `arms`) and --dry-run."""
     parser = tasks.add_parser(name, help=summary, description=summary)
     if moves:
         _add_arm(parser, arms)
@@ -211,7 +211,7 @@ def _add_arm(parser: argparse.ArgumentParser, arms: str | None = None) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run one task; return the exit status."""
+    """Run one task of `probewise arm`; return the exit status."""
     TASKS[arguments.task](arguments, read_or_shipped_geometry(arguments))
     return 0
 
@@ -397,7 +397,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
 
 
 def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    """Compare by the light over white how high the sensor hangs at each place with the first; print the differences."""
+    """Compare by the light over white the sensor's height at each place with that at the first; print differences."""
     import numpy as np
 
     from probewise.arm import LegoArm, require_within_reach
@@ -571,7 +571,7 @@ def _plan_for_simulated_sensor(plan: Plan, sensor: Path) -> Plan:
 
 
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
-    """Return the readings of an earlier session; none in a dry run, or without `resume`.
+    """List the readings of an earlier session, from `out`; none in a dry run, or without `resume`.
 
     Raises FileError if they do not match the plan's first rows, or the file exists without `resume`.
     """
@@ -672,7 +672,6 @@ def _refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> No
 
 
 def _is_own_instrument(arguments: argparse.Namespace) -> bool:
-    """Return whether the arm is a user's own instrument."""
     return arguments.arm is not None and parse_arm(arguments.arm).kind == "file"
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise audit`."""
     add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
     add_path(parser, "--sensor", "S.json", "the calibrated sensor (default: a typical one)")
     add_simulator(parser)
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Audit, print the summary, and write the results if requested."""
+    """Audit a plan, print the summary, and write the results if --out is given; return the exit status."""
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
     from probewise.diagnosis import audit_plan

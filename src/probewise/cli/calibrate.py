@@ -24,7 +24,7 @@ MOST_LIVE = 100_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise calibrate`."""
     parser.add_argument("recording", type=parse_path, metavar="REC.csv", help="recording, its JSON beside it")
     add_out_directory(parser)
     parser.add_argument(
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Calibrate and write sensor.json, report.html and the figures."""
+    """Calibrate a sensor model; write sensor.json, report.html and the figures; return the exit status."""
     import numpy as np
 
     from probewise import verbs
@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _checked_n_live(n_live: int, orders: Sequence[int]) -> int:
-    """Return the number of live points; raise ParameterError if it is too small for the largest order, or too large."""
+    """Return `n_live`; raise ParameterError if it is too large, or too small for the largest number of Gaussians."""
     from probewise.nested import LIVE_PER_PARAM, least_live
 
     if n_live > MOST_LIVE:

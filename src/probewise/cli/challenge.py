@@ -20,7 +20,7 @@ from probewise.cli._stopping import reporting_what_is_kept
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise challenge`."""
     add_out_directory(parser)
     add_count_option(
         parser,
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the remaining cases of the challenge and write its table."""
+    """Run the remaining cases of the challenge; write its table and report; return the exit status."""
     from probewise._progress import progress_shown
     from probewise.challenge import RunCaseInRounds, run_case, run_challenge, score, score_rounds
     from probewise.challenge.systems import run_system_case, score_systems

@@ -30,7 +30,7 @@ MAX_READINGS_DOUBT = 20  # bounds the time of the demo
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise demo`."""
     add_out_directory(parser)
     parser.add_argument(
         "--full", action="store_true", help="compare one to four Gaussians with 300 live points, as in the paper"
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Calibrate, search, diagnose, report."""
+    """Run the demo, print its summary, and return the exit status."""
     from probewise._progress import progress_shown
 
     with progress_shown(quiet=arguments.quiet) as progress:
@@ -141,7 +141,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
 def searches_with_true_circle(
     sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
 ) -> list[RobotSearch]:
-    """Return a `RobotSearch` for each run: with its robot's name, the true circle, and the sensor's levels."""
+    """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
     import numpy as np
 
     from probewise.report.robot_search import RobotSearch
@@ -162,7 +162,7 @@ def hypothesised_circle() -> Circle:
 
 
 def random_hidden_circle_mm(seed: int) -> tuple[float, ...]:
-    """Draw the hidden circle from the prior: x, y, radius in mm."""
+    """Draw the hidden circle from the prior, by the seed: x, y, radius in mm."""
     import numpy as np
 
     drawn = hypothesised_circle().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
@@ -259,7 +259,7 @@ def random_pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
 def search_with_saturating_sensor(
     sensor: FittedSensor, trust: float, truth: tuple[float, ...], seed: int
 ) -> Exploration:
-    """Search for the circle, from a first reading on it, with a sensor that saturates; its model leaves that out.
+    """Search for the circle, from a first reading on it, with a sensor that saturates, which its model leaves out.
 
     `trust` is the robot's prior probability that the model leaves nothing out.
     """

@@ -33,7 +33,7 @@ OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise diagnose`."""
     parser.add_argument(
         "recordings",
         type=parse_path,
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Diagnose and write diagnosis.json, both models, the next plan, report.html and the figures."""
+    """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
     if arguments.simulator is not None:
         return diagnose_simulator(arguments)
     from functools import partial
@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _read_inputs(
     arguments: argparse.Namespace, *, progress: Progress
 ) -> tuple[list[Recording], FittedSensor | None, Shape | None]:
-    """Return the recordings, the sensor, and the shape that a journal's run looked for; None for what there is not.
+    """Return the recordings, the sensor or None, and the shape that a journal's run looked for (None: no journal).
 
     Without --sensor, that of the journal's run is read, and `arguments.sensor` is set to its file.
     """

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise emulate-nxt`."""
     parser.add_argument(
         "--scene",
         default=SCENE,
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until Ctrl-C, or until the brick goes to sleep."""
+    """Emulate the LEGO brick until Ctrl-C, or until it goes to sleep; return the exit status."""
     if not hasattr(os, "openpty"):
         raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
 
@@ -137,7 +137,6 @@ class _TypedCommands:
 
 
 def _position_in_words(stand: SensorPose) -> str:
-    """Write the sensor's place and height in mm."""
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 
 

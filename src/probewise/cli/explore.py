@@ -52,7 +52,7 @@ class _LazyShapeNames:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise explore`."""
     parser.add_argument("--sensor", type=parse_path, required=True, metavar="S.json", help="sensor model")
     add_out_directory(parser)
     parser.add_argument("--model", choices=("ssf", "naive"), default=MODEL, help="the robot's sensor model")
@@ -256,7 +256,7 @@ def _closing_lines(result: Exploration, inputs: ExploreInputs, site: ArmAndTruth
 
 
 def _path_relative_to_folder(folder: Path, path: Path) -> str:
-    """Return a file's path relative to a folder, which stays right if both are moved together."""
+    """Return a file's path relative to a folder; the absolute path if it is on another drive."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # on another drive
@@ -264,7 +264,7 @@ def _path_relative_to_folder(folder: Path, path: Path) -> str:
 
 
 def _parse_numbers(text: str) -> tuple[float, ...]:
-    """Parse "A,B,...", each number once, for argparse."""
+    """Parse "A,B,..." to finite numbers, each once, for argparse."""
     try:
         values = tuple(float(cell) for cell in text.split(","))
     except ValueError:

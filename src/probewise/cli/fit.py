@@ -17,7 +17,7 @@ from probewise.cli._simulator import add_simulator, read_joined_table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise fit`."""
     parser.add_argument(
         "tables", type=parse_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
     )
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit and write fit.json, fitted.json, samples.csv, report.html and the figures."""
+    """Fit a simulator; write fit.json, fitted.json, samples.csv, report.html and figures; return the exit status."""
     import numpy as np
 
     from probewise._progress import progress_shown

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise investigate`."""
     parser.add_argument(
         "--arm",
         default="simulated",
@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the rounds, save every reading, and write the report."""
+    """Record and diagnose in rounds, save every reading, and write the report; return the exit status."""
     import hashlib
 
     import numpy as np

@@ -11,7 +11,7 @@ from probewise.cli._simulator import add_simulator
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise predict`."""
     add_path(
         parser,
         "sensor",
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Predict every row, and score the predictions where there are readings."""
+    """Predict every row of a plan, score the prediction of readings, write a CSV file; return the exit status."""
     refuse_journal(arguments.plan)
     if arguments.simulator is not None:
         return _predict_by_simulator(arguments)

@@ -18,7 +18,7 @@ FIELD, TARGET, MARKS, JIG = "field", "target", "marks", "jig"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise sheets`."""
     parser.add_argument(
         "what",
         metavar="WHAT",
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw the pages."""
+    """Draw the sheets asked for, write them as a PDF, and print the size of each; return the exit status."""
     from probewise.recordings import write_bytes_atomically
     from probewise.report.plots.sheets import sheets_pdf
     from probewise.report.sheets import PAPERS_MM, tiles_of

@@ -31,7 +31,7 @@ _SIZES = ("small", "plain", "gross")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the verb's options."""
+    """Define the options of `probewise study`."""
     add_out_directory(parser)
     add_count_option(parser, "--circles", "circles per row, always the first ones (default 200)", default=200)
     add_count_option(parser, "--quoted", "circles of the first row (default as --circles)")
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the study's remaining tasks and write its table."""
+    """Run the study's remaining tasks; write its table and report; return the exit status."""
     from probewise._progress import progress_shown
     from probewise.report import study as report
     from probewise.study import run_study
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
-    """Run the remaining tasks of the study of concealed effects and write its table."""
+    """Run the remaining tasks of the study of concealed effects; write its table and report; return the exit status."""
     from probewise.recordings.table import csv_text_of_rows
     from probewise.report import concealed as report
     from probewise.study import concealed_csv_rows, concealed_rows, run_concealed

@@ -1,4 +1,4 @@
-"""The share of a turned square pixel that lies inside an edge or a polygon."""
+"""The share of a turned square pixel that lies on the inner side of an edge, or inside a polygon."""
 
 from __future__ import annotations
 
@@ -86,6 +86,6 @@ def share_inside_polygon(
 
 
 def _integral_of_clip(y: FloatArray) -> FloatArray:
-    """Evaluate the antiderivative of clip(y, -1/2, 1/2)."""
+    """Return the antiderivative of clip(y, -1/2, 1/2) that is 0 at 0."""
     inner = np.clip(y, -0.5, 0.5)
     return 0.5 * inner**2 + 0.5 * np.abs(y - inner)

@@ -44,7 +44,7 @@ class Shape(Protocol):
         ...
 
     def region(self, theta: FloatArray) -> Region:
-        """Build the region of each hypothesis, theta (n_samples, n_params)."""
+        """Build the regions of the hypotheses, one per row of theta (n_samples, n_params)."""
         ...
 
 
@@ -57,7 +57,7 @@ class Scene(Protocol):
         ...
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Return the region by pattern name, theta (n_samples, n_params)."""
+        """Return by pattern name the regions of the hypotheses, one per row of theta (n_samples, n_params)."""
         ...
 
 

@@ -37,7 +37,7 @@ class _AnyOfPrior:
 
     @cached_property
     def columns_by_shape(self) -> list[IntArray]:
-        """Columns of theta with the parameters of each shape, in the shape's order."""
+        """Column numbers of theta with the parameters of each shape, in the shape's order, an array per shape."""
         return [
             np.array([self.names.index(n if n in self.shared else f"{key}.{n}") for n in shape.prior.names], dtype=int)
             for key, shape in self.shapes.items()
@@ -132,7 +132,7 @@ class AnyOf:
     which = shape_index  # its earlier name
 
     def region(self, theta: FloatArray) -> RegionsOfMixedKinds:
-        """Build the region of each hypothesis' shape."""
+        """Build the regions of the hypotheses, each of its own shape."""
         which = self.shape_index(theta)
         parts: list[Region] = []
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.prior.columns_by_shape, strict=True)):
@@ -143,7 +143,7 @@ class AnyOf:
 
 
 def shape_and_columns(shape: Shape, name: str) -> tuple[Shape, IntArray]:
-    """Return the shape of this name in a set, and its columns of theta; of a single shape, itself and all columns."""
+    """Return a set's shape of this name and its column numbers of theta; for a single shape, itself and all columns."""
     if isinstance(shape, AnyOf):
         return shape.shapes[name], shape.prior.columns_by_shape[shape.shape_names.index(name)]
     return shape, np.arange(len(shape.prior.names))

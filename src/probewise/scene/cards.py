@@ -1,4 +1,4 @@
-"""Reference cards of known place and albedo, which lie on top of the field and its shapes."""
+"""Reference cards (sheets of known place and albedo), which lie on top of the field and its shapes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from probewise.scene.scenes import HypothesisScene, OneRegionForAllNames
 
 @dataclass(frozen=True)
 class Card:
-    """A rectangle along X and Y about (x_mm, y_mm), of one albedo from 0, as dark as the field, to 1, as the shape."""
+    """A rectangle about (x_mm, y_mm), sides along X and Y; albedo 0 is as dark as the field, 1 as the shape."""
 
     x_mm: float
     y_mm: float
@@ -42,7 +42,7 @@ class Card:
 
     @property
     def corners_mm(self) -> FloatArray:
-        """Its corners in order, (4, 2)."""
+        """Its corners, anticlockwise from the lower left, (4, 2)."""
         half = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) / 2
         return np.asarray(np.array([self.x_mm, self.y_mm]) + half * (self.width_mm, self.height_mm))
 
@@ -63,7 +63,7 @@ class Card:
 
 @dataclass(frozen=True, eq=False)
 class CardedRegion:
-    """A region with cards on it; later cards of the tuple lie on top."""
+    """A region with cards on it, later ones on top; `outlines` and `edge_distance` are those of the region alone."""
 
     region: Region
     cards: tuple[Card, ...]
@@ -85,7 +85,7 @@ class CardedRegion:
 
 
 def mean_albedo_with_cards(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
-    """Return the white fraction seen with cards: `seen` is that without, `covered` the share of the view on each card.
+    """Return the white fraction seen with cards: `seen` is that without, `covered` each card's share of the view.
 
     Exact unless a view contains both an edge of a card and an edge of what lies below the cards. There, the albedo
     under the card is taken to be the mean albedo of the view.
@@ -112,5 +112,5 @@ class CardedScene(HypothesisScene):
     cards: tuple[Card, ...] = field(default=())
 
     def regions(self, theta: FloatArray) -> OneRegionForAllNames:
-        """Return the shape's region with the cards on it, theta (n_samples, n_params), under any pattern name."""
+        """Return, for any pattern name, the shape's regions with the cards on them, theta (n_samples, n_params)."""
         return OneRegionForAllNames(CardedRegion(self.shape.region(theta), self.cards))

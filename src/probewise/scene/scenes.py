@@ -28,7 +28,7 @@ class KnownScene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """No free parameters."""
+        """Names of its free parameters: none."""
         return ()
 
     @property
@@ -56,7 +56,7 @@ class HypothesisScene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The shape's parameters."""
+        """Names of the shape's parameters."""
         return self.shape.prior.names
 
     @property
@@ -65,13 +65,13 @@ class HypothesisScene:
         return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Return the shape's region, theta (n_samples, n_params), under any pattern name."""
+        """Return, for any pattern name, the regions of the hypotheses, one per row of theta (n_samples, n_params)."""
         return OneRegionForAllNames(self.shape.region(theta))
 
 
 @dataclass(frozen=True, eq=False)
 class OneRegionForAllNames(Mapping[str, Region]):
-    """A mapping from every name to one region; it lists the name "hypothesis"."""
+    """A mapping from every name to one `region`; as its only key it lists "hypothesis"."""
 
     region: Region
 

@@ -25,7 +25,10 @@ Bounds = tuple[float, float]
 
 @dataclass(frozen=True)
 class SymmetryTurn:
-    """A symmetry: turned by `by_rad`, parameter number `angle`, a shape is the same with the two sides `swapped`."""
+    """A symmetry: a shape is the same after a turn `by_rad`, added to parameter `angle`, with the two sides `swapped`.
+
+    `angle` and `swapped` are indices of parameters; `swapped` None: no sides are swapped.
+    """
 
     by_rad: float
     angle: int
@@ -34,11 +37,11 @@ class SymmetryTurn:
 
 @runtime_checkable
 class HasSymmetryTurn(Protocol):
-    """A shape with an angle, which is the same shape after a turn."""
+    """A shape with an angle, which looks the same after some turn."""
 
     @property
     def symmetry_turn(self) -> SymmetryTurn:
-        """The smallest such turn."""
+        """The smallest turn after which the shape is the same."""
         ...
 
 
@@ -71,7 +74,7 @@ class PlacedPrior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """x_mm, y_mm and the shape's own."""
+        """Names of the parameters: x_mm, y_mm, then the shape's own."""
         return ("x_mm", "y_mm", *self.own.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
@@ -96,14 +99,14 @@ class PlacedPrior:
         return np.where(inside & np.isfinite(own), own - np.log(room), -np.inf)
 
     def _bounds_of_centre(self, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the least and greatest x and y of the centre, each (n_samples, 2), for the shapes' own parameters."""
+        """Return the least and the greatest (x, y) of the centre, (n_samples, 2) each, given the own parameters."""
         size = np.array([self.field.width_mm, self.field.height_mm])
         margin = np.zeros((len(own), 2)) if self.extent is None else self.extent(own)
         return margin, size - margin
 
 
 def _require_bounds_fit_field(shape: str, name: str, bounds: Bounds, field: Field, *, reach: float | None) -> None:
-    """Raise ParameterError unless 0 < low < high and, with `reach`, a half width of `reach` x high fits the field."""
+    """Raise ParameterError unless 0 < low < high and, with `reach`, both sides of the field exceed 2 * reach * high."""
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = checked_pair(name, bounds, "(low, high): its prior is even between them")
     if not 0 < low < high < math.inf:
@@ -117,7 +120,7 @@ def _require_bounds_fit_field(shape: str, name: str, bounds: Bounds, field: Fiel
 
 
 def _half_extent_of_circle(own: FloatArray) -> FloatArray:
-    """Return half width and half height of circles, (n_samples, 2), from their radii, (n_samples, 1)."""
+    """Return half width and half height (n_samples, 2) of circles; the first column of `own` is the radius."""
     return np.repeat(own[:, :1], 2, axis=1)
 
 
@@ -146,13 +149,13 @@ class Circle:
         )
 
     def region(self, theta: FloatArray) -> EllipseRegion:
-        """Build a disc for each hypothesis, theta (n_samples, 3)."""
+        """Build the discs of the hypotheses, one per row of theta (n_samples, 3)."""
         return disc_region(theta[:, :2], theta[:, 2])
 
 
 @dataclass(frozen=True)
 class _EllipseOwnPrior:
-    """Uniform semi-major axis, semi-minor axis uniform below it, angle uniform over half a turn."""
+    """Semi-major axis uniform within the bounds, semi-minor uniform from the lower bound to it, angle 0 to pi."""
 
     bounds_mm: Bounds
 
@@ -201,7 +204,7 @@ class Ellipse:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over centre, semi-major axis and angle; the semi-minor axis uniform below the semi-major.
+        """Uniform over centre, semi-major axis, angle; the semi-minor axis from the lower bound to the semi-major.
 
         With `inside`, the centre is uniform over the places that keep the ellipse on the field.
         """
@@ -210,7 +213,7 @@ class Ellipse:
         )
 
     def region(self, theta: FloatArray) -> EllipseRegion:
-        """Build an ellipse for each hypothesis, theta (n_samples, 5)."""
+        """Build the ellipses of the hypotheses, one per row of theta (n_samples, 5)."""
         return EllipseRegion(theta[:, :2], theta[:, 2:4], theta[:, 4])
 
 
@@ -239,13 +242,13 @@ class Rectangle:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over all five; with `inside`, over the centres that keep the rectangle on the field."""
+        """Uniform over all five parameters; with `inside`, over centres that keep the rectangle on the field."""
         side = Uniform(*self.sides_mm)
         own = Product({"width_mm": side, "height_mm": side, "angle_rad": Uniform(0.0, np.pi / 2)})
         return PlacedPrior(self.field, own, _half_extent_of_rectangle if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
-        """Build a rectangle for each hypothesis, theta (n_samples, 5)."""
+        """Build the rectangles of the hypotheses, one per row of theta (n_samples, 5)."""
         corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
         return _turned_polygon(theta[:, :2], corners * theta[:, None, 2:4], theta[:, 4])
 
@@ -266,7 +269,7 @@ class RegularPolygon:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over centre, radius, and angle within the polygon's symmetry.
+        """Uniform over centre, radius, and an angle from 0 to 2 pi / n_sides.
 
         With `inside`, the centre is uniform over the places that keep the circumscribed circle on the field.
         """
@@ -276,11 +279,11 @@ class RegularPolygon:
 
     @property
     def symmetry_turn(self) -> SymmetryTurn:
-        """One corner to the next."""
+        """The turn from one corner to the next."""
         return SymmetryTurn(2 * np.pi / self.n_sides, angle=3)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
-        """Build a polygon for each hypothesis, theta (n_samples, 4)."""
+        """Build the polygons of the hypotheses, one per row of theta (n_samples, 4)."""
         corners = self._unit_corners() * theta[:, None, 2:3]
         return _turned_polygon(theta[:, :2], corners, theta[:, 3])
 
@@ -290,7 +293,7 @@ class RegularPolygon:
 
 
 def _turned_polygon(center_mm: FloatArray, corners_mm: FloatArray, angle_rad: FloatArray) -> PolygonRegion:
-    """Turn polygons with corners (n_samples, n_vertices, 2) anticlockwise about the centre."""
+    """Build polygons with corners (n_samples, n_vertices, 2) about their centres, turned anticlockwise by an angle."""
     cosine, sine = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
     x = center_mm[:, :1] + cosine * corners_mm[..., 0] - sine * corners_mm[..., 1]
     y = center_mm[:, 1:] + sine * corners_mm[..., 0] + cosine * corners_mm[..., 1]

@@ -1,4 +1,4 @@
-"""Parameters that describe the same shape: an angle counts within its symmetry, and a turn may swap two sides."""
+"""Parameters that describe the same shape: angles a symmetry turn apart, sides swapped where the symmetry says so."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probewise.scene.shapes import HasSymmetryTurn, SymmetryTurn
 
 
 def mean_angles(shape: Shape, theta: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the circular mean of each angle of a shape, (n_params,); NaN for what is not an angle.
+    """Return the circular mean of each angle of a shape, modulo its symmetry, (n_params,); NaN for other parameters.
 
     `theta` (n_samples, n_params) are weighted samples, `weight` (n_samples,). For a set of shapes, each angle's mean is
     taken over the samples of its own shape.
@@ -26,10 +26,10 @@ def mean_angles(shape: Shape, theta: FloatArray, weight: FloatArray) -> FloatArr
 
 
 def with_angles_near(shape: Shape, theta: FloatArray, angles_rad: FloatArray) -> FloatArray:
-    """Return samples of the same shapes, (n_samples, n_params), with each angle within half a turn of a given one.
+    """Return samples of the same shapes, (n_samples, n_params), each angle within half a symmetry turn of a given one.
 
-    Mean, sd and quantiles of the result are meaningful where those of the samples as drawn are not: an angle of 0.01
-    and one of pi - 0.01 are nearly the same ellipse. `angles_rad` is (n_params,); NaN leaves a column as it is.
+    `angles_rad` is (n_params,); NaN leaves a column as it is. Sides are swapped where the symmetry says so. Mean and sd
+    of the result are meaningful, while angles of 0.01 and pi - 0.01 may be of nearly the same ellipse.
     """
     out = theta
     for rows, columns, turn in _rows_columns_and_turns(shape, theta):
@@ -47,7 +47,7 @@ def with_angles_near(shape: Shape, theta: FloatArray, angles_rad: FloatArray) ->
 
 
 def _rows_columns_and_turns(shape: Shape, theta: FloatArray) -> list[tuple[IntArray, IntArray, SymmetryTurn]]:
-    """List rows, columns and symmetry of each shape among the samples that has an angle."""
+    """List (row numbers, column numbers, symmetry) of each shape among the samples that has an angle."""
     if isinstance(shape, AnyOf):
         which = shape.shape_index(theta)
         parts = zip(shape.shapes.values(), shape.prior.columns_by_shape, strict=True)

@@ -22,9 +22,9 @@ class RegionBatch(Region, Protocol):
 
 
 def broadcast_and_freeze_fields(region: object, **shapes: tuple[int, ...]) -> None:
-    """Broadcast the named arrays of a region to (n_regions, *shape), check that they are finite, and freeze them.
+    """Broadcast the named arrays of a region to (n_regions, *shape), in place; check that they are finite; freeze them.
 
-    Raises ShapeError for a shape that does not broadcast, ParameterError for a number that is not finite.
+    In a shape, -1 is any length. Raises ShapeError for a shape that does not fit, ParameterError for NaN or infinity.
     """
     arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
     lengths = set()

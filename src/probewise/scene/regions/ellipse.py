@@ -16,7 +16,7 @@ from probewise.scene.regions.geometry import edge_distance, outlines
 class EllipseRegion(RegionBatch):
     """Ellipses, albedo `inside` and `outside` them; a disc has equal semi-axes (paper, eq. 1).
 
-    `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis)
+    `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis, anticlockwise from X)
     (n_regions,).
     """
 
@@ -36,7 +36,7 @@ class EllipseRegion(RegionBatch):
         return np.where(p * p + q * q <= 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, a tangent in place of the edge: (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, the edge taken as straight: (n_regions, n_points)."""
         p, q = self._unit_circle_coordinates(centers_mm)
         a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
         level = np.hypot(p, q)

@@ -48,7 +48,7 @@ def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatAr
 
     Returns
     -------
-    Distances, (n_samples or n_regions or 1, n_points): to first order in the distance for an ellipse,
-    exact for a disc.
+    Distances, (n_samples or n_regions or 1, n_points): exact, but to first order in the distance for an ellipse
+    that is no disc.
     """
     return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)

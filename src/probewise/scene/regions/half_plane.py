@@ -14,10 +14,7 @@ from probewise.scene.regions.geometry import edge_distance
 
 @dataclass(frozen=True, eq=False)
 class HalfPlaneRegion(RegionBatch):
-    """Half-planes x cos(normal) + y sin(normal) > offset (paper, S_BW), fields (n_regions,).
-
-    The albedo is `inside` there, `outside` elsewhere.
-    """
+    """Half-planes x cos(normal) + y sin(normal) > offset, albedo `inside`; `outside` elsewhere. Fields (n_regions,)."""
 
     normal_rad: FloatArray
     offset_mm: FloatArray

@@ -16,7 +16,7 @@ from probewise.errors import ParameterError, ShapeError
 class ImageRegion:
     """One image of albedos: `values` (n_rows, n_columns), first row on top, 0 outside it.
 
-    `origin_mm` is the lower left corner; hypotheses share it (n_regions is 1).
+    `pixel_mm` is a pixel's side, `origin_mm` the lower left corner; hypotheses share the image (n_regions is 1).
     """
 
     values: FloatArray
@@ -34,14 +34,14 @@ class ImageRegion:
 
     @property
     def n_regions(self) -> int:
-        """One image for all hypotheses."""
+        """1: all hypotheses share the image."""
         return 1
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return self._albedo_at(points_mm[:, 0], points_mm[:, 1])[None]
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, from strips along x: exact for unturned pixels."""
+        """Return the mean albedo over turned square pixels, (1, n_points): exact if unturned, else by eight strips."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         steep, flat = np.maximum(np.abs(cosine), 1e-9), np.maximum(np.abs(sine), 1e-9)
         half = 0.5 * pixel_mm
@@ -72,7 +72,7 @@ class ImageRegion:
         return padded
 
     def _albedo_integral_to_lower_left(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Return the integral of the albedo over the quadrant to the lower left, mm^2."""
+        """Return the integral of the albedo to the lower left of each point (x, y), in mm^2."""
         n_rows, n_columns = self.values.shape
         u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)
         v = np.clip((y_mm - self.origin_mm[1]) / self.pixel_mm, 0, n_rows)

@@ -35,7 +35,7 @@ class RegionsOfMixedKinds(RegionBatch):
             raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one per hypothesis")
 
     def rows_and_regions(self) -> list[tuple[IntArray, Region]]:
-        """Return, for each part that occurs, its hypotheses' rows in `which` and their region."""
+        """List, for each part that occurs, the row numbers of its hypotheses in `which`, and their region."""
         pairs = [(np.flatnonzero(self.which == k), part) for k, part in enumerate(self.parts)]
         return [(rows, part) for rows, part in pairs if rows.size]
 

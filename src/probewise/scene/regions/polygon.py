@@ -51,7 +51,7 @@ class PolygonRegion(RegionBatch):
         """Build one region from the vertices (n_vertices, 2) of a polygon that may cross itself.
 
         Edges are split where they meet; pieces with the inside (even-odd rule) on exactly one
-        side are kept, directed so that the inside is on their left.
+        side are kept, directed so that the inside is on their left. ParameterError if the area is 0.
         """
         vertices = np.asarray(vertices_mm, dtype=np.float64)
         if vertices.ndim != 2 or len(vertices) < 3 or vertices.shape[1] != 2:
@@ -84,7 +84,7 @@ def _count_ray_crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArra
 
 
 def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
-    """Split edges (n_edges, 2, 2) where they meet and keep the boundary of the even-odd inside."""
+    """Return the even-odd inside's boundary, (n_pieces, 2, 2), from edges (n_edges, 2, 2), split where they meet."""
     size = float(np.ptp(edges.reshape(-1, 2), axis=0).max())
     if size == 0:
         raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")

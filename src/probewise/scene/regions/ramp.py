@@ -12,7 +12,7 @@ from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fie
 
 @dataclass(frozen=True, eq=False)
 class RampRegion(RegionBatch):
-    """Albedo per_mm (x . n), n the unit normal, unbounded; fields (n_regions,)."""
+    """Albedo per_mm (x . n), n the unit normal at `normal_rad`, not limited to 0 to 1; fields (n_regions,)."""
 
     normal_rad: FloatArray
     per_mm: FloatArray

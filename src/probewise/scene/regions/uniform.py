@@ -23,5 +23,5 @@ class UniformRegion(RegionBatch):
         return np.repeat(self.level[:, None], len(points_mm), axis=1)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over pixels: the level."""
+        """Return the mean albedo over pixels, the level: (n_regions, n_points)."""
         return self.albedo(centers_mm)

@@ -153,7 +153,7 @@ def sections(
 
 
 def evidence_table(sensor: FittedSensor) -> Markup:
-    """Build a calibration's table by number of Gaussians: ln Z ± error, distance below the best, parameters."""
+    """Build a calibration's table by number of Gaussians: ln Z ± error, ln Z below the best, number of parameters."""
     best = max((o.log_z for o in sensor.orders), default=0.0)
     return table(
         ("Gaussians", "ln Z", "below the best", "parameters (with I_min, I_max)"),

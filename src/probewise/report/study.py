@@ -31,7 +31,7 @@ _INTERVALS = (
 
 
 def summary_sentence(study: Study) -> str:
-    """Summarise the study's first row: mean and median readings, and the share of runs that reached the precision."""
+    """Summarise a study's first row: mean and median readings, and the share of runs that reached the precision."""
     row, found = next(iter(study.table().items()))
     share = "All" if found.reached.value == 1 else f"{number_text(100 * found.reached.value, 1)} % of the"
     return (
@@ -68,9 +68,9 @@ def result_tables(study: Study) -> Markup:
 
 
 def lower_bound_table(study: Study) -> Markup | None:
-    """Build the table of a lower bound, for any strategy, on the mean number of readings, beside the measured mean.
+    """Build the table of lower bounds, for any strategy, on mean readings up to the first on white, and after it.
 
-    None if no row of the study has default options (but for circles and noise) and the correct sensor model.
+    Measured means are beside; None if no row has default options (but for circles and noise) and the correct model.
     """
     lines = []
     for row, found in study.table().items():

@@ -195,7 +195,7 @@ def _legend_lines_by_column(labels: Sequence[str], n_columns: int) -> list[list[
 
 
 def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
-    """Write tick labels in full, without a factor or offset; with a power of ten if the axis is shorter than 1e-5."""
+    """Write tick labels in full, without a factor or offset; with a power of ten if the axis spans less than 1e-5."""
     for axis in ([ax.xaxis] if x else []) + ([ax.yaxis] if y else []):
         low, high = axis.get_view_interval()
         if high - low > _LEAST_IN_FULL:

@@ -54,7 +54,7 @@ class HalfPlane(_CheckedPattern):
 
 @dataclass(frozen=True)
 class Quadrant(_CheckedPattern):
-    """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0; direction is (dx, dy), each +1 or -1.
+    """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0, (cx, cy) its corner; direction is (dx, dy), each +1 or -1.
 
     The albedo is `inside` there, `outside` elsewhere.
     """

@@ -38,7 +38,7 @@ class Pictures:
     frames: list[bytes] = field(default_factory=list)
 
     def draw_and_write(self, step: Step, shadow: Step | None) -> None:
-        """Draw a step, beside it that of the other sensor model (`shadow`), if any; write PNG and live page."""
+        """Draw a step, with the other sensor model's (`shadow`), if any; write a PNG and, if `live`, the page."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)

@@ -1,7 +1,7 @@
-"""An independent brute-force simulator with concealed effects: pixels and rays (paper, eq. RwithSSF, by summing light).
+"""Brute-force simulator of a light sensor: sums light over pixels and rays, with effects that a sensor model omits.
 
-It shares only the file formats with the rest of the package: data simulated by the model's own code would prove nothing
-about the model.
+It shares only the file formats with the rest of the package: data simulated by the model's own code would not test
+the model. The summed integral is the paper's eq. RwithSSF.
 """
 
 from probewise.world.concealed import (

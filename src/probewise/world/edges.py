@@ -1,4 +1,4 @@
-"""Edges of a surface: the distance to the nearest, and the direction across."""
+"""Edges of a surface: the distance to the nearest edge, and the direction across edges."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def distance_to_nearest_edge(surface: Surface, x_mm: FloatArray, y_mm: FloatArra
 
 
 def common_edge_normal(surface: Surface) -> tuple[float, float]:
-    """Return the unit vector across the edges of a half-plane or stripes, or up a ramp; along X for others."""
+    """Return the unit vector (x, y) across the edges of a half-plane or stripes, or up a ramp; (1, 0) for others."""
     match surface:
         case HalfPlane() | Stripes() | Ramp():
             return math.cos(surface.normal_rad), math.sin(surface.normal_rad)
@@ -64,7 +64,7 @@ def _coordinate_along_normal(normal_rad: float, x_mm: FloatArray, y_mm: FloatArr
 
 
 def _distance_to_outline(corners: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Return the smallest distance to the sides of a polygon, corners (n, 2) in order."""
+    """Return each point's distance in mm, (n_points,), to the nearest side of a polygon, corners (n, 2) in order."""
     sides = np.roll(corners, -1, axis=0) - corners
     lengths = np.hypot(*sides.T)
     from_start = np.stack([x_mm, y_mm], axis=-1)[:, None, :] - corners

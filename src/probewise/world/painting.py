@@ -25,7 +25,7 @@ from probewise.recordings.patterns import (
 
 @dataclass(frozen=True)
 class Oval:
-    """An ellipse, which the file format lacks: half axes in mm, the first at `angle_rad` to X."""
+    """An ellipse, not in the file format: half axes in mm, the first at `angle_rad` to X; albedo inside and outside."""
 
     center_mm: tuple[float, float]
     half_axes_mm: tuple[float, float]
@@ -36,7 +36,7 @@ class Oval:
 
 @dataclass(frozen=True)
 class CoveredSurface:
-    """A surface with cards on it, each a polygon with an albedo; the last is on top."""
+    """A surface with cards lying on it, each a polygon of albedo `inside`; the last card is on top."""
 
     below: Pattern | Oval
     cards: tuple[Polygon, ...]
@@ -46,7 +46,7 @@ Surface: TypeAlias = Pattern | Oval | CoveredSurface
 
 
 def albedo_at(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Return the albedo at points; all arrays of one shape.
+    """Return the albedo at points in mm; `x_mm`, `y_mm` and the result have one shape.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def albedo_at(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArra
 
 
 def _inside_polygon_mask(polygon: Polygon, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
-    """Return whether points are inside: a ray towards +x crosses an odd number of sides."""
+    """Return a mask of the points inside: those from which a ray towards +x crosses an odd number of sides."""
     odd = np.zeros(x_mm.shape, dtype=np.bool_)
     corners = polygon.vertices_mm
     for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1], strict=True):

@@ -1,4 +1,4 @@
-"""The world's table of readings: where, when, and over what."""
+"""The simulator's table of readings: pose, motion, time, scan and covariates of each, and the nearest edge."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Rows:
     Parameters
     ----------
     place_mm
-        Place of the sensor, shape (n_points, 2): commanded, or true once the arm's errors are applied.
+        Position (x, y) of the sensor, shape (n_points, 2): commanded, or true once the arm's errors are applied.
     direction
         Unit vector of the last motion, 0 where there was none, shape (n_points, 2).
     orientation_rad
@@ -26,16 +26,16 @@ class Rows:
     time_s
         Time, shape (n_points,).
     scan
-        Number of the scan, shape (n_points,).
+        Number of the scan, an index of `scan_names`, shape (n_points,).
     scan_names
         Name of each scan.
     covariates
-        Other logged columns, arrays of shape (n_points,).
+        Other logged columns by name, arrays of shape (n_points,).
     across
         Unit vector across the straight edges of the pattern below, (1, 0) for others (`common_edge_normal`), shape
         (n_points, 2).
     edge_mm
-        Distance from the place to the nearest edge of the pattern, infinite where it has none, (n_points,).
+        Distance from the sensor's position to the pattern's nearest edge, infinite where there is none, (n_points,).
     """
 
     place_mm: FloatArray
@@ -50,7 +50,7 @@ class Rows:
 
     @classmethod
     def from_plan(cls, plan: Plan, across: FloatArray, edge_mm: FloatArray) -> Rows:
-        """Build from a plan, as commanded."""
+        """Build from a plan's commanded poses, with `across` and `edge_mm` of the surfaces below."""
         return cls(
             place_mm=np.stack([plan.x_mm, plan.y_mm], axis=-1),
             direction=plan.direction_of_motion,
@@ -64,17 +64,17 @@ class Rows:
         )
 
     def commanded_column(self, name: str, *, otherwise: float) -> FloatArray:
-        """Return a commanded column, `otherwise` where it is NaN or there is none, shape (n_points,)."""
+        """Return the covariate `name`, shape (n_points,), with `otherwise` in place of NaN or of an absent column."""
         column = self.covariates.get(name, np.full(len(self.time_s), np.nan))
         return np.where(np.isfinite(column), column, otherwise)
 
     def in_scans_mask(self, names: tuple[str, ...]) -> BoolArray:
-        """Return whether each row belongs to one of these scans, shape (n_points,)."""
+        """Return a mask of the rows that belong to a scan in `names`, shape (n_points,)."""
         chosen = [k for k, name in enumerate(self.scan_names) if name in names]
         return np.isin(self.scan, chosen)
 
     def scan_start_mask(self) -> BoolArray:
-        """Return whether each row is the first, or comes after one of another scan, shape (n_points,)."""
+        """Return a mask, shape (n_points,), of the rows that start a scan or resume it after another scan."""
         return np.concatenate([[True], self.scan[1:] != self.scan[:-1]])
 
     of, commanded, in_scans, starts_scan = (

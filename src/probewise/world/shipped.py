@@ -1,7 +1,7 @@
 """The recordings that ship with the package: their truth, and how to regenerate them from their seeds.
 
 `python -m probewise.world.shipped FOLDER` writes both recordings into a folder, bit for bit as they ship.
-No diagnosis may import this module, since it holds the truth.
+No diagnosis may import this module, since the module holds the truth.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ CANDIDATES: tuple[Concealed, ...] = (
 
 
 def true_world(name: str) -> World:
-    """Return the world of a shipped recording, with its concealed effect.
+    """Return the world of a shipped recording: "paper" has no concealed effect, "concealed" has one.
 
     Raises ParameterError if there is no recording of that name.
     """
@@ -69,7 +69,7 @@ truth = true_world  # its old name
 
 
 def regenerate_recording(name: str) -> Recording:
-    """Regenerate a shipped recording.
+    """Regenerate the shipped recording `name`, "paper" or "concealed".
 
     Readings are rounded to 0.001, far below the noise, so that floating-point differences between machines vanish.
 
@@ -83,7 +83,7 @@ def regenerate_recording(name: str) -> Recording:
 
 
 def _random_streams(name: str) -> list[np.random.Generator]:
-    """Return independent random streams for the concealed effect, the times and the noise."""
+    """Return three independent generators: for the concealed effect, the times and the noise."""
     if name not in SHIPPED:
         raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
     return np.random.default_rng(SEEDS[name]).spawn(3)

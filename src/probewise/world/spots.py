@@ -22,11 +22,11 @@ class Spot:
     Parameters
     ----------
     weights
-        Share by pixel, shape (n_v, n_u), first row at the smallest v; scaled here to sum to one.
+        Share by pixel, shape (n_v, n_u), first row at the smallest v, first column at smallest u; scaled to sum to one.
     pixel_mm
         Side of a pixel.
     corner_mm
-        Outer corner (u, v) of the first pixel in the sensor frame.
+        Corner (u, v) of the raster with the smallest u and v, in the sensor frame.
     """
 
     weights: FloatArray
@@ -63,7 +63,7 @@ class Spot:
 
 @dataclass(frozen=True)
 class Blob:
-    """One Gaussian of a footprint: share of the light, centre and sds (mm), correlation of u and v."""
+    """One Gaussian of a footprint: share of the light, centre and sds (mm) along u and v, correlation of u and v."""
 
     share: float
     center_mm: tuple[float, float]
@@ -74,12 +74,12 @@ class Blob:
 def raster_spot(
     density: Density, half_width_mm: float, *, center_mm: tuple[float, float] = (0.0, 0.0), pixel_mm: float = 0.25
 ) -> Spot:
-    """Rasterise a density over a square of pixels; rows and columns with negligible weight are cropped.
+    """Rasterise a density over a square of pixels; rows and columns with negligible weight at the margin are cropped.
 
     Parameters
     ----------
     density
-        Sensitivity at points (u, v), arrays of one shape; any scale, 0 or more.
+        Function of arrays u, v (mm) of one shape: sensitivity there; any scale, 0 or more.
     half_width_mm
         Half the side of the square.
     center_mm
@@ -103,7 +103,7 @@ def _slice_with_nearly_all_mass(profile: FloatArray) -> slice:
 
 
 def gaussian_spot(blobs: Sequence[Blob], *, pixel_mm: float = 0.25) -> Spot:
-    """Make a footprint of one or several Gaussians; only the ratios of their shares count."""
+    """Make a footprint that is a sum of Gaussians; only the ratios of their shares count."""
     low = [min(b.center_mm[k] - 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
     high = [max(b.center_mm[k] + 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
 
@@ -136,8 +136,8 @@ def ridge_spot(
 ) -> Spot:
     """Make a cosine disc with two lobes and the shadow of a ridge across it; not a mixture of Gaussians.
 
-    The photodiode sees a disc that fades as cos^2 to its rim, stronger along u by `lobes`; the plastic
-    ridge between diode and LED takes `shadow` of the light along the line v = centre + `ridge_mm`.
+    The photodiode sees a disc that fades as cos^2 to its rim, brighter along u and darker along v by a share `lobes`;
+    the plastic ridge between diode and LED takes `shadow` of the light along the line v = centre + `ridge_mm`.
     """
 
     def light_density(u: FloatArray, v: FloatArray) -> FloatArray:
@@ -159,8 +159,8 @@ def tailed_spot(
 ) -> Spot:
     """Make a skewed footprint with exponential tails, exp(-r) in stretched axes; not a mixture of Gaussians.
 
-    `core_mm` are the decay lengths along u and v; `skew`, 0 to below 1, lengthens the tail towards
-    +u and shortens it towards -u.
+    `core_mm` are the decay lengths along u and v; `skew`, 0 to below 1 (else ParameterError), lengthens the tail
+    towards +u and shortens that towards -u.
     """
     if not 0 <= skew < 1:
         raise ParameterError("skew", skew, "0 to below 1")
@@ -184,7 +184,7 @@ def ring_spot(
 ) -> Spot:
     """Make a ring, brighter on one side, as of an LED off the lens axis; not a mixture of Gaussians.
 
-    The ring is a Gaussian of sd `width_mm` about a circle; `off_axis`, 0 to 1, brightens it towards +v.
+    A Gaussian of sd `width_mm` about a circle; `off_axis`, 0 to 1 (else ParameterError), brightens the side towards +v.
     """
     if not 0 <= off_axis <= 1:
         raise ParameterError("off_axis", off_axis, "0 to 1")
@@ -199,7 +199,7 @@ def ring_spot(
 
 
 def blurred(spot: Spot, sd_mm: float) -> Spot:
-    """Convolve a footprint with a round Gaussian of sd `sd_mm`; its pixels become no larger than that."""
+    """Return a footprint convolved with a round Gaussian of sd `sd_mm`; larger pixels are divided first."""
     # A Gaussian sampled more coarsely than its sd is too narrow: refine the pixels first.
     cuts = math.ceil(spot.pixel_mm / sd_mm)
     pixel_mm = spot.pixel_mm / cuts

@@ -1,4 +1,4 @@
-"""The simulated world: a footprint over painted surfaces, with concealed effects."""
+"""The simulated world: a sensor's footprint over surfaces, with concealed effects."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class View:
     seen
         Seen white fraction u, shape (n_points,).
     dimming
-        Factor on the signal, from the true height and the LED, shape (n_points,).
+        Factor on the signal from the true height (inverse square) and the commanded LED, shape (n_points,).
     rows
         Table of the readings with the sensor's true poses.
     """
@@ -65,11 +65,11 @@ class World:
     noise_sd
         Standard deviation of the Gaussian noise of one reading.
     step
-        Readings are rounded to multiples of it; None: not rounded.
+        Readings are rounded to multiples of `step`; None: not rounded.
     concealed
         Effects that a plain model leaves out. They act in the order of the stages; within a stage, as listed.
     height_mm
-        Height of the sensor at which the footprint and the levels hold, and the usual one.
+        Height at which `spot`, `black` and `white` hold; also the sensor's height where none is commanded.
     """
 
     spot: Spot
@@ -103,7 +103,7 @@ class World:
         direction: tuple[float, float] = (0.0, 0.0),
         height_mm: float | None = None,
     ) -> float:
-        """Take one reading over a surface, as an arm does.
+        """Take one reading over a surface, as an arm does; return the recorded reading.
 
         Parameters
         ----------
@@ -116,9 +116,9 @@ class World:
         rng
             Generator of the noise; None: a reading without noise, but rounded.
         direction
-            Unit vector of the motion that led there, for backlash and hysteresis.
+            Unit vector of the motion to this pose, for backlash and hysteresis; (0, 0): none.
         height_mm
-            Height of the sensor; None: `self.height_mm`.
+            Commanded height of the sensor; None: `self.height_mm`.
         """
         if rng is not None:
             require_rng(rng)
@@ -139,8 +139,8 @@ class World:
     def view(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> View:
         """Compute what the sensor sees at each reading of a plan, by integrating light: a simulation's costly part.
 
-        The plan's columns `height_mm` and `led` are commands; at NaN the sensor is as usual. The view does not depend
-        on effects from the stage "response" on: a world that differs in those only may turn it into readings.
+        The plan's columns `height_mm` and `led` are commands; NaN means `self.height_mm` and LED 1. The view does not
+        depend on effects from the stage "response" on: worlds that differ in such effects only can share one view.
         """
         found = self._surfaces_with_rows(plan, surfaces)
         across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
@@ -150,7 +150,7 @@ class World:
         return self._view_of_rows(found, Rows.from_plan(plan, across, edge_mm))
 
     def noise_free_readings(self, view: View) -> FloatArray:
-        """Turn a view into noise-free readings, not rounded, shape (n_points,)."""
+        """Turn a view into readings before noise, rounding and losses, shape (n_points,)."""
         rows = view.rows
         signal = (self.white - self.black) * self._apply_changes("response", view.seen, rows) * view.dimming
         reading = self.black + self._apply_changes("gain", signal, rows)
@@ -238,7 +238,7 @@ class World:
         return View(self._apply_changes("seen", seen, there), dimming, there)
 
     def _recorded_readings(self, view: View, rng: np.random.Generator | None) -> FloatArray:
-        """Turn a view into readings with noise, rounding and losses; without `rng`, with rounding only."""
+        """Turn a view into readings with noise, rounding and losses; if `rng` is None, with rounding only."""
         readings = self.noise_free_readings(view)
         if rng is not None:
             noise = self._apply_disturbances("noise", rng.standard_normal(len(readings)), view, rng)

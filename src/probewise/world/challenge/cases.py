@@ -1,4 +1,4 @@
-"""Draw a case: a recording, its concealed effects, and held-out plans to test the diagnosis on."""
+"""Draw a case: a simulated recording, its concealed effects, and held-out plans to test the diagnosis on."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class Case:
     truth
         The truth that the diagnosis is scored against.
     world
-        The world with its concealed effects.
+        The simulated sensor with its concealed effects.
     test_plans
-        Plans of the held-out readings, by name.
+        Plans of the held-out readings, by name: "angle", "pattern", "direction" (`held_out_plans`).
     test_seed
-        Seed of the noise of the held-out readings.
+        Seed sequence of the noise of the held-out readings.
     """
 
     recording: Recording
@@ -66,16 +66,17 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     Parameters
     ----------
     seed
-        The sealed seed of the challenge.
+        The secret seed of the challenge.
     number
         Number of the case, from 0: determines its stratum (`stratum_of`) and, with the seed, everything else.
     norm_after_refit
-        Norm of an effect after a full refit of the null model, in reading units.
+        Function of two noise-free recordings, without and with an effect: norm of the effect after a full refit of the
+        null model, in reading units.
 
     Raises
     ------
     NotConvergedError
-        If no draw fits the stratum (the size; the cosine of a pair or an alias), in any of the plans tried.
+        If none of six draws in each plan has the stratum's size, a pair's |cosine| < 0.5, an alias's loss < 3 nats.
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
@@ -112,9 +113,9 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
 
 
 def held_out_recordings(case: Case) -> dict[str, Recording]:
-    """Simulate the held-out recordings, by name of their plan, in the same world after the recording.
+    """Simulate the held-out plans of a case in its world; return the recordings by name of the plan.
 
-    Effects tied to a named scan are not in them; effects in time continue.
+    They follow the recording in time: effects in time continue; effects tied to a named scan do not act.
     """
     rng = np.random.default_rng(case.test_seed)
     return {name: case.world.simulate(plan, rng=rng) for name, plan in case.test_plans.items()}
@@ -122,7 +123,7 @@ def held_out_recordings(case: Case) -> dict[str, Recording]:
 
 @dataclass(frozen=True)
 class _ConcealedEffects:
-    """Effects chosen for a case, with the cosine of a pair or the alias."""
+    """Effects chosen for a case; the cosine of a pair, or the alias, is None in other strata."""
 
     hidden: tuple[HiddenEffect, ...] = ()
     cosine: float | None = None
@@ -139,9 +140,9 @@ def _draw_plan_and_effects(
     rng: np.random.Generator,
     plan_rng: np.random.Generator,
 ) -> tuple[str, CleanSetup, _ConcealedEffects]:
-    """Draw plans, and the stratum's effects a few times in each, until all fit the stratum.
+    """Draw a plan and up to six times the stratum's effects, plan after plan, until the effects fit the stratum.
 
-    Return the plan's name, the plan with its world, and the effects.
+    Return the plan's name, the plan with its effect-free world, and the effects; raise NotConvergedError if none fit.
     """
     failure = NotConvergedError("no plan to try")
     for plan_name in plan_names:
@@ -162,7 +163,7 @@ def _draw_effects(
 ) -> _ConcealedEffects:
     """Draw the effects of a stratum once.
 
-    Raises NotConvergedError if they cannot have the size, a pair is too similar, or an alias is not aliased.
+    Raises NotConvergedError if they cannot have the size, a pair's |cosine| is 0.5 or more, or an alias loses 3 nats.
     """
 
     def draw_effect(name: str) -> HiddenEffect:
@@ -192,7 +193,7 @@ def _draw_effects(
 def _draw_effect_of_size(
     name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
 ) -> HiddenEffect:
-    """Draw the effect `name` at the amplitude where it has the wanted size, or at a fixed one if it is not scalable."""
+    """Return the effect `name`, other parameters drawn, with lambda about `wanted`, or at its fixed amplitude."""
     sampler = INSIDE.get(name) or OUTSIDE[name]
     of_amplitude = sampler.draw(setup, rng)
     amplitude = sampler.first
@@ -205,6 +206,6 @@ def _draw_effect_of_size(
 
 
 def _simulated_instrumentation(plan: Plan, model: str) -> Instrumentation:
-    """Return a plan's instrumentation as that of simulated readings; "quantised" noise has a rounding step."""
+    """Return a plan's instrumentation, described as simulated; rounding step 1 for "quantised" noise, else None."""
     step = 1.0 if model == "quantised" else None
     return replace(plan.instrumentation, step=step, description="Simulated readings of a challenge")

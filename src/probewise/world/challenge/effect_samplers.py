@@ -21,29 +21,29 @@ OfAmplitude: TypeAlias = Callable[[float], Concealed]
 
 @dataclass(frozen=True, eq=False)
 class CleanSetup:
-    """A plan and a world without effects, in which an effect will be concealed."""
+    """A plan and a simulated sensor without effects, in which an effect will be concealed."""
 
     plan: Plan
     world: World
 
     @property
     def start_s(self) -> float:
-        """Time of the first reading."""
+        """Time of the first reading, s."""
         return float(self.plan.time_s[0])
 
     @property
     def duration_s(self) -> float:
-        """Time from the first reading to the last."""
+        """Time from the first reading to the last, s."""
         return float(self.plan.time_s[-1] - self.plan.time_s[0])
 
     @property
     def nyquist_hz(self) -> float:
-        """Half the median rate of the readings: the highest frequency that they determine."""
+        """Half the median rate of the readings, Hz: the highest frequency that they determine."""
         return 0.5 / float(np.median(np.diff(self.plan.time_s)))
 
     @cached_property
     def edge_scan_names(self) -> tuple[str, ...]:
-        """Names of the scans of 20 readings or more that start over a pattern that is not uniform."""
+        """Names of the scans of 20 readings or more whose first reading is over a pattern that is not uniform."""
         return tuple(
             self.plan.scan_names[k]
             for k, rows in enumerate(self.plan.rows_by_scan())
@@ -52,7 +52,7 @@ class CleanSetup:
         )
 
     def scans_at_orientation_of(self, scan: str) -> tuple[str, ...]:
-        """Return the names of all scans with the same sensor orientation as `scan`, in the order they were taken."""
+        """Return the names of all scans, `scan` included, that start at the orientation of `scan`, in plan order."""
         first = {name: rows[0] for name, rows in zip(self.plan.scan_names, self.plan.rows_by_scan(), strict=True)}
         turn = self.plan.orientation_rad
         return tuple(name for name, row in first.items() if turn[row] == turn[first[scan]])
@@ -69,15 +69,15 @@ class EffectSampler:
     Parameters
     ----------
     residual_covariates
-        Covariates along which its residual is visible.
+        Names of the covariates along which its residual is visible.
     draw
-        Function that draws all parameters except the amplitude.
+        Function of a setup and a generator that draws all parameters but the amplitude: returns amplitude -> effect.
     first
         First amplitude of the search for a size.
     limit
         Largest plausible amplitude.
     scalable
-        Whether its size can be chosen; otherwise the amplitude is `first`.
+        Whether the search chooses the amplitude; if False, the amplitude is `first`.
     """
 
     residual_covariates: tuple[str, ...]
@@ -88,22 +88,22 @@ class EffectSampler:
 
 
 def draw_sign(rng: np.random.Generator) -> float:
-    """Draw +1 or -1."""
+    """Draw +1.0 or -1.0, equally likely."""
     return float(rng.choice([-1.0, 1.0]))
 
 
 def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number whose logarithm is uniform."""
+    """Draw a number between `low` and `high` whose logarithm is uniform."""
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
 def make_draw_without_random_parameters(make: OfAmplitude) -> Draw:
-    """Make the `Draw` of an effect whose amplitude is its only parameter: nothing is drawn."""
+    """Return the `draw` of an `EffectSampler` whose amplitude is its only parameter: nothing is drawn."""
     return lambda setup, rng: make
 
 
 def make_draw_with_random_sign(make: OfAmplitude) -> Draw:
-    """Make the `Draw` of an effect whose only drawn parameter is the sign of its amplitude."""
+    """Return the `draw` of an `EffectSampler` that draws only the sign of the amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s = draw_sign(rng)

@@ -1,4 +1,4 @@
-"""Samplers of the effects in the diagnosis's vocabulary, with the covariates of their residuals."""
+"""Samplers of the effects that a diagnosis can name, with the covariates along which their residuals are visible."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from probewise.world.challenge.effect_samplers import (
 
 
 def _make_draw_with_random_direction(make: Callable[[float, float], concealed.Concealed]) -> Draw:
-    """Make the `Draw` of a gradient within 60 degrees of X, the direction in which every plan moves."""
+    """Return the `draw` of a vector effect: direction within 60 degrees of +X or -X, length = amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, angle = draw_sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
@@ -46,7 +46,7 @@ def _draw_flicker(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 def _draw_saturation(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    """Draw a ceiling, hard or softened over one unit; the amplitude is its depth below white, a share of the span."""
+    """Draw a saturation, sharp or rounded over one reading unit; amplitude: (white - level) / (white - black)."""
     white, span = setup.world.white, setup.world.white - setup.world.black
     softness = float(rng.choice([0.0, 1.0]))
     return lambda a: concealed.Saturation(white - a * span, softness)
@@ -68,7 +68,7 @@ def _draw_scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAm
 
 
 def _make_draw_with_random_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
-    """Make the `Draw` of an effect of random sign on a random scan, or on all scans at that scan's orientation."""
+    """Return the `draw` of an effect of random sign on a random scan or, as likely, all scans at its orientation."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, scan = draw_sign(rng), str(rng.choice(setup.edge_scan_names))
@@ -79,7 +79,7 @@ def _make_draw_with_random_scans(make: Callable[[float, tuple[str, ...]], concea
 
 
 def _draw_patch_place(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Draw the place x, y of a stain or glint, near the scans along X, and its sd, in mm."""
+    """Draw x (-40 to 40), y (-4 to 4) and sd (3 to 10) of a stain or glint, all in mm."""
     return rng.uniform(-40, 40), rng.uniform(-4, 4), draw_log_uniform(rng, 3.0, 10.0)
 
 
@@ -114,7 +114,7 @@ def _draw_outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 def _draw_dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    """Draw the value and the share of lost readings; their size is not chosen, since a single one is obvious."""
+    """Draw the value of lost readings, 0 or 100, and their share: 0.5 to 5 times the amplitude (fixed at 0.01)."""
     value, factor = float(rng.choice([0.0, 100.0])), draw_log_uniform(rng, 0.5, 5.0)
     return lambda a: concealed.Dropouts(factor * a, value)
 

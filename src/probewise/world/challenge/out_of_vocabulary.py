@@ -1,4 +1,4 @@
-"""Samplers of effects outside the vocabulary."""
+"""Samplers of effects outside the vocabulary, which a diagnosis can detect but not name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plans of a challenge with randomly displaced patterns, and the held-out plans."""
+"""The plans of a challenge with randomly displaced patterns, and plans of held-out readings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _READING_S, _BREAK_S = 1.2, 30.0
 
 @dataclass(frozen=True)
 class _HeldOutScan:
-    """One held-out scan over one pattern: places (n, 2) in mm."""
+    """One held-out scan over one pattern: positions (n, 2) in mm, one orientation in rad."""
 
     name: str
     pattern: Pattern
@@ -29,14 +29,14 @@ class _HeldOutScan:
 
 
 def draw_plan_with_displaced_patterns(name: str, *, rng: np.random.Generator) -> Plan:
-    """Return a plan by name, its patterns displaced at random (and described so), its readings at an arm's times."""
+    """Return the plan `name` of PLANS with jittered times and randomly displaced patterns, described where they are."""
     plan = PLANS[name]()
     patterns = {key: _randomly_displaced_pattern(pattern, rng) for key, pattern in plan.patterns.items()}
     return with_jittered_times(replace(plan, patterns=patterns), rng=rng)
 
 
 def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
-    """Make the held-out plans "angle", "pattern" and "direction", which differ from `plan` and are read after it.
+    """Return three held-out plans of one scan each, by name, which differ from `plan` and are read after it.
 
     "angle": a scan across a boundary with the sensor at an unused angle. "pattern": a scan beside the middle of a disc,
     or of a triangle if the plan has a disc already. "direction": a boundary crossed from +x to -x where the plan goes
@@ -75,7 +75,7 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
 
 
 def _randomly_displaced_pattern(pattern: Pattern, rng: np.random.Generator) -> Pattern:
-    """Move a boundary, quadrant or disc by up to 0.5 mm; turn a boundary by up to 2 degrees, resize a disc."""
+    """Return a boundary (also turned by up to 2 degrees), quadrant or disc (also resized) moved by up to 0.5 mm."""
     dx, dy, turn = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), math.radians(rng.uniform(-2, 2))
     match pattern:
         case HalfPlane():
@@ -90,7 +90,7 @@ def _randomly_displaced_pattern(pattern: Pattern, rng: np.random.Generator) -> P
 
 
 def _single_scan_plan(plan: Plan, scan: _HeldOutScan, start_s: float) -> Plan:
-    """Return a plan of one scan that begins at `start_s`; covariates continue the line fitted to those of `plan`."""
+    """Return a plan of one scan from `start_s`; each covariate continues the line in time fitted to that of `plan`."""
     n_points = len(scan.places_mm)
     time_s = start_s + _READING_S * np.arange(n_points)
     # The battery keeps draining at the same rate.

@@ -1,4 +1,4 @@
-"""The region of a local effect, which a diagnosis should locate."""
+"""The region where a local effect acts, which a diagnosis should locate."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from probewise.world.concealed import (
 
 @dataclass(frozen=True)
 class CovariateRegion:
-    """An interval of a covariate in its unit, or scans by name."""
+    """The interval `low` to `high` of a covariate in its unit, or `scans` by name."""
 
     covariate: str
     low: float | None = None
@@ -34,11 +34,11 @@ class CovariateRegion:
 
 
 def region_of_effect(effect: Concealed, sizer: EffectSizer) -> CovariateRegion | None:
-    """Return the region of a local effect, or None for a global one.
+    """Return the region of a local effect, or None for any other.
 
-    Of an effect on named scans: these scans. Of a step in time: the rest of the recording. Of a saturation: the levels
-    above it. Of an edge shadow or an effect about a place: the distances, or the range of X in scans along X, where it
-    is at least half its maximum.
+    Effects on named scans: those scans. Ambient step: from the step to the last reading. Saturation: its level to the
+    largest reading. Edge shadow: distances at which it is at least half its maximum. Stain, glint, step in X: the range
+    of X in which it changes readings of scans along X by at least half its maximum.
     """
     plan, clean = sizer.clean_recording.plan, sizer.clean_recording.readings
     match effect:

@@ -107,19 +107,20 @@ middle noise level: a good but inexact model."""
 
 
 def draw_spot(ssf: str, *, rng: np.random.Generator) -> Spot:
-    """Draw a footprint of this kind, with sizes within 15 % of a LEGO light sensor's."""
+    """Draw a footprint of the kind `ssf`, a key of SSFS, with sizes within 15 % of a LEGO light sensor's."""
     return SSFS[ssf](rng)
 
 
 def draw_sensor(ssf: str, noise_level: str, *, rng: np.random.Generator) -> World:
-    """Draw a sensor without concealed effects."""
+    """Draw a sensor, as a World without effects: SSF of a kind of SSFS, black, white, noise sd of NOISE_LEVELS."""
     black, white = float(rng.uniform(8, 14)), float(rng.uniform(55, 70))
     return World(draw_spot(ssf, rng=rng), black=black, white=white, noise_sd=NOISE_LEVELS[noise_level])
 
 
 def with_noise_model(world: World, model: str, *, duration_s: float) -> World:
-    """Return the world with a noise model of NOISE_MODELS; `noise_sd` remains the sd of its Gaussian core.
+    """Return the world with a noise model of NOISE_MODELS added; its `noise_sd` is unchanged.
 
+    It is the sd at the start for "drifting", on black for "signal_dependent", of the core for "outliers".
     "quantised" readings are rounded to whole units, which the plan should declare.
     """
     if model == "quantised":

@@ -39,7 +39,7 @@ def amplitude_of_size(
     acceptable: float = 0.1,
     max_calls: int = 16,
 ) -> float:
-    """Find an amplitude greater than 0 at which `size` has the requested value.
+    """Return an amplitude greater than 0 at which `size` has the requested value.
 
     Size grows roughly as a power of the amplitude: steps follow a straight line in log-log coordinates, first by
     extrapolation, then by interpolation, with bisection where interpolation gains too little.
@@ -47,7 +47,7 @@ def amplitude_of_size(
     Parameters
     ----------
     size
-        Size at an amplitude.
+        Function from amplitude to size.
     wanted
         Requested size, greater than 0.
     first
@@ -57,15 +57,15 @@ def amplitude_of_size(
     tolerance
         Relative error of the size at which the search ends.
     acceptable
-        Relative error accepted where the size jumps past the requested value as the amplitude grows.
+        Relative error accepted when the search ends otherwise.
     max_calls
         Largest number of calls of `size`.
 
     Raises
     ------
     NotConvergedError
-        If even the limit is too small, or no amplitude has an acceptable size; `partial` holds the amplitude and size
-        that came closest.
+        If even the limit is too small, or no amplitude has an acceptable size; `partial` holds (amplitude, size) of the
+        nearest.
     """
     low: tuple[float, float] | None = None  # log amplitude and log(size / wanted), size too small
     high: tuple[float, float] | None = None  # the same, size too large
@@ -99,14 +99,14 @@ def amplitude_of_size(
 
 @dataclass(frozen=True, eq=False)
 class EffectSizer:
-    """Sizes lambda of effects in one plan and with one sensor, and the cosine of two.
+    """Computes sizes lambda of effects in one plan and with one sensor, and the cosine of two.
 
     Parameters
     ----------
     setup
         A plan and a world without effects.
     norm_after_refit
-        Norm of an effect after a full refit of the null model.
+        Function of two recordings, without and with an effect: its norm after a full refit of the null model.
     """
 
     setup: CleanSetup
@@ -118,11 +118,11 @@ class EffectSizer:
 
     @cached_property
     def clean_recording(self) -> Recording:
-        """Recording of noise-free readings without any effect."""
+        """Recording of the plan: noise-free readings without any effect."""
         return self.setup.world.simulate(self.setup.plan, rng=None, view=self._clean_view).without_declared_range()
 
     def recording_with_effects(self, *concealed: Concealed) -> Recording:
-        """Return a recording of the noise-free readings with these effects."""
+        """Return a recording of the plan: noise-free readings with these effects."""
         same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
         world = replace(self.setup.world, concealed=concealed)
         return world.simulate(
@@ -130,7 +130,7 @@ class EffectSizer:
         ).without_declared_range()
 
     def size(self, *concealed: Concealed) -> float:
-        """Return lambda of the effects together, in sds of the noise's Gaussian core."""
+        """Return lambda of the effects together: norm after the refit / noise sd; of noise, `noise_effect_size`."""
         if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
             return noise_effect_size(
                 concealed[0], self._clean_view, self.clean_recording.readings, self.setup.world.noise_sd
@@ -141,7 +141,7 @@ class EffectSizer:
         )
 
     def cosine(self, one: Concealed, other: Concealed) -> float:
-        """Return the cosine of two effects after the refit, from the sizes of both together and of each."""
+        """Return the cosine between two effects' residuals after the refit, from the sizes of each and of both."""
         a, b, both = self.size(one), self.size(other), self.size(one, other)
         return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
 
@@ -159,16 +159,16 @@ def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_
     Parameters
     ----------
     effect
-        A noise effect of the vocabulary.
+        Correlated or signal-dependent noise, outliers, or dropouts.
     view, readings
-        View of the sensor, and the noise-free readings, shape (n_points,).
+        View of the sensor (`World.view`), and the noise-free readings, shape (n_points,).
     noise_sd
-        Sd of the noise's Gaussian core.
+        Sd of the noise's Gaussian core, reading units.
 
     Raises
     ------
     ParameterError
-        If the effect is not a noise effect of the vocabulary.
+        If the effect is any other.
     """
     n_points = len(view.seen)
     match effect:
@@ -188,7 +188,7 @@ def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_
 
 
 def _outlier_divergence(share: float, size: float) -> float:
-    """Return the KL divergence of a two-Gaussian mixture from the Gaussian of equal variance."""
+    """Return KL in nats of (1 - share) N(0, 1) + share N(0, 1 + size^2) from the Gaussian of equal variance."""
     wide, even = math.sqrt(1 + size**2), math.sqrt(1 + share * size**2)
 
     def integrand(z: float) -> float:

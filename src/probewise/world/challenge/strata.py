@@ -1,4 +1,4 @@
-"""The strata of a campaign: kinds and sizes of cases, in a repeating cycle."""
+"""The strata of a challenge: kinds and sizes of cases, in a repeating cycle of 60."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CaseKind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ss
 
 @dataclass(frozen=True)
 class Stratum:
-    """A kind of case, its size lambda (0 for clean), and whether its noise is of another kind than white."""
+    """A kind of case, the size lambda of each effect (0 for clean), and whether the noise is drawn from OTHER_NOISE."""
 
     kind: CaseKind
     size: float = 0.0
@@ -42,7 +42,7 @@ _STRIDE = 23  # coprime to the length of the cycle, so that successive cases dif
 
 
 def stratum_of(number: int) -> tuple[Stratum, int]:
-    """Return the stratum of a case and the number of earlier cases of that stratum."""
+    """Return the stratum of case `number`, and how many cases of that stratum have smaller numbers."""
     cycle, slot = divmod(number, len(WHEEL))
     order = [WHEEL[k * _STRIDE % len(WHEEL)] for k in range(len(WHEEL))]
     stratum = order[slot]

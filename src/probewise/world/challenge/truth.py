@@ -25,7 +25,7 @@ class HiddenEffect:
     size_lambda
         Norm of its change after a refit of the null model, in noise sds.
     region
-        Region where it acts; None: everywhere.
+        Region where it acts; None: not a local effect.
     """
 
     effect: Concealed
@@ -39,17 +39,17 @@ class HiddenEffect:
 
     @property
     def in_vocabulary(self) -> bool:
-        """Whether a diagnosis can name it."""
+        """Whether the effect is one that a diagnosis can name."""
         return self.name in INSIDE
 
     @property
     def residual_covariates(self) -> tuple[str, ...]:
-        """Covariates along which its residual is visible."""
+        """Names of the covariates along which the effect's residual is visible."""
         return (INSIDE.get(self.name) or OUTSIDE[self.name]).residual_covariates
 
     @property
     def parameters(self) -> dict[str, object]:
-        """Parameters by name, as in the vocabulary."""
+        """Parameters of the effect, name to value."""
         return dict(vars(self.effect))
 
     shows_in = visible_covariates = residual_covariates  # its old names
@@ -57,7 +57,7 @@ class HiddenEffect:
 
 @dataclass(frozen=True)
 class AliasedEffect:
-    """An effect that is aliased with the concealed one in this plan, and their cosine."""
+    """An effect aliased with the concealed one, not itself in the recording, and their cosine after the refit."""
 
     effect: Concealed
     cosine: float
@@ -74,9 +74,9 @@ class Truth:
     stratum
         Stratum of the case.
     ssf, noise_level, noise_model, plan
-        Names of SSFS, NOISE_LEVELS, NOISE_MODELS and PLANS.
+        Names in SSFS, NOISE_LEVELS, NOISE_MODELS and PLANS.
     noise_sd, black, white
-        Noise sd and levels of the sensor.
+        Noise sd and levels of the sensor, in reading units.
     hidden
         Concealed effects, in the order of the vocabulary.
     cosine
@@ -101,9 +101,9 @@ class Truth:
 
     @property
     def combination(self) -> tuple[str, ...]:
-        """Answer of a perfect diagnosis: sorted names; () if clean; ("unknown",) outside the vocabulary.
+        """Names that a perfect diagnosis gives, sorted; ("unknown",) if any effect is outside the vocabulary.
 
-        A noise model that the vocabulary has is named among the effects.
+        A noise model that the vocabulary has is among them, "ssf_order" is not; () if none is left.
         """
         if any(not hidden.in_vocabulary for hidden in self.hidden):
             return ("unknown",)
@@ -113,7 +113,7 @@ class Truth:
         return tuple(sorted(names))
 
     def to_json(self) -> str:
-        """Serialise as strict JSON, "format": "truth/1"."""
+        """Return the truth as a string of strict JSON, "format": "truth/1"."""
         content = {
             "format": "truth/1",
             **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},

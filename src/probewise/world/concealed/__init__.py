@@ -1,4 +1,4 @@
-"""Effects that a world may have and a plain sensor model leaves out: one small class each, with independent formulas.
+"""Effects that a world may have and a plain sensor model leaves out: one small class each, written independently of it.
 
 A concealed effect acts at one stage of the chain from pose to reading. To add one, write a frozen
 dataclass with `name`, `stage` and the method of that stage (`stages`); `World` applies it there.

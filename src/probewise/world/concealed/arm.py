@@ -15,7 +15,7 @@ from probewise.world.rows import Rows
 
 @dataclass(frozen=True)
 class Backlash:
-    """Backlash: the arm stops short by half the play of its gears, in either direction."""
+    """Backlash: the arm stops `width_mm` / 2, half the play of its gears, short of the commanded place."""
 
     name: ClassVar[str] = "backlash"
     stage: ClassVar[Stage] = "place"
@@ -27,7 +27,7 @@ class Backlash:
 
 @dataclass(frozen=True)
 class PositionScale:
-    """Scale error of the arm: lengths are too long by a share `x` along X and `y` along Y."""
+    """Scale error of the arm: true X is 1 + `x` times the commanded one, true Y 1 + `y` times."""
 
     name: ClassVar[str] = "position_scale"
     stage: ClassVar[Stage] = "place"
@@ -40,7 +40,7 @@ class PositionScale:
 
 @dataclass(frozen=True)
 class PeriodicPositionError:
-    """Runout of a gear or lead screw: an error in X that is a sine of X."""
+    """Runout of a gear or lead screw: adds `amp_mm` sin(2 pi X / `period_mm` + `phase`) to X."""
 
     name: ClassVar[str] = "periodic_position_error"
     stage: ClassVar[Stage] = "place"
@@ -56,7 +56,7 @@ class PeriodicPositionError:
 
 @dataclass(frozen=True)
 class ScanAngleError:
-    """An orientation error of the sensor in some scans, given by name."""
+    """An error of `deg` degrees in the sensor's orientation, in the scans named in `scans`."""
 
     name: ClassVar[str] = "scan_angle_error"
     stage: ClassVar[Stage] = "turn"
@@ -69,7 +69,7 @@ class ScanAngleError:
 
 @dataclass(frozen=True)
 class OrientationError:
-    """A constant orientation error of the sensor."""
+    """A constant error of `deg` degrees in the sensor's orientation."""
 
     name: ClassVar[str] = "orientation_error"
     stage: ClassVar[Stage] = "turn"

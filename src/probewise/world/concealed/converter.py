@@ -47,7 +47,7 @@ class Saturation:
 
 @dataclass(frozen=True)
 class Quantisation:
-    """Coarse rounding that the plan does not declare."""
+    """Rounding to multiples of `step` (reading units) that the plan does not declare."""
 
     name: ClassVar[str] = "quantisation"
     stage: ClassVar[Stage] = "quantisation"

@@ -1,4 +1,4 @@
-"""Effects on the footprint: displacement, height, blur, halo; and the shadow of an edge."""
+"""Effects on the footprint: displacement, height, blur, halo; and on the seen fraction, the shadow of an edge."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from probewise.world.spots import Blob, blurred, gaussian_spot
 
 @dataclass(frozen=True)
 class SensorTilt:
-    """A tilted sensor: the footprint is shifted by one vector of the lab frame, whatever the orientation."""
+    """A tilted sensor: it moves the footprint by `dx_mm`, `dy_mm` in the lab frame, whatever the orientation."""
 
     name: ClassVar[str] = "sensor_tilt"
     stage: ClassVar[Stage] = "tilt"
@@ -41,7 +41,7 @@ class HeightGradient:
 
 @dataclass(frozen=True)
 class HeightOffset:
-    """A height offset of the sensor in some scans, given by name."""
+    """A height offset of the sensor by `mm` in the scans named in `scans`."""
 
     name: ClassVar[str] = "height_offset"
     stage: ClassVar[Stage] = "height"
@@ -54,7 +54,7 @@ class HeightOffset:
 
 @dataclass(frozen=True)
 class EdgeBlur:
-    """Soft printed edges: a Gaussian blur, which is equivalent to a blurred footprint."""
+    """Soft printed edges: a Gaussian blur of sd `sd_mm`, here applied to the footprint, which is equivalent."""
 
     name: ClassVar[str] = "edge_blur"
     stage: ClassVar[Stage] = "footprint"
@@ -66,7 +66,7 @@ class EdgeBlur:
 
 @dataclass(frozen=True)
 class Halo:
-    """A halo: a share of the light comes through a wide Gaussian of sd `r_mm` about the footprint's centre."""
+    """A halo: a `share` of the light comes through a wide Gaussian of sd `r_mm` about the footprint's centre."""
 
     name: ClassVar[str] = "halo"
     stage: ClassVar[Stage] = "footprint"
@@ -83,7 +83,7 @@ class Halo:
 
 @dataclass(frozen=True)
 class ExtraGaussian:
-    """One more round Gaussian in the footprint, in the sensor frame; not a physical fault."""
+    """A round Gaussian at `u_mm`, `v_mm` in the sensor frame with a `share` of the light; not a physical fault."""
 
     name: ClassVar[str] = "ssf_order"
     stage: ClassVar[Stage] = "footprint"
@@ -100,7 +100,7 @@ class ExtraGaussian:
 
 @dataclass(frozen=True)
 class EdgeShadow:
-    """Shadow of the paper's edge: light is lost within about `w` mm of an edge."""
+    """Shadow along edges of the pattern: the seen fraction falls by `amp` at an edge, less within about `w` mm."""
 
     name: ClassVar[str] = "edge_shadow"
     stage: ClassVar[Stage] = "seen"

@@ -15,7 +15,7 @@ from probewise.world.rows import Rows
 
 @dataclass(frozen=True)
 class Nonlinearity:
-    """A response that is a power of the light."""
+    """A response that is the `gamma`-th power of the light."""
 
     name: ClassVar[str] = "nonlinearity"
     stage: ClassVar[Stage] = "response"
@@ -27,7 +27,7 @@ class Nonlinearity:
 
 @dataclass(frozen=True)
 class GainDrift:
-    """Warm-up of the LED: the signal starts wrong by a fraction `frac` and settles with time constant `tau_s`."""
+    """Warm-up of the LED: the signal is wrong by a fraction `frac` at time 0 and settles with time constant `tau_s`."""
 
     name: ClassVar[str] = "gain_drift"
     stage: ClassVar[Stage] = "gain"

@@ -16,7 +16,7 @@ from probewise.world.rows import Rows
 
 @dataclass(frozen=True)
 class CorrelatedNoise:
-    """AR(1) noise within each scan, with unchanged sd."""
+    """AR(1) noise within each scan: correlation `rho` between successive readings, with unchanged sd."""
 
     name: ClassVar[str] = "correlated_noise"
     stage: ClassVar[Stage] = "noise"
@@ -32,7 +32,7 @@ class CorrelatedNoise:
 
 @dataclass(frozen=True)
 class SignalDependentNoise:
-    """Noise variance that grows by a fraction `ratio` from black to white."""
+    """Noise variance that grows linearly from its value on black to 1 + `ratio` times that on white."""
 
     name: ClassVar[str] = "signal_dependent_noise"
     stage: ClassVar[Stage] = "noise"
@@ -44,7 +44,7 @@ class SignalDependentNoise:
 
 @dataclass(frozen=True)
 class RisingNoiseSd:
-    """Noise sd that rises to `factor` times its value within `over_s`, then stays constant."""
+    """Noise sd that rises linearly to `factor` times its first value from time 0 to `over_s`, then stays constant."""
 
     name: ClassVar[str] = "drifting_noise"
     stage: ClassVar[Stage] = "noise"
@@ -70,7 +70,7 @@ class HeavyTails:
 
 @dataclass(frozen=True)
 class Outliers:
-    """Outliers: a share of the readings has additional noise of `size` times the sd."""
+    """Outliers: a random `share` of the readings has additional Gaussian noise, of sd `size` times the noise sd."""
 
     name: ClassVar[str] = "outliers"
     stage: ClassVar[Stage] = "noise"
@@ -84,7 +84,7 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Dropouts:
-    """Dropouts: a share of the readings is replaced by one value."""
+    """Dropouts: a random `share` of the readings is replaced by `value`."""
 
     name: ClassVar[str] = "dropouts"
     stage: ClassVar[Stage] = "loss"

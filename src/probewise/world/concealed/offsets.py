@@ -15,7 +15,7 @@ from probewise.world.rows import Rows
 
 @dataclass(frozen=True)
 class AmbientGradient:
-    """Room light from one side: an offset that is a plane over the lab frame."""
+    """Room light from one side: adds `per_mm_x` X + `per_mm_y` Y (lab frame, mm) to the reading."""
 
     name: ClassVar[str] = "ambient_gradient"
     stage: ClassVar[Stage] = "offset"
@@ -28,7 +28,7 @@ class AmbientGradient:
 
 @dataclass(frozen=True)
 class AmbientStep:
-    """A lamp is switched on: a step in time."""
+    """A lamp is switched on: adds `amp` to the readings after `at_s`."""
 
     name: ClassVar[str] = "ambient_step"
     stage: ClassVar[Stage] = "offset"
@@ -41,7 +41,7 @@ class AmbientStep:
 
 @dataclass(frozen=True)
 class OffsetDrift:
-    """Linear drift of the dark level."""
+    """Linear drift of the dark level, by `per_hour` reading units per hour."""
 
     name: ClassVar[str] = "offset_drift"
     stage: ClassVar[Stage] = "offset"
@@ -53,7 +53,7 @@ class OffsetDrift:
 
 @dataclass(frozen=True)
 class Flicker:
-    """A sinusoidal offset: mains flicker, aliased by the sampling, or a slow lamp."""
+    """A sinusoidal offset of amplitude `amp` at `alias_hz`: mains flicker, aliased by the sampling, or a slow lamp."""
 
     name: ClassVar[str] = "flicker"
     stage: ClassVar[Stage] = "offset"
@@ -67,7 +67,7 @@ class Flicker:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """An offset whose sign depends on the direction of motion."""
+    """An offset of +`amp` or -`amp`, by the direction of motion."""
 
     name: ClassVar[str] = "hysteresis"
     stage: ClassVar[Stage] = "offset"
@@ -82,7 +82,7 @@ class Hysteresis:
 
 @dataclass(frozen=True)
 class Glint:
-    """A specular reflection of a lamp: an offset that is a Gaussian of sd `r` about a place."""
+    """A reflection of a lamp: adds a Gaussian of height `amp` and sd `r` about `x`, `y` (lab frame) to the reading."""
 
     name: ClassVar[str] = "glint"
     stage: ClassVar[Stage] = "offset"

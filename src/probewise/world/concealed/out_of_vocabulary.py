@@ -1,4 +1,4 @@
-"""Effects outside the vocabulary: a diagnosis can only detect and locate them."""
+"""Effects outside the vocabulary, which a diagnosis can detect and locate but not name."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class CubicPositionError:
 
 @dataclass(frozen=True)
 class PlaceStep:
-    """A missing gear tooth: X is too large by `amp_mm` beyond `at_mm`."""
+    """A missing gear tooth: true X is larger than commanded by `amp_mm` where X exceeds `at_mm`."""
 
     name: ClassVar[str] = "place_step"
     stage: ClassVar[Stage] = "place"
@@ -53,7 +53,7 @@ class PlaceStep:
 
 @dataclass(frozen=True)
 class StickSlip:
-    """Stick-slip of the slide: an error in X that is a sawtooth of X."""
+    """Stick-slip of the slide: an error in X, a sawtooth of X between -`amp_mm` and `amp_mm`, period `period_mm`."""
 
     name: ClassVar[str] = "stick_slip"
     stage: ClassVar[Stage] = "place"
@@ -68,7 +68,7 @@ class StickSlip:
 
 @dataclass(frozen=True)
 class SlippedPaper:
-    """The paper slips across its edge at one time, and stays there."""
+    """The paper slips by `offset_mm` across its edge at time `at_s`, and stays there."""
 
     name: ClassVar[str] = "slipped_paper"
     stage: ClassVar[Stage] = "pattern"
@@ -81,7 +81,7 @@ class SlippedPaper:
 
 @dataclass(frozen=True)
 class Ghost:
-    """A faint second image from a glass plate, displaced in the lab frame."""
+    """A faint second image from a glass plate: a `share` of the light, its footprint moved by `dx_mm`, `dy_mm`."""
 
     name: ClassVar[str] = "ghost"
     stage: ClassVar[Stage] = "footprint"
@@ -100,7 +100,7 @@ class Ghost:
 
 @dataclass(frozen=True)
 class ThermalGain:
-    """Gain that wanders with room temperature: slow waves with a 1/f power spectrum.
+    """Gain that wanders with room temperature by a relative sd `frac`: slow waves with a 1/f power spectrum.
 
     Frequencies are the first multiples of 1/`longest_s`, one for each of `phases` (rad).
     """
@@ -122,7 +122,7 @@ class ThermalGain:
 
 @dataclass(frozen=True)
 class OrientationDependentGain:
-    """Gain that varies with twice the orientation: a pull of the cable gets into the signal."""
+    """Gain that varies by a fraction `frac` with twice the orientation, as when a pulled cable disturbs the signal."""
 
     name: ClassVar[str] = "cross_talk"
     stage: ClassVar[Stage] = "gain"
@@ -136,7 +136,7 @@ class OrientationDependentGain:
 
 @dataclass(frozen=True)
 class DeadZone:
-    """A dead zone: light below a share of white gives no signal."""
+    """A dead zone: light below a `share` of white gives no signal."""
 
     name: ClassVar[str] = "floor"
     stage: ClassVar[Stage] = "response"
@@ -148,7 +148,7 @@ class DeadZone:
 
 @dataclass(frozen=True)
 class PeakMemory:
-    """Persistence of the photodiode: it adds a share of the brightest light since the start of the scan."""
+    """Persistence of the photodiode: adds a `share` of the brightest light since the start of the scan."""
 
     name: ClassVar[str] = "peak_memory"
     stage: ClassVar[Stage] = "response"
@@ -163,7 +163,7 @@ class PeakMemory:
 
 @dataclass(frozen=True)
 class AfterGlow:
-    """A pulse that decays with `tau_s` each time the reading rises through `level`."""
+    """A pulse of height `amp` that decays with `tau_s`, added each time the reading rises through `level`."""
 
     name: ClassVar[str] = "after_glow"
     stage: ClassVar[Stage] = "offset"
@@ -172,7 +172,7 @@ class AfterGlow:
     level: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp exp(-t / tau) for every such rise, t the time since it."""
+        """Add amp exp(-t / tau) for every such rise, where t >= 0 is the time since the rise."""
         bright = values > self.level
         rises = rows.time_s[np.flatnonzero(bright & ~np.concatenate([[True], bright[:-1]]))]
         since = rows.time_s[:, None] - rises
@@ -183,7 +183,7 @@ class AfterGlow:
 
 @dataclass(frozen=True)
 class Chirp:
-    """An oscillating offset of rising frequency, as of a fan running up: `first_hz` + `rate_hz_per_s` t."""
+    """An oscillating offset, as of a fan running up: amplitude `amp`, frequency `first_hz` + `rate_hz_per_s` t."""
 
     name: ClassVar[str] = "chirp"
     stage: ClassVar[Stage] = "offset"

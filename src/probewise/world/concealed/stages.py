@@ -39,7 +39,7 @@ AFTER_VIEW = STAGES[STAGES.index("response") :]
 
 @dataclass(frozen=True, eq=False)
 class FootprintPart:
-    """One component of the footprint: a share of the light through a spot; `shift_mm` displaces it in the lab frame."""
+    """A component of the footprint: a `share` of the light comes through `spot`, moved by `shift_mm` (lab frame)."""
 
     share: float
     spot: Spot
@@ -61,7 +61,7 @@ class ChangesQuantity(Protocol):
     stage: ClassVar[Stage]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Return the quantity with the effect on it."""
+        """Return `values` with the effect on them; `rows` hold true poses, but commanded ones at "place" and "turn"."""
         ...
 
 
@@ -73,7 +73,7 @@ class Retouches(Protocol):
     stage: ClassVar[Stage]
 
     def retouch(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Return the changed albedo at places in the lab frame; all arrays of one shape."""
+        """Return the changed albedo at points `x_mm`, `y_mm` of the lab frame; all arrays of one shape."""
         ...
 
 
@@ -85,7 +85,7 @@ class ChangesFootprint(Protocol):
     stage: ClassVar[Stage]
 
     def change_footprint(self, parts: Sequence[FootprintPart]) -> tuple[FootprintPart, ...]:
-        """Return the changed components of the footprint; their shares sum to one."""
+        """Return the components of the changed footprint; their shares sum to one."""
         ...
 
 
@@ -101,7 +101,7 @@ class Disturbs(Protocol):
     stage: ClassVar[Stage]
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Return the draws or readings with the effect on them; `seen` is the seen white fraction, (n_points,)."""
+        """Return `values` with the effect on them; `seen` is the seen white fraction, (n_points,)."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Surfaces that differ from their description."""
+"""Effects by which a surface differs from its description."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probewise.world.rows import Rows
 
 @dataclass(frozen=True)
 class EdgeMisplacement:
-    """A displacement of every pattern across its edge (along X if it has no single edge)."""
+    """A displacement of every pattern by `offset_mm` across its edges (along X if they have no common direction)."""
 
     name: ClassVar[str] = "edge_misplacement"
     stage: ClassVar[Stage] = "pattern"
@@ -26,7 +26,7 @@ class EdgeMisplacement:
 
 @dataclass(frozen=True)
 class ScanMisplacement:
-    """A displacement of the pattern across its edge (along X if it has no single edge), in the one scan `scan`."""
+    """As `EdgeMisplacement`, by `offset_mm` in the one scan named `scan`."""
 
     name: ClassVar[str] = "scan_misplacement"
     stage: ClassVar[Stage] = "pattern"
@@ -39,7 +39,7 @@ class ScanMisplacement:
 
 @dataclass(frozen=True)
 class AlbedoGradient:
-    """A print that is whiter on one side: the albedo times a plane over the lab frame."""
+    """A print that is whiter on one side: albedo times 1 + `per_mm_x` X + `per_mm_y` Y (lab frame, mm)."""
 
     name: ClassVar[str] = "albedo_gradient"
     stage: ClassVar[Stage] = "albedo"
@@ -52,7 +52,7 @@ class AlbedoGradient:
 
 @dataclass(frozen=True)
 class AlbedoPatch:
-    """A stain at one place of the lab frame, on every pattern: albedo plus a Gaussian of height `albedo`, sd `r`."""
+    """A stain on every pattern, at `x`, `y` of the lab frame: adds a Gaussian of height `albedo`, sd `r` (mm)."""
 
     name: ClassVar[str] = "albedo_patch"
     stage: ClassVar[Stage] = "albedo"

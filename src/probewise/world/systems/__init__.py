@@ -1,7 +1,7 @@
 """Simulated systems with concealed effects, for challenges; the code is independent of the library's systems.
 
-It produces what a user would provide (a table and a short file) with a separate truth; integration of laws, forms and
-fits are implemented a second time.
+It produces what a user would provide (a table and a short simulator file) and, separately, the truth; it implements
+the integration of laws, the effects and the fits a second time.
 """
 
 from probewise.world.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, draw_system_case

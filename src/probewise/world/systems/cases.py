@@ -47,9 +47,9 @@ class DrawnSystem:
     Parameters
     ----------
     kind, table
-        The system, and the table of all its rows, including held-out ones.
+        The system, and the table of all its rows, including those of the two held-out runs.
     shared, by_run
-        True parameters; those per run have shape (n_runs,).
+        True parameters by name; those per run as arrays over all runs of `table`, held-out runs last.
     """
 
     kind: SystemKind
@@ -59,33 +59,33 @@ class DrawnSystem:
 
     @cached_property
     def diagnosed_row_numbers(self) -> IntArray:
-        """Numbers of the rows that are not held out."""
+        """Indices in `table` of the rows that are not held out."""
         return np.flatnonzero(self.table.run < self.table.n_runs - 2)
 
     @cached_property
     def diagnosed_table(self) -> SystemTable:
-        """The table of the rows given to the diagnosis."""
+        """The table of the rows that are not held out."""
         return self.table.select_rows(self.diagnosed_row_numbers)
 
     @cached_property
     def nominal_model(self) -> ModelWithForms:
-        """The nominal model of those rows."""
+        """The model without effects, over the rows that are not held out."""
         return ModelWithForms(self.kind, self.diagnosed_table)
 
     @cached_property
     def true_coordinates(self) -> FloatArray:
-        """Coordinates of the true parameters."""
+        """Coordinates of the true parameters in `nominal_model`, (n_coordinates,)."""
         return self.nominal_model.coordinates_of(self.shared, self.by_run)
 
     @cached_property
     def fit_without_effects(self) -> LeastSquaresFit:
-        """The noise-free readings without any effect, as a fit of the nominal model, with its slopes."""
+        """The nominal model at the true parameters, as a fit with chi-square 0: its readings and their derivatives."""
         readings, slopes = self.nominal_model.predict_with_slopes(self.true_coordinates)
         return LeastSquaresFit(self.true_coordinates, readings, slopes, 0.0)
 
     @cached_property
     def true_system(self) -> TrueSystem:
-        """The system at its true parameters, about which effects are built."""
+        """The system at its true parameters with readings and states, over the rows that are not held out."""
         parameters = self.nominal_model.parameters_at(self.true_coordinates[None, :])
         trace = simulate_noise_free(self.kind, self.diagnosed_table, parameters)
         return TrueSystem(
@@ -97,7 +97,7 @@ class DrawnSystem:
         )
 
     def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
-        """Return noise-free readings with these effects at all rows, (n_points,)."""
+        """Return noise-free readings with these effects at all rows of `table`, (n_points,); may not be finite."""
         whole = ModelWithForms(self.kind, self.table)
         with np.errstate(all="ignore"):
             at = whole.coordinates_of(self.shared, self.by_run)
@@ -105,9 +105,9 @@ class DrawnSystem:
         return np.asarray(trace.readings[0])
 
     def simulate_diagnosed_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
-        """Return noise-free readings with these effects at the rows given to the diagnosis, (n_points,).
+        """Return noise-free readings with these effects at the rows that are not held out, (n_points,).
 
-        Raises NotConvergedError if they are not finite.
+        Raises NotConvergedError if a reading is not finite.
         """
         with np.errstate(all="ignore"):
             readings: FloatArray = simulate_noise_free(
@@ -136,7 +136,7 @@ class DrawnSystem:
 
 @dataclass(frozen=True, eq=False)
 class SystemEffect:
-    """A concealed effect: form, parameter values, size, rivals by name with their loss in nats, visible covariates."""
+    """A concealed effect: form, parameters, size lambda, covariates, and rivals by name with their loss in nats."""
 
     form: Form
     values: Mapping[str, float]
@@ -146,12 +146,12 @@ class SystemEffect:
 
     @property
     def name(self) -> str:
-        """Its name, in the vocabulary or outside."""
+        """The effect's name, with its target."""
         return vocabulary_name(self.form)
 
     @property
     def in_vocabulary(self) -> bool:
-        """Whether a diagnosis can name it."""
+        """Whether the effect is one that a diagnosis can name."""
         return not self.form.shape
 
     @property
@@ -161,14 +161,14 @@ class SystemEffect:
 
     @property
     def form_with_parameters(self) -> FormWithParameters:
-        """The form with its parameters."""
+        """The pair of the form and its parameters by name, (1, 1) each."""
         return self.form, parameter_arrays([self.values])
 
     placed = form_with_parameters  # its old name
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Parameters as in the vocabulary; `values` of all runs, with the held-out ones last."""
+        """Parameters and constants by name; `values` lists those of all runs, held-out runs last."""
         values = [v for name, v in self.values.items() if name.startswith("values[")]
         own = {name: v for name, v in self.values.items() if not name.startswith("values[")}
         return {**own, **({"values": values} if values else {}), **self.form.also_in_truth}
@@ -189,11 +189,11 @@ class SystemCase:
     noise
         Its noise.
     noise_text
-        The statement on noise in the owner's file; may be empty.
+        The line on noise in the simulator file; may be empty.
     labels
-        Names of the runs.
+        Names of the runs, as in the table.
     noise_free, readings
-        At all rows, (n_points,).
+        Readings with the effects, without and with noise, at all rows, (n_points,).
     cosine
         Cosine of a pair after the refit; None: no pair.
     """
@@ -212,7 +212,7 @@ class SystemCase:
 
 
 def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
-    """Draw rows and true parameters of a kind."""
+    """Draw a system of this kind: the table of all runs and the true parameters."""
     rows = design_runs(kind, rng=rng)
     each = [kind.draw_run(rng) for _ in range(rows.n_runs)]
     return DrawnSystem(
@@ -223,10 +223,7 @@ def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
 def draw_system_case(seed: int, number: int) -> SystemCase:
     """Draw case `number` of a challenge on systems; it depends on the seed and the number alone.
 
-    Raises
-    ------
-    NotConvergedError
-        If no drawn effect can have the requested size.
+    Raises NotConvergedError if in none of 16 systems the effects can have the requested size (a pair |cosine| < 0.5).
     """
     stratum, n_earlier = system_stratum_of(number)
     drawing, noise = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
@@ -258,7 +255,7 @@ def _recorded_case(
     noise_free: FloatArray,
     rng: np.random.Generator,
 ) -> SystemCase:
-    """Add noise, round as printed, and choose what the owner's file states of it."""
+    """Build the case: add noise, round the readings, and choose what the simulator file states on noise."""
     kind = drawn.kind
     name = OTHER_NOISE[n_earlier % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
@@ -329,14 +326,14 @@ def _draw_effects(
 
 
 def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
-    """Draw one of these forms; raise NotConvergedError, with their common name, if there is none."""
+    """Draw one of these forms; if there is none, raise NotConvergedError with the effect's `name` in the message."""
     if not forms:
         raise NotConvergedError(f"this system has no target for {name}")
     return forms[int(rng.integers(len(forms)))]
 
 
 def _draw_effect_of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.random.Generator) -> SystemEffect:
-    """Draw an effect of this form with the requested size; its rivals are not filled in yet."""
+    """Return an effect of this form with lambda `wanted`, other parameters drawn, without rivals and covariates."""
     more = form.draw(rng)
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
@@ -365,7 +362,7 @@ def _draw_effect_of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.
 
 
 def _form_with_true_step_time_in_bank(form: Form, values: Mapping[str, float]) -> Form:
-    """Add the effect's own time of a step to the bank of a form with a step; return other forms unchanged."""
+    """Add the true time (or row) of the concealed step to a step form's template bank; return other forms unchanged."""
     at = next((name for name in ("at_s", "at_row") if name in values and name in form.bank[0][0]), None)
     return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
 
@@ -384,7 +381,7 @@ def _cosine_of_effects(drawn: DrawnSystem, one: SystemEffect, other: SystemEffec
 def _effect_with_rivals(
     effect: SystemEffect, forms: Sequence[Form], drawn: DrawnSystem, others: Sequence[SystemEffect]
 ) -> SystemEffect:
-    """Return an effect with its rivals and visible covariates, found in the presence of the other effects."""
+    """Return the effect with its rivals and covariates, found in a model that has the other concealed effects."""
     target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
     beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
     model = ModelWithForms(drawn.kind, drawn.diagnosed_table, beside)

@@ -1,4 +1,4 @@
-"""From parameters to noise-free readings, with effects: input and clock, parameters, law, reading."""
+"""From parameters to noise-free readings, with effects on inputs and clock, parameters, rates of a law, readings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from probewise.world.systems.table import SystemTable
 
 @dataclass(frozen=True, eq=False)
 class NoiseFreeResult:
-    """Noise-free readings and the states behind them, (n_samples, n_points)."""
+    """Noise-free readings, (n_samples, n_points), and states by name of the same shape ({} for a static system)."""
 
     readings: FloatArray
     states: Mapping[str, FloatArray]
@@ -28,14 +28,14 @@ def simulate_noise_free(
     parameters: Mapping[str, FloatArray],
     effects: Sequence[FormWithParameters] = (),
 ) -> NoiseFreeResult:
-    """Simulate a system without noise: its readings and states.
+    """Simulate a system without noise, at one set of parameters per sample.
 
     Parameters
     ----------
     kind
         The system.
     rows
-        The rows to simulate.
+        The table of the rows to simulate.
     parameters
         By name, (n_samples or 1, 1 or n_points) each.
     effects
@@ -67,7 +67,7 @@ def simulate_noise_free(
 
 
 def apply_reading_effects(readings: FloatArray, rows: SystemTable, effects: Sequence[FormWithParameters]) -> FloatArray:
-    """Apply the effects on the readings, in order."""
+    """Return readings, (n_samples, n_points), with the effects of side "reading" applied in ascending `Form.order`."""
     for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
         readings = form.act(readings, rows, numbers)
     return readings

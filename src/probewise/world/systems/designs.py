@@ -12,12 +12,12 @@ _PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
 
 def irregular_times(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
-    """Draw times from 0 whose gaps lie between 0.6 and 1.4 of `gap`, (n,)."""
+    """Draw n times from 0, whose gaps lie between 0.6 and 1.4 times `gap`, (n,)."""
     return np.concatenate([[0.0], np.cumsum(gap * rng.uniform(0.6, 1.4, n - 1))])
 
 
 def random_steps(rng: np.random.Generator, n: int, levels: FloatArray, length: int) -> FloatArray:
-    """Return random levels, each held for about `length` rows, without repetition, (n,)."""
+    """Return random levels, none twice in succession, each held for 0.5 to 2 times `length` rows, (n,)."""
     out: list[float] = []
     while len(out) < n:
         choices = [level for level in levels if not out or level != out[-1]]
@@ -26,21 +26,21 @@ def random_steps(rng: np.random.Generator, n: int, levels: FloatArray, length: i
 
 
 def random_waves(rng: np.random.Generator, t: FloatArray, size: float, fastest: float) -> FloatArray:
-    """Return the sum of four sinusoids of random frequency up to `fastest`, rms `size`, (n,)."""
+    """Return a sum of four sinusoids at times `t`, frequencies 0.1 to 1 times `fastest`, rms `size`; shape of `t`."""
     hz = fastest * rng.uniform(0.1, 1.0, 4)
     waves = np.sin(2 * np.pi * hz[:, None] * t + rng.uniform(0, 2 * np.pi, 4)[:, None])
     return np.asarray(size * waves.sum(axis=0) / np.sqrt(2.0))
 
 
 def sweep_there_and_back(rng: np.random.Generator, n: int, low: float, high: float) -> FloatArray:
-    """Return a sweep from low to high in uneven steps and back, (n,)."""
+    """Return a rising and then a falling sweep between `low` and `high` in random steps, (n,)."""
     up = n // 2
     first, second = np.sort(rng.uniform(0, 1, up)), np.sort(rng.uniform(0, 1, n - up))[::-1]
     return np.asarray(low + (high - low) * np.concatenate([first, second]))
 
 
 def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
-    """Design all runs of a case; the last two are held out, the last one in a new regime."""
+    """Return the table of all runs of a case; the last two are held out, the last one is in a new range of inputs."""
     n_runs = kind.n_runs + 2
     each = int(np.clip(rng.integers(150, 420) // kind.n_runs, 24, 120))
     columns: dict[str, list[FloatArray]] = {}

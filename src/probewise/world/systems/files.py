@@ -16,7 +16,7 @@ from probewise.world.systems.cases import SystemCase, SystemEffect
 
 
 def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tuple[Path, Path, Path, Path]:
-    """Write simulator.py, table.csv, table_test.csv and truth.json into a directory, and return their paths."""
+    """Write simulator.py, table.csv, table_test.csv and truth.json into a directory; return the paths in this order."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     seen = case.drawn.diagnosed_row_numbers
@@ -34,12 +34,12 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
 
 
 def simulator_file_text(case: SystemCase) -> str:
-    """Return the text of simulator.py: the nominal simulator as its owner would hand it in."""
+    """Return the text of simulator.py: the nominal model as a user would provide it, with the line on noise."""
     return case.drawn.kind.text.replace("{noise}\n", f"{case.noise_text}\n" if case.noise_text else "")
 
 
 def table_text(case: SystemCase, rows: IntArray) -> str:
-    """Return these rows of the table as CSV."""
+    """Return the rows with these indices, readings last, as CSV text with a header."""
     kind, laid = case.drawn.kind, case.drawn.table
     decimals = {**kind.decimals, **{c.name: c.decimals for c in kind.logged}, kind.reading: kind.reading_decimals}
     columns: dict[str, list[str]] = {}
@@ -53,7 +53,7 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
 
 
 def truth_json(case: SystemCase) -> dict[str, Any]:
-    """Return the truth of a case as a JSON object, the content of truth.json."""
+    """Return the truth of a case as a dict for JSON, the content of truth.json."""
     seen = case.drawn.diagnosed_row_numbers
     later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
     pair = len(case.effects) == 2

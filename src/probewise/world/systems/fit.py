@@ -1,4 +1,4 @@
-"""Least squares with the world's own simulation: residuals of an effect after a full refit of the nominal model."""
+"""Least squares with the simulator's own model: residuals of an effect after a full refit of the nominal model."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _FAR = 1e9  # residual in sds where a law diverges
 
 
 def names_of_fitted_parameters(form: Form) -> tuple[str, ...]:
-    """Return the names of a form's fitted parameters: not the time of a step, nor values of runs without rows."""
+    """Return the names of a form's fitted parameters: not a step's time, nor values of runs without rows."""
     return tuple(name for name, step in form.steps.items() if step > 0)
 
 
 @dataclass(frozen=True, eq=False)
 class AddedForm:
-    """A form in a model, with starting values of its parameters and the names of the fitted ones."""
+    """A form in a model: start values of its parameters by name, and the names of the fitted ones."""
 
     form: Form
     start: Mapping[str, float]
@@ -37,7 +37,7 @@ class AddedForm:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquaresFit:
-    """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), chi-square."""
+    """A fit: coordinates, readings (n_points,), their derivatives (n_points, n_coordinates), sum of squares / sd^2."""
 
     coordinates: FloatArray
     readings: FloatArray
@@ -49,8 +49,8 @@ class LeastSquaresFit:
 class ModelWithForms:
     """A nominal model with additional forms, as a function of coordinates.
 
-    Coordinates are the shared parameters, each `per_run` parameter in every run, and the fitted parameters of the forms
-    in units of their steps.
+    Coordinates, in this order: shared parameters (`Prior.coordinate`), each `per_run` parameter in every run of the
+    table, and the fitted parameters of the forms in units of a tenth of `Form.steps`.
     """
 
     kind: SystemKind
@@ -67,14 +67,14 @@ class ModelWithForms:
         return len(self.kind.shared_parameter_names) + len(self.kind.per_run) * len(self._run_numbers)
 
     def coordinates_of(self, shared: Mapping[str, float], by_run: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the coordinates of parameters (`by_run` for all runs of the case) and of the forms' start values."""
+        """Return the coordinates, (n_coordinates,), of parameters (`by_run`: all runs of the case) and start values."""
         own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared_parameter_names]
         each = [self.kind.priors[name].coordinate(by_run[name][self._run_numbers]) for name in self.kind.per_run]
         numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.added for name in b.free]
         return np.concatenate([np.ravel(own), *each, numbers])
 
     def parameters_at(self, x: FloatArray) -> dict[str, FloatArray]:
-        """Return parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points)."""
+        """Return parameters by name at coordinates (n_samples, n_coordinates), (n_samples, 1 or, per run, n_points)."""
         out, n = {}, len(self.kind.shared_parameter_names)
         for k, name in enumerate(self.kind.shared_parameter_names):
             out[name] = self.kind.priors[name].value(x[:, k : k + 1])
@@ -85,7 +85,7 @@ class ModelWithForms:
         return out
 
     def effects_at(self, x: FloatArray) -> list[FormWithParameters]:
-        """Return forms with their parameters at coordinates."""
+        """Return each form with its parameters by name, (n_samples, 1), at coordinates (n_samples, n_coordinates)."""
         out: list[FormWithParameters] = []
         n = self.n_nominal_coordinates
         for b in self.added:
@@ -97,13 +97,13 @@ class ModelWithForms:
         return out
 
     def predict(self, x: FloatArray) -> FloatArray:
-        """Return noise-free readings at coordinates (n_samples, n_coordinates): (n_samples, n_points)."""
+        """Return noise-free readings, (n_samples, n_points), at coordinates (n_samples, n_coordinates)."""
         return simulate_noise_free(self.kind, self.table, self.parameters_at(x), self.effects_at(x)).readings
 
     def predict_with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings (n_points,) and their slopes (n_points, n_coordinates).
+        """Return readings (n_points,) at coordinates (n_coordinates,), and derivatives (n_points, n_coordinates).
 
-        Parameters per run are varied in all runs at once.
+        Derivatives are central differences; a `per_run` parameter is varied in all runs in one simulation.
         """
         n_shared, n_runs = len(self.kind.shared_parameter_names), len(self._run_numbers)
         moves = [np.eye(len(x))[k] for k in range(n_shared)]
@@ -127,7 +127,7 @@ class ModelWithForms:
         return found[0], out
 
     def _predict_with_slopes_or_huge(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings with their slopes; if a law diverges, values so large that the fit steps back."""
+        """Return readings and derivatives; if the law diverges, huge readings and zeros, so that the fit steps back."""
         try:
             readings, slopes = self.predict_with_slopes(x)
         except NotConvergedError:
@@ -137,12 +137,9 @@ class ModelWithForms:
         return readings, np.nan_to_num(slopes)
 
     def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> LeastSquaresFit:
-        """Fit readings (n_points,) by least squares from a start.
+        """Fit readings (n_points,) by least squares from start coordinates, with at most `max_calls` evaluations.
 
-        Raises
-        ------
-        NotConvergedError
-            If the fit diverges.
+        Raises NotConvergedError if the fit leaves the finite numbers.
         """
         last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
         sd = self.kind.sd
@@ -179,7 +176,7 @@ class ModelWithForms:
 
 
 def project_out(change: FloatArray, slopes: FloatArray) -> FloatArray:
-    """Return changes (n_points, ...) without their projection on the slopes, (n_points, n)."""
+    """Return the part of `change`, (n_points, ...), that is orthogonal to the columns of `slopes`, (n_points, n)."""
     scale = np.sqrt(np.sum(slopes**2, axis=0))
     basis, values, _ = np.linalg.svd(slopes / np.where(scale > 0, scale, 1.0), full_matrices=False)
     basis = basis[:, values > 1e-8 * values.max(initial=1e-300)]

@@ -1,4 +1,4 @@
-"""Static systems, whose reading depends only on the row."""
+"""Kinds of static systems, whose reading depends only on the row's columns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A kind of system: its owner's file, an independent implementation of its law, and its experimental design."""
+"""A kind of system: its simulator file, an independent implementation of its law, and its experimental design."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Law:
     Parameters
     ----------
     start
-        Initial value of each state: a parameter or a number.
+        Initial value of each state: the name of a parameter, or a number.
     rates
         Function of states, parameters and columns; returns the rate of each state.
     read
@@ -45,7 +45,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of a parameter in the owner's file: "uniform" or "log" (low, high), or "normal" (mean, sd)."""
+    """Prior of a parameter in the simulator file: `shape` "uniform" or "log" (low, high), or "normal" (mean, sd)."""
 
     shape: str
     a: float
@@ -53,11 +53,11 @@ class Prior:
 
     @property
     def coordinate_unit(self) -> float:
-        """Unit of the coordinate: the range or the sd, or 1 where the coordinate is a logarithm."""
+        """Unit of the coordinate: the range of "uniform", the sd of "normal", 1 of "log" (a logarithm)."""
         return {"uniform": self.b - self.a, "normal": self.b}.get(self.shape, 1.0)
 
     def coordinate(self, value: FloatArray) -> FloatArray:
-        """Return the coordinate of a value: its logarithm, or the value in units of `coordinate_unit`."""
+        """Return the coordinate of a value: its logarithm for "log", else the value in units of `coordinate_unit`."""
         return np.log(value) if self.shape == "log" else np.asarray(value / self.coordinate_unit)
 
     def value(self, coordinate: FloatArray) -> FloatArray:
@@ -69,7 +69,7 @@ class Prior:
         )
 
     def stratified_draws(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw n values, one from each of n parts of equal mass, in random order."""
+        """Draw n values, one from each of n intervals of equal probability, in random order."""
         u = (rng.permutation(n) + rng.random(n)) / n
         if self.shape == "normal":
             return np.asarray(self.a + self.b * ndtri(u))
@@ -80,9 +80,9 @@ class Prior:
 
 @dataclass(frozen=True)
 class IrrelevantColumn:
-    """An irrelevant logged column: a random walk about a middle with jitter, printed to some decimals.
+    """A logged column without influence: a random walk (scale `wander`) about `middle`, plus `jitter` of sd per row.
 
-    `beyond` is the shift of its middle in a new regime.
+    `beyond` shifts `middle` in the last held-out run.
     """
 
     name: str
@@ -104,26 +104,26 @@ class SystemKind:
     reading, unit
         The predicted column, and its unit.
     text
-        The owner's file; `{noise}` is replaced by its statement on noise.
+        The simulator file as a user would provide it; `{noise}` stands for its line on noise.
     priors
-        Priors as in the file.
+        Priors as in the file, by parameter.
     draw
         Draws the true shared parameters.
     draw_run
         Draws the true parameters of a run.
     design
         Designs a run: draws its times from 0 and its columns, from (rng, n_rows, regime). The regime is 1, or larger
-        for a run beyond the others.
+        for a run with inputs beyond the others' range.
     decimals
         Decimals of the designed columns and of time.
     drives
         Columns that the law uses.
     sd
-        Sd of a reading's noise.
+        Sd of a reading's white noise.
     formula, law
-        The nominal model, one of the two.
+        The nominal model, one of the two; the other is None.
     time, time_unit, run
-        Names of the columns; None if absent.
+        Name of the time column, its unit, name of the run column; names are None if absent.
     restarts_time
         Whether time restarts in each run.
     logged
@@ -133,7 +133,7 @@ class SystemKind:
     reading_decimals
         Decimals of a reading.
     defines_states
-        Whether the owner's file defines states and rates, or integrates by itself.
+        Whether the simulator file defines states and rates; False: it integrates by itself.
     """
 
     name: str
@@ -161,5 +161,5 @@ class SystemKind:
 
     @property
     def shared_parameter_names(self) -> tuple[str, ...]:
-        """Parameters that all runs share."""
+        """Names of the parameters that all runs share."""
         return tuple(name for name in self.priors if name not in self.per_run)

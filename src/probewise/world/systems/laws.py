@@ -1,4 +1,4 @@
-"""Dynamical systems, with a law in continuous time."""
+"""Kinds of dynamical systems, with a law in continuous time."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Integrate a law between the rows of every run by SciPy's eighth-order method.
 
-All samples and runs are integrated together. Dry friction and bounds change the law at events; a gap that contains one
-is integrated again, for one sample and run at a time, with event location.
+All samples and runs are integrated together. Dry friction and bounds change the law at events; a gap between rows
+that contains an event is integrated again, for one sample and run at a time, with event location.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def solve_law(
     columns: Mapping[str, FloatArray],
     effects: Sequence[FormWithParameters],
 ) -> dict[str, FloatArray]:
-    """Solve a law: every state at every row, (n_samples, n_points).
+    """Solve a law: return every state by name at every row, (n_samples, n_points).
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ def solve_law(
     rows
         Its rows.
     parameters
-        (n_samples or 1, 1 or n_points).
+        By name, (n_samples or 1, 1 or n_points).
     columns
-        Effective inputs, (n_samples or 1, n_points), including time.
+        Inputs after their effects, (n_samples or 1, n_points), including time.
     effects
         Forms on parameters and rates, and those that delay a column.
     """
@@ -66,7 +66,7 @@ class _Integration:
 
     @cached_property
     def rows_by_position_and_run(self) -> IntArray:
-        """Row at each position of each run, (n_places, n_runs); short runs repeat their last row."""
+        """Index of the row at each position in each run, (n_positions, n_runs); short runs repeat their last row."""
         longest = max(len(own) for own in self.table.rows_by_run)
         filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.table.rows_by_run]
         return np.stack(filled, axis=1)
@@ -83,12 +83,12 @@ class _Integration:
 
     @cached_property
     def delays(self) -> dict[str, FloatArray]:
-        """Delay of each column that is delayed, (n_samples or 1, 1)."""
+        """Delay of each column that is delayed, by name, (n_samples or 1, 1)."""
         return {form.late: numbers["tau_s"] for form, numbers in self.effects if form.late}
 
     @cached_property
     def used_columns(self) -> tuple[str, ...]:
-        """Columns that the law or an effect uses."""
+        """Names of the columns that the law or an effect uses."""
         uses = (column for form, _ in self.effects for column in form.uses)
         return tuple(dict.fromkeys((*self.kind.drives, *uses)))
 
@@ -108,7 +108,7 @@ class _Integration:
         return values if values.shape[1] == 1 else values[:, self.rows_by_position_and_run[0]]
 
     def rate_inputs_in_gap(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Instants]]:
-        """Return a function of the share of the gap from position k to the next, giving parameters and columns."""
+        """Return a function from a share of the gap after position k to the parameters by name and `Instants` there."""
         here, there = self.rows_by_position_and_run[k, runs], self.rows_by_position_and_run[k + 1, runs]
         first = self.rows_by_position_and_run[0, runs]
         law, time = self.kind.law, self.table.time
@@ -141,7 +141,7 @@ class _Integration:
         return at
 
     def _delayed_column(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
-        """Interpolate a column at earlier times, (n_samples, n_runs): held or linear; constant before the start."""
+        """Return a column at earlier times `t`, (n_samples, n_runs): held or linear; constant before a run's start."""
         law = self.kind.law
         assert law is not None
         column = self.columns[name]
@@ -159,7 +159,7 @@ class _Integration:
         return out
 
     def rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
-        """Return the rate of each state with the effects on rates, except dry friction and bounds."""
+        """Return the rate of each state by name, with the effects on rates except dry friction and bounds."""
         law = self.kind.law
         assert law is not None
         out = law.rates(s, p, now.u)
@@ -169,7 +169,7 @@ class _Integration:
         return out
 
     def discontinuity_shares(self, k: int) -> list[float]:
-        """Return shares of the gap from position k to the next: 0, the discontinuities of any sample or run, and 1."""
+        """Return sorted shares of the gap after position k: 0, the discontinuities of any sample or run, and 1."""
         here, there = self.rows_by_position_and_run[k], self.rows_by_position_and_run[k + 1]
         begin, gap = self.table.t[here], self.table.t[there] - self.table.t[here]
         moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
@@ -184,7 +184,7 @@ class _Integration:
         return [0.0, *inside.tolist(), 1.0]
 
     def solve(self) -> dict[str, FloatArray]:
-        """Return every state at every row, (n_samples, n_points)."""
+        """Return every state by name at every row, (n_samples, n_points)."""
         law = self.kind.law
         assert law is not None
         names, n_positions = list(law.start), len(self.rows_by_position_and_run)
@@ -197,7 +197,7 @@ class _Integration:
         return self._states_at_rows(names, kept)
 
     def _integrate_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
-        """Integrate from position k of all runs to the next, (n_states, n_samples, n_runs).
+        """Integrate states, (n_states, n_samples, n_runs), from position k of all runs to the next position.
 
         A gap of a sample and run in which friction or a bound changes its mode is integrated again with events.
         """
@@ -263,7 +263,7 @@ class _Integration:
 
     @property
     def friction_and_bound_forms(self) -> list[tuple[Any, FloatArray]]:
-        """The forms of dry friction and of bounds, each with its sizes or levels, (n_samples or 1, 1)."""
+        """Pairs of a form of dry friction or bound and its strength or level, (n_samples or 1, 1)."""
         return [(f, np.atleast_2d(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
 
     def _states_at_rows(self, names: list[str], kept: FloatArray) -> dict[str, FloatArray]:
@@ -289,7 +289,7 @@ class _Integration:
         )
 
     def clipped_to_bounds(self, s: FloatArray, names: list[str]) -> FloatArray:
-        """Clip initial states to their bounds."""
+        """Return the initial states clipped to their upper bounds, in place."""
         for form, size in self.friction_and_bound_forms:
             if form.stops:
                 k = names.index(form.target)
@@ -297,7 +297,7 @@ class _Integration:
         return s
 
     def integrate_gap_with_events(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
-        """Integrate from position k of run j to the next for one sample, with events of friction and bounds."""
+        """Integrate one sample's states, (n_states,), in run j from position k to the next, locating mode changes."""
         time = self.table.time
         assert time is not None
         t = self.columns[time]
@@ -358,7 +358,7 @@ def _modes_after_events(
     names: list[str],
     free_rates: Callable[[FloatArray], dict[str, float]],
 ) -> dict[int, int]:
-    """Put states that came to rest or a bound exactly there; return the modes of those that broke loose, by number."""
+    """Set states that came to rest or a bound exactly there; return modes of forms that broke loose, by index."""
     forced: dict[int, int] = {}
     for m, ((f, size), found, mode) in enumerate(zip(hard, events, modes, strict=True)):
         if found.size and mode != 0:  # at rest, or at the bound
@@ -369,7 +369,7 @@ def _modes_after_events(
 
 
 def _intervals_between(edges: Sequence[float]) -> Iterator[tuple[float, float]]:
-    """Yield successive pairs of edges, except those that are too close."""
+    """Yield pairs of successive edges that are more than 1e-7 apart."""
     return ((low, high) for low, high in pairwise(edges) if high - low > _CLOSE)
 
 
@@ -381,14 +381,14 @@ def _stick_or_bound_mode(form: Form, size: Any, value: Any, rate: Any) -> Any:
 
 
 def _mode_ended_mask(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
-    """Return where a mode has ended: motion reversed, or a force or value beyond its limit."""
+    """Return where a mode has ended: motion reversed, the force exceeds the friction, the bound is passed or left."""
     if form.sticks:
         return np.where(mode == 0, np.abs(rate) > size, value * mode < 0)
     return np.where(mode == 0, rate < 0, value > size)
 
 
 def _event_of_mode_end(form: Form, size: float, mode: int, names: list[str], free_rates: Any) -> Any:
-    """Return the event function for the end of a mode: coming to rest, breaking loose, reaching or leaving a bound."""
+    """Return SciPy's event function of a mode's end: coming to rest, breaking loose, reaching or leaving a bound."""
     i = names.index(form.target)
     if form.sticks:
         if mode == 0:

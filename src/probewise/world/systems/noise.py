@@ -1,4 +1,4 @@
-"""Kinds of noise, most of them other than white, some with a requested detectability."""
+"""Kinds of noise, most of them not white; of some, the strength follows from a requested detectability."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class SystemNoise:
     name
         "white" or one of OTHER_NOISE.
     draw
-        Function of noise-free readings, rows and a generator; returns readings, (n_points,).
+        Function of noise-free readings, table and a generator; returns readings with noise, (n_points,).
     parameters
-        As in the vocabulary.
+        Its parameters by name, as in the vocabulary.
     size_lambda
         Square root of twice the expected gain in log likelihood over white noise; 0 if its strength is fixed.
     step
-        Rounding step, if this noise is rounding.
+        Step to which this noise asks to round readings; None: no rounding.
     """
 
     name: str
@@ -54,9 +54,9 @@ class SystemNoise:
 def noise_of_size(
     name: str, wanted: float, readings: FloatArray, rows: SystemTable, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
-    """Return a noise, as detectable as an effect of size `wanted` as far as its strength can be chosen.
+    """Return the noise `name` at the strength at which it is as detectable as an effect of lambda `wanted`.
 
-    The strengths of "white", "outliers", "dropouts", "t4" and "quantised" are fixed.
+    If none suffices, at the largest. "white", "outliers", "dropouts", "t4" and "quantised" have a fixed strength.
     """
     whole = rows.n_runs
     match name:
@@ -123,7 +123,7 @@ def noise_of_size(
 
 
 def _ar1_noise(rows: SystemTable, rho: float, rng: np.random.Generator) -> FloatArray:
-    """Draw AR(1) noise of sd 1 within each run, (n_points,)."""
+    """Draw AR(1) noise of sd 1 and correlation `rho`, which starts anew in each run, (n_points,)."""
     own = rng.standard_normal(len(rows))
     for run in rows.rows_by_run:
         for before, row in pairwise(run):
@@ -137,7 +137,7 @@ def _noise_with_outliers(n: int, share: float, size: float, rng: np.random.Gener
 
 
 def _walk_covariance_eigenvalues(n: int) -> FloatArray:
-    """Return the eigenvalues of a unit-step random walk's covariance, without the constant, (n - 1,)."""
+    """Return the eigenvalues of the covariance of n steps of a centred unit-step random walk, ascending, (n - 1,)."""
     count = np.arange(1.0, n + 1)
     walk = np.minimum(count[:, None], count)
     centered = walk - walk.mean(axis=0) - walk.mean(axis=1)[:, None] + walk.mean()
@@ -145,13 +145,13 @@ def _walk_covariance_eigenvalues(n: int) -> FloatArray:
 
 
 def _lambda_of_variances(variances: FloatArray) -> float:
-    """Return lambda of unequal variances against their mean."""
+    """Return lambda (see `SystemNoise.size_lambda`) of noise with these variances against their mean."""
     n = len(variances)
     return math.sqrt(max(n * math.log(variances.mean()) - float(np.log(variances).sum()), 0.0))
 
 
 def _strength_and_size(size: Callable[[float], float], wanted: float, low: float, high: float) -> tuple[float, float]:
-    """Return the strength of a requested size, and that size; or the largest strength and its size, if that is less."""
+    """Return (strength, `wanted`) where `size(strength)` is `wanted`, or (`high`, its size) if that is less."""
     largest = size(high)
     if largest <= wanted:
         return high, largest
@@ -160,6 +160,6 @@ def _strength_and_size(size: Callable[[float], float], wanted: float, low: float
 
 
 def _nearest_preferred_number(value: float) -> float:
-    """Return the nearest of 1, 2 and 5 times a power of ten."""
+    """Return that of 1, 2 and 5 times powers of ten which is nearest on a logarithmic scale."""
     power = 10.0 ** math.floor(math.log10(value))
     return float(min((m * power for m in (1.0, 2.0, 5.0, 10.0)), key=lambda m: abs(math.log(m / value))))

@@ -1,4 +1,4 @@
-"""Covariates along which a residual is most visible."""
+"""Covariates along which the residual of an effect is most visible."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PLAIN = 0.25  # least explained share of the sum of squares
 
 
 def residual_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
-    """Return the covariates that a right answer may rank first: the form's own, and equivalent ones.
+    """Return names that a diagnosis may rank first: the form's covariates, then others that explain as much (to 10 %).
 
     Parameters
     ----------

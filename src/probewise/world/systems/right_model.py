@@ -16,15 +16,10 @@ _MOMENTS = 8  # distinct values of a dead time over samples, since the integrati
 
 
 def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
-    """Predict the held-out rows by posterior samples of the right model, (n_samples, n_rows).
+    """Predict the held-out rows by posterior samples of the model with the concealed effects, (n_samples, n_rows).
 
-    Samples are from the Gaussian approximation about the least-squares fit; parameters per run are drawn from the
-    prior.
-
-    Raises
-    ------
-    NotConvergedError
-        If the fit diverges.
+    Samples are from the Gaussian approximation about the least-squares fit; `per_run` parameters of the held-out runs
+    are drawn from the prior. Raises NotConvergedError if the fit diverges.
     """
     drawn, kind = case.drawn, case.drawn.kind
     beside = [AddedForm(e.form, e.values, names_of_fitted_parameters(e.form)) for e in case.effects]
@@ -61,7 +56,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
 
 
 def _with_unseen_runs_at_mean(numbers: Numbers, free: Sequence[str]) -> Numbers:
-    """Set values of held-out runs to the mean of the fitted ones, which the runs have in common."""
+    """Return a form's parameters, with "values[k]" of held-out runs set to the mean of the fitted runs."""
     fitted = [numbers[name] for name in free if name.startswith("values[")]
     if not fitted:
         return numbers
@@ -70,6 +65,6 @@ def _with_unseen_runs_at_mean(numbers: Numbers, free: Sequence[str]) -> Numbers:
 
 
 def _rounded_to_quantiles(values: FloatArray) -> FloatArray:
-    """Round each value (n_samples,) to the nearest of a few quantiles."""
+    """Round each value (n_samples,) to the nearest of eight quantiles of all."""
     few = np.quantile(values, (np.arange(_MOMENTS) + 0.5) / _MOMENTS)
     return np.asarray(few[np.searchsorted(0.5 * (few[1:] + few[:-1]), values)])

@@ -1,4 +1,4 @@
-"""Rivals of an effect: forms that, fitted together with the system, come within a few nats of it; aliases within three.
+"""Rivals of an effect: forms that, fitted together with the nominal model, explain it up to a few nats.
 
 First linearised, for every form at once; then by full fits of the closest ones.
 """
@@ -34,7 +34,7 @@ _NEUTRAL = {"level": np.inf, "period": 1.0}
 
 
 def vocabulary_name(form: Form) -> str:
-    """Return the vocabulary's name of a form: a saturation from below is `saturation` too."""
+    """Return a form's name in the vocabulary: that of "saturation (floor)" is "saturation"."""
     return form.name.removesuffix(" (floor)")
 
 
@@ -68,13 +68,13 @@ def rivals_with_nats(
     target
         Noise-free readings with the effect, (n_points,).
     fitted, model
-        The fit without the effect: the nominal model with the other effects.
+        The fit to `target` without the effect: the nominal model with the other concealed effects.
     without
         Names not to try.
 
     Returns
     -------
-    Loss of log likelihood in nats by name, for those below 12, the best first; those below TELLING_NATS are aliases.
+    Loss of log likelihood in nats by name, for those below 12, the smallest first; below TELLING_NATS (3): aliases.
     """
     left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
     near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], left, fitted, model)
@@ -113,7 +113,7 @@ def rivals_with_nats(
 def _best_by_linearisation(
     true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
 ) -> list[_StartOfFit]:
-    """Return the best candidates by linearisation, with each form's best two starts."""
+    """Return up to six candidates for full fits, at most two starts per form, by the least linearised loss first."""
     size = float(left @ left)
     out = []
     for form, changes in templates_of(true, forms, fitted, model).items():
@@ -139,7 +139,7 @@ def _best_by_linearisation(
 def templates_of(
     true: TrueSystem, forms: Sequence[Form], fitted: LeastSquaresFit, model: ModelWithForms
 ) -> dict[Form, FloatArray]:
-    """Return, by form, the changes of the readings about a fit by every setting of its bank, (n_settings, n_points)."""
+    """Return the change of readings by each setting of a form's bank, about a fit: form to (n_settings, n_points)."""
     settings = {form: [each for group in form.bank for each in group] for form in forms}
     x = fitted.coordinates[None, :]
     parameters, beside = model.parameters_at(x), model.effects_at(x)
@@ -166,7 +166,7 @@ def templates_of(
 
 
 def _split_by_way_of_simulation(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
-    """Divide forms into those to be simulated each alone, and those of one integration together."""
+    """Divide forms into two lists: those to be simulated each alone, and those that share one integration."""
     alone = [f for f in forms if f.sticks or f.stops or true.kind.law is None]
     return alone, [f for f in forms if f not in alone]
 
@@ -190,7 +190,7 @@ def _changes_of_chunk(
     fitted: LeastSquaresFit,
     model: ModelWithForms,
 ) -> dict[Form, FloatArray]:
-    """Return the changes of the readings by many forms, simulated at once: each is neutral but in its own samples."""
+    """Return as `templates_of`, for forms simulated at once: each has neutral parameters in the others' samples."""
     ends = np.cumsum([len(settings[form]) for form in forms])
     total, x = int(ends[-1]), fitted.coordinates[None, :]
     placed = []
@@ -216,7 +216,7 @@ def _changes_of_chunk(
 def _simulated_or_nan(
     true: TrueSystem, parameters: Mapping[str, FloatArray], effects: Sequence[FormWithParameters], n: int
 ) -> FloatArray:
-    """Simulate; NaN if a law diverges."""
+    """Return noise-free readings, (n, n_points), all NaN if the law diverges."""
     try:
         return simulate_noise_free(true.kind, true.table, parameters, effects).readings
     except NotConvergedError:

@@ -1,4 +1,4 @@
-"""The strata of a campaign on systems: half of the cases are clean."""
+"""The strata of a challenge on systems: half of the cases are clean."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STRIDE = 7  # coprime to the length of the cycle, so that successive cases diff
 
 
 def system_stratum_of(number: int) -> tuple[Stratum, int]:
-    """Return the stratum of a case, and the number of earlier cases of its kind and noise, of any size."""
+    """Return the stratum of case `number`, and how many earlier cases have its kind and `other_noise`, at any size."""
     order = [SYSTEMS_WHEEL[k * _STRIDE % len(SYSTEMS_WHEEL)] for k in range(len(SYSTEMS_WHEEL))]
 
     def have_same_kind_and_noise(a: Stratum, b: Stratum) -> bool:

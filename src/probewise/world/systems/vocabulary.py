@@ -49,6 +49,6 @@ FAMILIES = (
 
 
 def forms_of(true: TrueSystem) -> list[Form]:
-    """Return every form of the vocabulary, once for each of its targets in this system."""
+    """Return every form of the vocabulary, once for each of its possible targets in this system."""
     of_rates = forms_of_rates(true) if true.kind.defines_states else ()
     return [*forms_of_readings(true), *forms_of_inputs(true), *forms_of_parameters(true), *of_rates]

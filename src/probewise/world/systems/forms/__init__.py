@@ -1,1 +1,1 @@
-"""Every form of the vocabulary, and others outside it, implemented independently for the world."""
+"""Forms of effects, in the vocabulary and outside, implemented for the simulator alone."""

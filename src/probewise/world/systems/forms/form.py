@@ -1,4 +1,4 @@
-"""Forms of effects on a system, bound to a target."""
+"""The form of an effect on a system: its formula, bound to a target."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ Bank: TypeAlias = Sequence[Sequence[dict[str, float]]]
 class Instants:
     """Instants of runs, at rows or between them; arrays broadcast.
 
-    `t` is the recorded time, `since` the time since the start of the run, `u` the columns, `run` the number of the run,
-    `row` the number of the row.
+    `t` is the recorded time, `since` the time since the start of the run, `u` the columns by name, `run` the number of
+    the run, `row` the index of the row.
     """
 
     t: FloatArray
@@ -36,33 +36,33 @@ class Instants:
 
     @classmethod
     def at_rows(cls, rows: SystemTable) -> Self:
-        """Return the instants of all rows."""
+        """Return the instants of all rows of a table."""
         return cls(rows.t[None, :], rows.time_since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
 
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """A form, in the vocabulary or outside, bound to its target.
+    """The formula of an effect, in the vocabulary or outside, bound to a target.
 
     Parameters
     ----------
     name
         `name` or `name:target`.
     side
-        Side of the system on which it acts.
+        What it changes: inputs, a parameter, the rate of a state, or readings.
     act
         Its function, by side: input (columns, rows, parameters) to columns; parameter (now, parameters) to a term to
         add; rate (states, now, parameters) to a term to add; reading (readings, rows, parameters) to readings.
     of_amplitude
-        Converts the amplitude and the drawn values to the form's parameters.
+        Function of the amplitude and the values from `draw`; returns all parameters by name.
     draw
         Draws all parameters except the amplitude and its sign.
     bank
-        Its template bank.
+        Template bank: groups of parameter settings; templates within a group may be combined linearly.
     start_values
-        Converts a group of the bank and the amounts of its members to starting values of a fit.
+        Function of a group of the bank and the fitted coefficient of each setting; returns start values of a fit.
     steps
-        Step of each parameter for derivatives.
+        Scale of a change of each parameter, for derivatives; 0: not fitted.
     first, limit
         First amplitude tried, and the largest.
     signed
@@ -70,7 +70,7 @@ class Form:
     target
         Parameter or state on which it acts, if any.
     order
-        Order among the forms of the readings.
+        Forms of side "reading" act in ascending order.
     uses
         Columns that it uses.
     covariates
@@ -80,9 +80,9 @@ class Form:
     late
         Column that it delays.
     sticks, stops
-        Whether it is dry friction, or a bound, of the target.
+        Whether it is dry friction, or an upper bound, of the target.
     shape
-        Its formula in words, if it is outside the vocabulary.
+        Its formula in words, if it is outside the vocabulary, else "".
     also_in_truth
         Constants of its formula, by name, which the truth lists beside the parameters.
     """
@@ -115,5 +115,5 @@ FormWithParameters: TypeAlias = tuple[Form, Numbers]
 
 
 def parameter_arrays(settings: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
-    """Stack settings to parameter arrays, (n_settings, 1) each."""
+    """Stack parameter settings into one array per parameter, (n_settings, 1)."""
     return {name: np.array([[each[name]] for each in settings]) for name in settings[0]}

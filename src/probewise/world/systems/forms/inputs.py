@@ -1,4 +1,4 @@
-"""Forms on the inputs of a system (offset, gain, ceiling, dead zone, play, waves, delay), and on its clock."""
+"""Forms on the inputs of a system: offset, gain, saturation, dead zone, play, waves, delay; and on its clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Change = Callable[[FloatArray, SystemTable, Numbers], Any]
 
 
 def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
-    """Yield the forms on each column that drives the system, and on the clock."""
+    """Yield the forms on each column that the law or formula uses, and the drift of the clock."""
     for column in true.kind.drives:
         yield from _forms_of_column(true, column)
     time = true.table.time
@@ -32,7 +32,7 @@ def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
 def _make_act_on_column(
     column: str, change: Change
 ) -> Callable[[Mapping[str, FloatArray], SystemTable, Numbers], dict[str, Any]]:
-    """Return the `Form.act` that changes one column."""
+    """Return a `Form.act` that replaces one column by `change(column, rows, parameters)`."""
     return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
 
 
@@ -158,7 +158,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
 
 
 def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-    """Return a column behind gear play: it rests until the play is taken up.
+    """Return a column, (n_samples, n_points), behind gear play `v["width"]`: it rests until the play is taken up.
 
     At the start of each run, the play is taken up in the direction of the first motion.
     """

@@ -16,7 +16,7 @@ _N_WAVES = 20
 
 
 def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
-    """Yield the ways in which each parameter may vary."""
+    """Yield the forms by which each parameter may vary: in a step, a drift, from run to run, with a column."""
     common = {"steps": modulations.step_at_change_point(true)}
     if true.table.time is not None:
         common["drifts"] = modulations.linear_drift(true)
@@ -36,7 +36,7 @@ def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
 
 
 def varying_parameter_form(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
-    """Build the effect `name`, by which the parameter `target` varies as `how` says: a step, a drift, with a column."""
+    """Return the form `name` by which the parameter `target` varies as the modulation `how`, e.g. a step."""
     first = 0.003 * float(np.abs(true.parameters[target]).mean()) / how.reach
     return Form(
         name,
@@ -67,7 +67,7 @@ def rate_term_form(
     shape: str = "",
     signed: bool = True,
 ) -> Form:
-    """Return the form of a term a push(states, now, parameters) in the rate of a state; `size` is the push's scale."""
+    """Return the form of a term a push(states, now, parameters) in the rate of a state; `size`: push's magnitude."""
     first = 0.01 * true.rms_rate(state) / size
     return Form(
         name,
@@ -89,7 +89,7 @@ def rate_term_form(
 
 
 def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
-    """Yield the terms that may be missing from the rate of each state."""
+    """Yield the terms that may be missing from the rate of each state, dry friction and an upper bound included."""
     if true.kind.law is None:
         return
     for state, values in true.states.items():
@@ -121,7 +121,7 @@ def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
 
 
 def _make_term_of_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
-    """Return the push that is a function of one state alone."""
+    """Return a `push` for `rate_term_form` that is a function `term` of one state."""
     return lambda s, now, v: term(s[state])
 
 

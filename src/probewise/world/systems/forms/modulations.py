@@ -1,4 +1,4 @@
-"""Modulations of a reading, a parameter or a rate: drift, step, per run, with a column, wave, settling."""
+"""Modulations, which vary a reading, a parameter or a rate: drift, step, per run, with a column, wave, settling."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from probewise.world.systems.forms.true_system import TrueSystem, draw_log_unifo
 
 @dataclass(frozen=True, eq=False)
 class Modulation:
-    """A variation in proportion to an amplitude; attributes as in `Form`, some of them functions of the amplitude.
+    """A variation in proportion to an amplitude; attributes as of `Form`, `bank` and `steps` functions of amplitude.
 
-    `value_at` is its value as a function of instants and parameters, `reach` the scale of that value at amplitude 1.
+    `value_at` is a function of instants and parameters, `reach` its typical magnitude at amplitude 1.
     """
 
     value_at: Callable[[Instants, Numbers], Any]
@@ -34,7 +34,7 @@ class Modulation:
 
 
 def start_values_of_single_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Return the only member of a group with its amplitude scaled by the only amount."""
+    """Return the first setting of a group, with its amplitude "a" multiplied by the first fitted coefficient."""
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
@@ -55,13 +55,13 @@ def _amplitude_only_modulation(
 
 
 def linear_drift(true: TrueSystem) -> Modulation:
-    """Return a linear drift in recorded time."""
+    """Return the modulation a t, t the recorded time."""
     names = ("time",) if true.table.time in (None, "time") else ("time", str(true.table.time))
     return _amplitude_only_modulation(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
 
 
 def proportional_to_column(true: TrueSystem, column: str) -> Modulation:
-    """Return a variation in proportion to a column, about its mean over the recording."""
+    """Return the modulation a (column - its mean over the recording)."""
     middle = true.mean_of(column)
     return _amplitude_only_modulation(
         lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.sd_of(column), (column,)
@@ -69,7 +69,7 @@ def proportional_to_column(true: TrueSystem, column: str) -> Modulation:
 
 
 def step_at_change_point(true: TrueSystem) -> Modulation:
-    """Return a step at a time, or at a row if there is no time."""
+    """Return a step at a time "at_s", or at a row "at_row" if the table has no time."""
     at, timed = ("at_s", True) if true.table.time is not None else ("at_row", False)
     moments = np.quantile(np.unique(true.table.t), np.linspace(0.02, 0.98, 40))
 
@@ -90,7 +90,7 @@ def step_at_change_point(true: TrueSystem) -> Modulation:
 
 
 def value_per_run(true: TrueSystem) -> Modulation:
-    """Return a random value per run, including held-out runs, scaled by the amplitude."""
+    """Return a modulation with one normal random value per run, held-out runs included, times the amplitude."""
     n = true.table.n_runs
     names = [f"values[{k}]" for k in range(n)]
     present = [int(true.table.run[own[0]]) for own in true.table.rows_by_run]
@@ -115,18 +115,18 @@ def value_per_run(true: TrueSystem) -> Modulation:
 
 
 def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
-    """Return the bank of a wave: sine and cosine at each rate."""
+    """Return the template bank of a wave: a group of sine and cosine of amplitude `a` for each rate (key `name`)."""
     return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
 
 
 def start_values_of_wave(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Return the setting of the wave that the amounts of sine and cosine add up to."""
+    """Return amplitude and phase of the wave that is the sum of a group's sine and cosine times their coefficients."""
     sine, cosine = amounts * group[0]["a"]
     return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
 
 
 def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
-    """Return one sinusoid in time, up to one period in four rows; the bank has n frequencies."""
+    """Return a sinusoid in time, its period from four rows to two thirds of the recording; its bank has n rates."""
     rows = true.table
     slowest, fastest = 1.5 / rows.duration, 0.25 / rows.median_gap
     return Modulation(
@@ -143,7 +143,7 @@ def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
 
 
 def settling(true: TrueSystem) -> Modulation:
-    """Return an exponential settling after the start of each run."""
+    """Return an exponential decay that starts with each run."""
     longest = float(true.table.time_since_start.max())
     taus = np.geomspace(true.table.median_gap, longest, 12)
     return Modulation(

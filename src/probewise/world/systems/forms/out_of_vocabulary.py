@@ -101,7 +101,7 @@ def _switch_form(true: TrueSystem, column: str, share: float) -> Form:
 
 
 def _soft_limited_sum_form(true: TrueSystem, column: str) -> Form:
-    """Return the form that adds the sum of a column's absolute deviations since the start of the run, soft-limited."""
+    """Return the form that adds a tanh of the sum of a column's absolute deviations since the start of the run."""
     middle, spread = true.mean_of(column), true.sd_of(column)
 
     def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:

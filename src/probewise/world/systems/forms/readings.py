@@ -1,4 +1,4 @@
-"""Forms on the reading: offset, gain, bend, ceiling, hysteresis, lag, dead time."""
+"""Forms on the reading: offset, gain, nonlinearity, saturation, hysteresis, lag, delay."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
 
 
 def modulated_reading_form(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
-    """Return the form by which an offset, or with `gain` a factor 1 + modulation, varies the reading."""
+    """Return the form that adds a modulation to the reading or, with `gain`, multiplies by 1 + modulation."""
 
     def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         change = how.value_at(Instants.at_rows(rows), v)
@@ -69,7 +69,7 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
 
 
 def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
-    """Return the sign of change of readings (n_samples, n_points); rests keep the last sign, the first row the next."""
+    """Return the sign of each reading's last change in its run (before any, of the first), (n_samples, n_points)."""
     out = np.zeros_like(y)
     for own in rows.rows_by_run:
         for i in range(len(y)):
@@ -142,18 +142,18 @@ def _hysteresis_bend_and_saturation_forms(true: TrueSystem) -> Iterator[Form]:
 
 
 def _make_clip(upper: bool) -> Callable[[FloatArray, SystemTable, Numbers], FloatArray]:
-    """Return the `Form.act` that clips readings at the parameter "level", from above or below."""
+    """Return a `Form.act` that limits readings to the parameter "level": at most this if `upper`, else at least."""
     bound = np.minimum if upper else np.maximum
     return lambda y, rows, v: np.asarray(bound(y, v["level"]))
 
 
 def _make_clip_level_of_amplitude(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
-    """Return the `Form.of_amplitude` that clips by an amplitude inwards from `end`."""
+    """Return a `Form.of_amplitude`: the clip level is `end` + `sign` times the amplitude."""
     return lambda a, drawn: {"level": end + sign * a}
 
 
 def delayed_values(values: FloatArray, rows: SystemTable, tau: FloatArray) -> FloatArray:
-    """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs: interpolated, constant before the first."""
+    """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs: interpolated, constant before the first row."""
     n = max(len(values), len(tau))
     values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
     out = np.empty(values.shape)

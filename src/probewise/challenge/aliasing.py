@@ -1,4 +1,4 @@
-"""Cosines of a concealed effect with the effects of the vocabulary, and a pair's residuals after one is fitted."""
+"""Cosines of a concealed effect with the vocabulary's effects, and a pair's residuals after a fit of one of both."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cosines_with_vocabulary(
     *,
     vocabulary: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
 ) -> dict[str, float]:
-    """Return the cosine of an effect's residuals, after a refit of the null, with every named effect on the mean.
+    """Return the cosine of an effect's residuals, after a refit of the null model, with every named effect on the mean.
 
     Parameters
     ----------
@@ -38,13 +38,13 @@ def cosines_with_vocabulary(
     clean, changed
         Noise-free readings without and with the effect.
     vocabulary
-        The effects to compare with, by name.
+        The effects to compare with, by name; those that cannot act in this plan or act on the noise are left out.
 
     Returns
     -------
     Cosine rho by name: the square root of the share of the residual sum of squares that the named effect, at its best
-    fit and together with the null, explains. The effects that explain most are refitted in full, the others
-    linearised. If a halo or blur explains much, "ssf_order" is included: one more Gaussian, no missing physics.
+    fit and together with the null model, explains: from a full refit if the linearised rho is above 0.8. If "halo" or
+    "edge_blur" is above 0.8, also of "ssf_order": one more Gaussian in the SSF, which is no missing physics.
     """
     found = refit.refit(clean, changed)
     usable = np.flatnonzero(clean.usable)
@@ -70,7 +70,7 @@ def cosines_with_vocabulary(
 def residual_norms_with_one_named(
     refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]
 ) -> dict[str, float]:
-    """Return the norm of two effects' residuals after a fit of the null and one of them, in reading units.
+    """Return the norm of two effects' residuals after a fit of the null model and one of them, in reading units.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def residual_norms_with_one_named(
     clean, both
         Noise-free readings without any effect and with both.
     names
-        Effects fitted together with the null, one at a time.
+        Effects fitted together with the null model, one at a time.
 
     Returns
     -------
-    Norm of the residuals by name; divided by the noise sd, it is the size of the other effect given this one. It may be
-    much smaller than that effect's size alone: readings cut off by a ceiling do not show a paler patch.
+    Norm of the residuals by name of the fitted effect; divided by the noise sd, it is the size of the other effect
+    given this one. It may be much smaller than the other's size alone: a saturation can hide a stain.
     """
     found, adjusted = refit.refit(clean, both), refit.without_null_residuals(clean, both)
     usable = np.flatnonzero(clean.usable)
@@ -107,7 +107,7 @@ def residual_norms_with_one_named(
 def _templates_and_explained_squares(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
 ) -> tuple[EffectTemplates, FloatArray]:
-    """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
+    """Return an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
     templates = templates_of_effect(found, effect, usable)
     blocks = OrthonormalBlocks.of(problem, templates.columns)
     return templates, np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
@@ -116,7 +116,7 @@ def _templates_and_explained_squares(
 def _refit_with_effect(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], templates: EffectTemplates, at: int, adjusted: Recording
 ) -> Fit:
-    """Refit the null and an effect from an entry of its bank."""
+    """Refit the null model with an effect to `adjusted`, from entry `at` of its template bank; return the fit."""
     columns, setting = templates.columns[at], templates.settings[at]
     amount = np.linalg.lstsq(problem.project(columns), problem.residual)[0]
     start = effect.start(setting, np.asarray(amount, dtype=np.float64))
@@ -130,6 +130,6 @@ def _refit_with_effect(
 
 
 def _cosine_of_fits(found: Fit, by: Fit) -> float:
-    """Return the square root of the share of one fit's residual sum of squares that another fit explains."""
+    """Return the square root of the share of `found`'s residual sum of squares by which `by`'s is smaller."""
     left = float(by.residuals @ by.residuals) / float(found.residuals @ found.residuals)
     return float(np.sqrt(np.clip(1 - left, 0.0, 1.0)))

@@ -30,7 +30,7 @@ _LEAST_COSINE = 0.5
 
 @dataclass(frozen=True)
 class Task:
-    """One case of a challenge: the challenge's sealed seed and the case's number, from 0."""
+    """One case of a challenge: the challenge's secret seed and the case's number, from 0."""
 
     seed: int
     number: int
@@ -49,7 +49,7 @@ class Task:
 class RunCaseInRounds:
     """A function that runs a case in up to `rounds` rounds: record, diagnose, then take the advised readings.
 
-    It is a dataclass instead of a closure, so that it can be pickled for another process.
+    It is a dataclass, not a closure, so that it can be pickled for another process.
     """
 
     rounds: int
@@ -64,8 +64,8 @@ def run_case(task: Task) -> dict[str, Any]:
 
     Returns
     -------
-    A JSON object. A case that could not be drawn or whose diagnosis failed has "failed", the reason, and "at",
-    "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
+    A dict for JSON: the stratum ("kind", "size", "other_noise"), the truth ("truth", sorted names; "hidden", a dict per
+    effect), the diagnosis (`statements_to_score`). If drawing or diagnosis failed: "failed", the reason, and "at".
     """
     return _case_result(task, _diagnosis_result)
 
@@ -106,7 +106,7 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
 
 
 def _effect_results(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
-    """Describe the effects; for a pair also "size_beside", the size of each effect when the other is in the model."""
+    """Return one dict per effect; in a pair with "size_beside", its size in sds when the other is in the model."""
     each = [_effect_result(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
         both = sizer.recording_with_effects(*(one.effect for one in hidden))
@@ -117,7 +117,7 @@ def _effect_results(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: N
 
 
 def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
-    """Describe one effect; "cosines" holds similar effects in this plan, by name, with their cosines."""
+    """Return an effect as a dict; "cosines" are those above 0.5 with effects of the vocabulary, by name."""
     # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
     on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
     like = (
@@ -170,7 +170,7 @@ def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, A
 
 
 def statements_to_score(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the parts of a diagnosis that are scored, as a JSON object."""
+    """Return "verdict", "p_value", "combination", "hypotheses" ([names, probability]) and "credible_set", for JSON."""
     return {
         "verdict": diagnosis.verdict,
         "p_value": diagnosis.p_value,
@@ -183,7 +183,7 @@ def statements_to_score(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
-    """Take the readings that the diagnosis advises and diagnose all readings together."""
+    """Diagnose the recording together with simulated readings of the advised plan; None if none was advised."""
     asked = diagnosis.next_measurement
     if asked is None:
         return None

@@ -1,4 +1,4 @@
-"""The confusion matrix."""
+"""The confusion matrix: which answers were given for which concealed effect."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ OUTSIDE, SEVERAL = "outside", "several"
 def confusion_counts(
     results: Sequence[Mapping[str, Any]], *, label: Callable[[str], str] = str
 ) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
-    """Count answers by truth, for cases that conceal nothing, one effect, or one outside the vocabulary.
+    """Count answers by truth, over cases of kind "clean", "single" and "outside".
 
-    An alias of the truth counts as the truth. Only names that occur have a row or a column; `label` may merge several
-    names.
+    An answer that is an alias of the truth counts as the truth. Only names that occur have a row or a column. `label`
+    maps a name to that of its row and column, e.g. to merge several.
 
     Returns
     -------
-    Truths, in the order of the vocabulary; answers; counts, (n_truths, n_said).
+    Truths, in the order of the vocabulary; answers; counts, (n_truths, n_answers).
     """
     counts: Counter[tuple[str, str]] = Counter()
     for result in results:
@@ -42,7 +42,7 @@ def confusion_counts(
 
 
 def _stated_name(result: Mapping[str, Any], truth: str) -> str:
-    """Return the answer of a case: `truth` if it is right, "clean", a single name, or `SEVERAL`."""
+    """Return the name for which a leading hypothesis counts: `truth` if right, "clean", its one name, or `SEVERAL`."""
     names = leading_hypothesis(result, clean=True)[0]
     if acts_on_mean(result):
         names = tuple(name for name in names if name not in NOISE)

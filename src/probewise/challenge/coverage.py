@@ -1,4 +1,4 @@
-"""Coverage of the stated intervals: effect parameters, sensor parameters, and the place of a local effect."""
+"""Coverage of the stated intervals (effect and sensor parameters), and overlap with the region of a local effect."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not
 def effect_truths_and_intervals(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
     """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
 
-    Angles are compared modulo a turn. Parameters with one value per run, which share a prior, are left out.
+    Angles are compared modulo a turn. Parameters with one value per run are left out.
     """
     out = {}
     for stated in found.parameters:
@@ -37,7 +37,7 @@ def effect_truths_and_intervals(parameters: Mapping[str, Any], found: EffectFoun
 def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str, list[float]]:
     """Pair the true moments of the footprint, and the levels, with their 95 % intervals: name -> [truth, low, high].
 
-    The moments, mean (mm) and variances and covariance (mm^2), do not depend on the number of Gaussians.
+    Names: "u_mm", "v_mm", "var_u_mm2", "var_v_mm2", "cov_uv_mm2", "I_min", "I_max".
     """
     mean, covariance = world.spot.moments()
     n_ssf = 6 * samples.n_gaussians
@@ -59,7 +59,7 @@ def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str
 
 
 def _footprint_moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
-    """Return means, variances and covariance of the whole mixture, (n_samples, 5)."""
+    """Return mean u and v, variances of u and v, and covariance of the whole mixture, (n_samples, 5)."""
     f = footprint_of(theta, n_gaussians)
 
     def average(values: FloatArray) -> FloatArray:
@@ -77,7 +77,7 @@ def _footprint_moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
-    """Return intersection over union of an effect's region and the strongest place in its covariate; 0 if none."""
+    """Return intersection over union of an effect's region and the first of `places` in its covariate; 0 if none."""
     place = next((p for p in places if p.covariate == region.covariate), None)
     if place is None:
         return 0.0

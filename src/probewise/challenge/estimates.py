@@ -16,7 +16,7 @@ _DRAWS = 400
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimate, the ends of its 95 % interval, and the sample size; NaN for an empty sample."""
+    """An estimate, the ends of its 95 % interval, and the sample size; NaN and 0 for an empty sample."""
 
     value: float
     low: float
@@ -28,7 +28,7 @@ _NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
 def estimated_share(hits: list[bool]) -> Estimate:
-    """Estimate a proportion, with Wilson's interval (Wilson 1927)."""
+    """Estimate the share of True values, with Wilson's interval (Wilson 1927)."""
     if not hits:
         return _NOTHING
     found = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
@@ -36,7 +36,7 @@ def estimated_share(hits: list[bool]) -> Estimate:
 
 
 def estimated_mean(values: list[float]) -> Estimate:
-    """Estimate a mean, with Student's interval."""
+    """Estimate a mean, with Student's interval (infinite for one value)."""
     if not values:
         return _NOTHING
     center, n = float(np.mean(values)), len(values)
@@ -47,10 +47,10 @@ def estimated_mean(values: list[float]) -> Estimate:
 
 
 def estimated_statistic(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
-    """Estimate a statistic of rows (n, ...), with the basic bootstrap interval from fixed random draws.
+    """Estimate a statistic of rows (n, ...), with the basic bootstrap interval from random draws with a fixed seed.
 
     The basic interval reflects the draws about the estimate, which corrects the bias of small samples (Davison and
-    Hinkley 1997, section 5.2).
+    Hinkley 1997, section 5.2). It is infinite for one row.
     """
     if not len(rows):
         return _NOTHING

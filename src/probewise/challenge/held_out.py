@@ -19,16 +19,15 @@ from probewise.world.challenge import NO_PHYSICS, Case, held_out_recordings
 def log_densities_of_scans(
     case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Return the log predictive density of each held-out scan under four models, in nats.
+    """Return the log predictive density of each held-out scan under up to four models, in nats, summed over readings.
 
-    "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", if all concealed effects are in the
-    vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the same readings: the
-    best that naming can achieve. "true" is an upper limit: it knows the noise-free reading and the sd of the noise's
-    Gaussian core, and is exact for white noise.
+    "null" and "repaired" are the diagnosis's models without effects and with those found. "right", if all concealed
+    effects are in the vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the
+    same readings. "true" is an upper limit (exact for white noise): it knows the noise-free readings and the noise sd.
 
     Returns
     -------
-    Values by name of the scan, then of the model.
+    Values by name of the scan ("angle", "pattern", "direction"), then of the model.
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}

@@ -1,4 +1,4 @@
-"""Refit of the null model to noise-free readings: lambda is the norm of its residuals in noise sds."""
+"""Refit of the null model (a sensor without effects) to noise-free readings: residual norm / noise sd is lambda."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _BEHIND = 3.0  # nats: once an SSF order is this far behind the best, higher ord
 class NullRefit:
     """The null model, fitted to clean readings once and refitted to readings with effects.
 
-    The order of the SSF is the one with the largest evidence on the clean readings, as in a diagnosis. Its residuals on
-    those readings (the true SSF may be no mixture of Gaussians) are subtracted before a refit.
+    The number of Gaussians in the SSF has the largest evidence on the clean readings, as in a diagnosis. The residuals
+    of that fit (the true SSF may be no mixture of Gaussians) are subtracted before a refit.
     """
 
     def __init__(self) -> None:
@@ -35,23 +35,23 @@ class NullRefit:
         return float(np.linalg.norm(self.refit(clean, changed).residuals))
 
     def refit(self, clean: Recording, changed: Recording) -> Fit:
-        """Refit the null to an effect's readings, as if the null fitted the clean sensor exactly."""
+        """Return the null model's fit to `changed`, as if the model fitted `clean` exactly."""
         null = self.null_fit(clean)
         return _white_noise_fit(null.model, self.without_null_residuals(clean, changed), null.z)
 
     def with_one_more_gaussian(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
-        """Refit the same readings with one Gaussian more than `refit`, which is not a physical effect."""
+        """Return as `refit`, but with one Gaussian more in the SSF than `found`, the result of `refit`."""
         fits = _fits_with_one_more_gaussian(found, self.without_null_residuals(clean, changed), Extent.of(clean))
         return min(fits, key=lambda f: float(np.linalg.norm(f.residuals)))
 
     def without_null_residuals(self, clean: Recording, changed: Recording) -> Recording:
-        """Subtract the null's residuals on `clean` from `changed`."""
+        """Return `changed` minus the null model's residuals on `clean`."""
         readings = changed.readings.copy()
         readings[clean.usable] -= self.null_fit(clean).residuals
         return Recording(changed.plan, readings)
 
     def null_fit(self, clean: Recording) -> Fit:
-        """Fit the null to the clean readings; the result is cached."""
+        """Return the null model's fit to the clean readings, cached for the last recording."""
         if self._clean is not clean:
             self._clean, self._null = clean, _fit_of_best_order(clean)
         return self._null
@@ -78,7 +78,7 @@ def _fit_of_best_order(clean: Recording) -> Fit:
 
 
 def _fits_with_one_more_gaussian(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
-    """Fit with one more Gaussian, starting from every way to split the heaviest."""
+    """Yield fits with one more Gaussian than `found`, one from each way to split the heaviest."""
     wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
     for z in starts_with_more_gaussians(found.model.sensor, found.z, wanted):
         yield _white_noise_fit(Model(wanted, (), recording.plan), recording, z)

@@ -1,9 +1,9 @@
 """Oracle baseline: how well effects can be identified, given the cosines of their changes alone.
 
-The change by an effect of size lambda (after the refit) and the best imitation by another effect are d = lambda sqrt(1
-- rho^2) noise sds apart, where rho is their cosine. With nothing else unknown, the log Bayes factor of the true effect
-is normal with mean d^2 / 2 and sd d, so it is right with probability Phi(d / 2). This is not a bound: averaging over a
-rival's parameters does better than the comparison with its best fit; many rivals and an unknown sensor do worse.
+The change by an effect of size lambda (after the refit) and the best imitation by a rival (another effect) are
+d = lambda sqrt(1 - rho^2) noise sds apart, where rho is their cosine. With nothing else unknown, the log Bayes factor
+of the true effect is normal with mean d^2 / 2 and sd d, so it is right with probability Phi(d / 2). This is not a
+bound: averaging over a rival's parameters does better; many rivals and an unknown sensor do worse.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Hidden = Mapping[str, Any]
 
 
 def oracle_name_rate(hidden: Hidden) -> float:
-    """Return the probability that the right name or an alias of it ranks before its most similar rival."""
+    """Return the probability that the right name or an alias ranks before the most similar rival (other effect)."""
     return _rate_against_closest_rival(hidden, right_names(hidden))
 
 
 def oracle_covariate_rate(hidden: Hidden) -> float:
-    """Return the probability that the right covariate ranks before the most similar rival without it."""
+    """Return the probability that the effect ranks before its most similar rival without any of its covariates."""
     shown = set(hidden["shows_in"])
     named = [name for name in hidden["cosines"] if name in VOCABULARY]
     covariates = {name: cast(tuple[str, ...], VOCABULARY[name].covariates) for name in named}
@@ -41,7 +41,7 @@ def oracle_covariate_rate(hidden: Hidden) -> float:
 def oracle_credible_set_size(hidden: Hidden) -> float:
     """Return the expected size of a 95 % credible set, with the truth and its aliases counted as one.
 
-    The log Bayes factors against the rivals are taken as independent; the random draws are fixed.
+    The log Bayes factors against the rivals are taken as independent; the random draws have a fixed seed.
     """
     apart = _distances_of_rivals(hidden)
     d: FloatArray = np.array(list(apart.values()))
@@ -58,7 +58,7 @@ def oracle_credible_set_size(hidden: Hidden) -> float:
 
 
 def readings_to_separate_alias(result: Mapping[str, Any]) -> float:
-    """Return how many readings of the same plan would separate an aliased pair by 3 nats (inf if identical)."""
+    """Return how many readings of the same plan would separate a case's aliased pair by 3 nats (inf if identical)."""
     size, rho = float(result["hidden"][0]["size_lambda"]), float(result["cosine"])
     apart = size**2 * (1 - rho**2) / 2
     return float(result["readings"]) * HONEST_NATS / apart if apart > 0 else np.inf
@@ -71,9 +71,9 @@ def _rate_against_closest_rival(hidden: Hidden, right: Set[str]) -> float:
 
 
 def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
-    """Return the distance of every rival in noise sds; noise effects have no rivals.
+    """Return the distance d (module) of every rival in noise sds, by name; {} for a noise effect.
 
-    Rivals of a system's effect have a loss in nats, half the squared distance; those of the light sensor a cosine.
+    Rivals of a system's effect have a loss in nats, d^2 / 2; those of the light sensor a cosine.
     """
     if "rival_nats" in hidden:
         return {name: float(np.sqrt(2 * nats)) for name, nats in hidden["rival_nats"].items()}

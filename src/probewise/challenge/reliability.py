@@ -24,7 +24,7 @@ class Bin:
 
 
 def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
-    """Bin cases by the probability of their leading hypothesis into ten bins; empty bins are left out."""
+    """Bin cases by the probability of their leading hypothesis into ten equal bins, ascending, without empty bins."""
     said = [leading_probability_and_correctness(result) for result in results]
     of_case = _bin_numbers(np.array([p for p, _ in said]))
     return tuple(
@@ -37,7 +37,7 @@ def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
 
 
 def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
-    """Estimate the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
+    """Estimate the expected calibration error: abs(mean stated - share right) of each bin, averaged over the cases."""
     found = estimated_statistic(
         np.array([leading_probability_and_correctness(result) for result in results], dtype=np.float64).reshape(-1, 2),
         _calibration_error_of_rows,
@@ -46,7 +46,7 @@ def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
 
 
 def _calibration_error_of_rows(said: FloatArray) -> float:
-    """Return the calibration error of rows (probability, right or not), (n, 2)."""
+    """Return the calibration error of rows (probability, 1 if right or 0), (n, 2)."""
     off = np.bincount(_bin_numbers(said[:, 0]), said[:, 0] - said[:, 1])
     return float(np.abs(off).sum()) / len(said)
 

@@ -21,7 +21,7 @@ _BOOTSTRAPS = 2000
 
 
 def score_rounds(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
-    """Score the results of `RunCaseInRounds`: a row per target after the last round and, below it, after the first."""
+    """Return rows for results of `RunCaseInRounds`: each target after the last round and, below it, after the first."""
     last = [r for r in results if "failed" not in r]
     first = [r | r["rounds"][0] for r in last]
     return (

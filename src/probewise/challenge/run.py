@@ -1,4 +1,4 @@
-"""Run the cases of a challenge as a campaign that can be interrupted at any time."""
+"""Run the cases of a challenge as a campaign: many tasks, with results in a file, that can be interrupted."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def run_challenge(
     n_cases
         Number of cases, from case 0. It may be raised later: cases in the file are not run again.
     seed
-        The sealed seed: with its number, it determines a case.
+        The secret seed: with its number, it determines a case.
     work
         Function that runs a case; by default the light sensor's.
     of
-        Name of the apparatus, if not the light sensor: campaigns on different apparatus do not mix.
+        Name of what is diagnosed, if not the light sensor; a file of another name is refused.
     path
         The campaign's file.
     executor

@@ -1,4 +1,4 @@
-"""Score one case at a time from the result of `run_case`."""
+"""Score one case at a time from the result of `run_case` or `run_system_case`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
 
 
 def right_names_of_each_effect(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
-    """List the effects that have to be named, as one set of right names each.
+    """List the effects that have to be named, as one set of right names each; effects on the mean come first.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def right_names_of_each_effect(result: Result, *, merged: bool, noise: bool = Tr
 
 
 def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
-    """Return whether names match the wanted effects one to one; effects that are no physics may go unnamed."""
+    """Return whether names match the wanted effects one to one; those that "ssf_order" imitates may go unnamed."""
     needed = [right for right in wanted if not right & NO_PHYSICS]
     optional = [right for right in wanted if right & NO_PHYSICS]
     n_more = len(names) - len(needed)
@@ -62,7 +62,7 @@ def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
 
 
 def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
-    """Return whether the credible set holds the truth; `merged`: whether an alias of an effect will do."""
+    """Return whether the credible set holds the truth or, if `merged`, aliases of it."""
     wanted = right_names_of_each_effect(result, merged=merged)
     return any(names_match(names_in_label(label), wanted) for label in result["credible_set"])
 
@@ -74,7 +74,7 @@ def has_false_extra_effect(result: Result) -> bool:
 
 
 def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
-    """Count the names that match no wanted effect; each effect matches one name."""
+    """Count the names left over when as many as possible match a wanted effect, one name per effect."""
     most = max(
         sum(name in right for name, right in zip(order, wanted, strict=False))
         for order in itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
@@ -83,31 +83,31 @@ def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) ->
 
 
 def is_distinguishable_from_ssf(result: Result) -> bool:
-    """Return whether a concealed effect can be told from one more Gaussian in the SSF with this many readings."""
+    """Return whether some concealed effect cannot be imitated by one more Gaussian in the SSF."""
     return any(not right & NO_PHYSICS for right in right_names_of_each_effect(result, merged=True))
 
 
 def is_out_of_vocabulary(result: Result) -> bool:
-    """Return whether a concealed effect is outside the vocabulary and has no alias in it."""
+    """Return whether a concealed effect is outside the vocabulary and has no alias there."""
     return frozenset({"unknown"}) in right_names_of_each_effect(result, merged=True)
 
 
 def acts_on_mean(result: Result) -> bool:
-    """Return whether every concealed effect, if any, changes the mean of the readings."""
+    """Return whether no concealed effect acts on the noise only; True if nothing is concealed."""
     return not any(h["on_noise"] for h in result["hidden"])
 
 
 def leading_hypothesis(result: Result, *, clean: bool) -> tuple[Names, float]:
-    """Return the most probable hypothesis and its probability; `clean`: whether the clean one is included."""
+    """Return names and probability of the most probable hypothesis; `clean`: whether the clean one, (), may be it."""
     options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
     return max(options, key=lambda option: option[1], default=((), 0.0))
 
 
 def is_leading_name_right(result: Result) -> bool:
-    """Return whether the right names rank first among hypotheses that are not clean, with aliases merged.
+    """Return whether the right names, or aliases, rank first among the hypotheses that are not clean.
 
-    If the mean is changed, names of noise effects are ignored. If one more Gaussian in the SSF absorbs the effect,
-    clean is right too.
+    If the effects act on the mean, names of noise effects are ignored. If one more Gaussian in the SSF absorbs the
+    effect, clean is right too.
     """
     if not acts_on_mean(result):
         return names_match(leading_hypothesis(result, clean=False)[0], right_names_of_each_effect(result, merged=True))
@@ -122,11 +122,11 @@ def is_leading_name_right(result: Result) -> bool:
 
 
 def leading_probability_and_correctness(result: Result) -> tuple[float, bool]:
-    """Return the probability of the leading hypothesis, which may be clean, and whether it is exactly the truth."""
+    """Return the probability of the leading hypothesis, which may be clean, and whether it is the truth (no alias)."""
     names, probability = leading_hypothesis(result, clean=True)
     return probability, names_match(names, right_names_of_each_effect(result, merged=False))
 
 
 def names_in_label(label: str) -> Names:
-    """Split a label of a credible set into names."""
+    """Split a label of a credible set, such as "lag+backlash", into names; "clean" has none."""
     return () if label == "clean" else tuple(label.split("+"))

@@ -1,4 +1,4 @@
-"""The table of a challenge: target, estimate and decision in each row."""
+"""The table of a challenge: quantity, target, estimate and decision in each row."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ScoreRow:
     found
         Estimate with its 95 % interval.
     least, most
-        Bounds of the target; without any, there is no target.
+        Bounds of the target, infinite by default; if both are, there is no target.
     """
 
     name: str
@@ -63,7 +63,7 @@ class ScoreRow:
 
     @property
     def decision(self) -> Decision | None:
-        """Whether the target is "met" or "missed" by the whole interval, or "open" otherwise; None without a target."""
+        """The word "met" (interval within bounds), "missed" (beyond one) or "open" (neither); None without a target."""
         if math.isinf(self.least) and math.isinf(self.most):
             return None
         if self.found.low >= self.least and self.found.high <= self.most:
@@ -72,7 +72,7 @@ class ScoreRow:
 
 
 def score(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
-    """Score the results of `run_case`; a case that failed counts in the last row alone."""
+    """Return the table's rows from results of `run_case`; a case that failed counts in the last row alone."""
     done = [r for r in results if "failed" not in r]
     return (
         *_rows_on_clean_cases(done),
@@ -91,7 +91,7 @@ def score(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
 
 
 def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
-    """Estimate, for each effect concealed alone at a size, how often it was detected at alpha .01 and named first."""
+    """Return by name the shares of cases detected at alpha .01, and named first, of single effects of this size."""
     singles = cases_with_one_effect([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
@@ -156,7 +156,7 @@ def _rows_on_naming(done: list[Result]) -> list[ScoreRow]:
 
 
 def _difference_of_shares(before: Estimate, after: Estimate) -> Estimate:
-    """Return the difference of two proportions, with Newcombe's interval."""
+    """Return the proportion `before` minus `after`, with Newcombe's interval."""
     fall = before.value - after.value
     down = math.hypot(before.value - before.low, after.high - after.value)
     up = math.hypot(before.high - before.value, after.value - after.low)
@@ -236,7 +236,7 @@ def _rows_on_intervals(done: list[Result]) -> list[ScoreRow]:
 
 
 def share_of_intervals_with_truth(intervals: list[list[float]]) -> Estimate:
-    """Estimate the share of intervals, [truth, low, high] each, that cover the truth."""
+    """Estimate the share of intervals, [truth, low, high] each, that hold the truth."""
     return estimated_share([low <= truth <= high for truth, low, high in intervals])
 
 
@@ -272,7 +272,7 @@ def _rows_on_held_out_gains(done: list[Result]) -> list[ScoreRow]:
 
 
 def _held_out_gains_by_scan(results: Sequence[Result], best: str) -> FloatArray:
-    """Return the gains over the null of the repaired model and of model `best`, (n_cases, n_scans, 2)."""
+    """Return the gains in nats over the null of the repaired model and of model `best`, (n_cases, n_scans, 2)."""
     gains = [[_summed_gains_over_null(r, [scan], best) for scan in _SCANS] for r in results]
     return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
 
@@ -299,7 +299,7 @@ def _rows_on_pairs(done: list[Result]) -> list[ScoreRow]:
 
 
 def _each_keeps_size_beside_other(result: Result) -> bool:
-    """Return whether each effect of a pair keeps at least `_BESIDE` of its λ when the other is in the model."""
+    """Return whether each effect of a pair keeps at least 80 % of its lambda when the other is in the model."""
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
@@ -356,32 +356,32 @@ def _rows_on_processor_time(done: list[Result]) -> list[ScoreRow]:
 
 
 def cases_with_one_effect(done: Sequence[Result], size: float) -> list[Result]:
-    """List the cases with one effect of this size."""
+    """List the cases of kind "single" whose effect has this size lambda."""
     return [r for r in done if r["kind"] == "single" and r["size"] == size]
 
 
 def _cases_distinguishable_from_ssf(results: Sequence[Result]) -> list[Result]:
-    """Keep the cases that should raise an alarm: those that one more Gaussian in the SSF cannot absorb."""
+    """Keep the cases whose effects on the mean cannot be imitated by one more Gaussian in the SSF."""
     return [r for r in _cases_with_mean_effects(results) if is_distinguishable_from_ssf(r)]
 
 
 def _cases_with_mean_effects(results: Sequence[Result]) -> list[Result]:
-    """Keep the cases that the p-value tests: effects on the mean."""
+    """Keep the cases without effects on the noise, which the p-value does not test."""
     return [r for r in results if acts_on_mean(r)]
 
 
 def rejection_rate(results: Sequence[Result], alpha: float) -> Estimate:
-    """Estimate how often the test of the mean rejects at significance level `alpha`."""
+    """Estimate the share of cases with a p-value of at most `alpha`."""
     return estimated_share([r["p_value"] <= alpha for r in results])
 
 
 def names_effect_on_mean(result: Result) -> bool:
-    """Return whether an effect on the mean is named."""
+    """Return whether the diagnosis names an effect on the mean ("unknown" is none)."""
     return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
 def is_confidently_wrong(result: Result) -> bool:
-    """Return whether a wrong effect is stated above .9; `clean` and `unknown` do not count."""
+    """Return whether a wrong effect, or an alias, has a probability above 0.9; "clean" and "unknown" do not count."""
     probability, right = leading_probability_and_correctness(result)
     names = leading_hypothesis(result, clean=True)[0]
     return probability > 0.9 and not right and names not in ((), ("unknown",))

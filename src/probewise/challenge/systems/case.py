@@ -20,12 +20,12 @@ from probewise.world.systems import SystemCase, SystemEffect, draw_system_case, 
 
 
 def run_system_case(task: Task) -> dict[str, Any]:
-    """Draw a case, diagnose it from its two files alone, and return the diagnosis and the truth.
+    """Draw a case, diagnose it from its simulator file and table alone, and return the diagnosis and the truth.
 
     Returns
     -------
-    A JSON object. A case that could not be drawn or whose diagnosis failed has "failed", the reason, and "at",
-    "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
+    A dict for JSON, with keys as of `run_case`. A case that could not be drawn or whose diagnosis failed has "failed",
+    the reason, and "at", "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
     """
     stratum, _ = system_stratum_of(task.number)
     result: dict[str, Any] = asdict(stratum)
@@ -70,7 +70,7 @@ def _truth_json(case: SystemCase) -> dict[str, Any]:
 
 
 def _effect_json(effect: SystemEffect) -> dict[str, Any]:
-    """Describe one effect; an alias's loss in nats is converted to a cosine."""
+    """Return an effect as a dict; an alias's loss in nats is converted to a cosine, sqrt(1 - 2 nats / lambda^2)."""
     squared = effect.size_lambda**2
     return {
         "name": effect.name,
@@ -106,5 +106,5 @@ def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
 
 
 def _has_formula(diagnosis: Diagnosis) -> bool:
-    """Return whether the diagnosis gives the unknown effect a formula."""
+    """Return whether an effect of the diagnosis's repaired model is a formula that the diagnosis found."""
     return any(getattr(effect, "expression", "") for effect in getattr(diagnosis.repaired.chain, "effects", ()))

@@ -1,4 +1,4 @@
-"""Log predictive densities of a system's held-out runs under the null, repaired, right and true models."""
+"""Log predictive densities of a system's two held-out runs under the null, repaired, right and true models."""
 
 from __future__ import annotations
 
@@ -28,14 +28,15 @@ _N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the densi
 def log_densities_of_runs(
     case: SystemCase, diagnosis: Diagnosis, later: RunTable, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Sum the log predictive densities of each held-out run, in nats.
+    """Return the log predictive density of each held-out run under up to four models, in nats, summed over readings.
 
-    "null" and "repaired" are the diagnosis's own models. "right" is the model with exactly the concealed effects,
-    fitted to the same readings by the world. "true" knows the noise-free reading.
+    "null" and "repaired" are the diagnosis's models without effects and with those found. "right" is the model with
+    exactly the concealed effects, fitted by the simulator; absent without effects or if the fit fails. "true" knows the
+    noise-free reading.
 
     Returns
     -------
-    Values by run, "inside" the regime of the recorded runs and "beyond" it, then by model.
+    Values by run, "inside" the range of the recorded runs and "beyond" it, then by model; not finite ones are left out.
     """
     fitting, *drawing = rng.spawn(3)
     readings = later.covariates[case.drawn.kind.reading]
@@ -76,13 +77,13 @@ def predict_runs(
     Parameters
     ----------
     samples
-        The model.
+        Posterior samples of the model.
     about
-        The fit about which its effects were bound.
+        The reference fit of the diagnosis, from which its effects have their scales.
     table
         The new runs.
     rng
-        Random generator, for the choice of samples and for what a new run has of its own.
+        Random generator, for the choice of samples and for the values per run.
     """
     chain = cast(SystemChain, samples.chain)
     system = chain.system.with_added_runs(table)
@@ -108,6 +109,6 @@ def predict_runs(
 
 
 def _log_mean_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
-    """Return the log of the mean density over samples, (n_points,)."""
+    """Return the log of the mean density over samples, (n_points,), of readings predicted with `sd` (n_samples,)."""
     each = log_gaussian_density(readings, predicted, sd[:, None])
     return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))

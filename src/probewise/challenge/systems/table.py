@@ -1,4 +1,4 @@
-"""The table of a challenge on systems: target, estimate and decision in each row."""
+"""The table of a challenge on systems: quantity, target, estimate and decision in each row."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _RUNS = ("inside", "beyond")
 
 
 def name_without_target(name: str) -> str:
-    """Return a name without its target."""
+    """Return a name, or several joined by "+", without the targets after ":"."""
     return "+".join(part.split(":")[0] for part in name.split("+"))
 
 
 def score_systems(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
-    """Score the results of `run_system_case`; a case that failed counts in the last row alone."""
+    """Return the table's rows from results of `run_system_case`; a case that failed counts in the last row alone."""
     done = [r for r in results if "failed" not in r]
     return (
         *_rows_on_clean_cases(done),
@@ -124,7 +124,7 @@ def _effects_with_rivals(singles: Sequence[Result]) -> list[Result]:
 
 
 def _is_confidently_wrong(result: Result) -> bool:
-    """Return whether a wrong name, not an alias of the truth, is stated above .9."""
+    """Return whether a wrong effect, not an alias of the truth, has a probability above 0.9."""
     return is_confidently_wrong(result) and not names_match(
         leading_hypothesis(result, clean=True)[0], right_names_of_each_effect(result, merged=True)
     )
@@ -136,9 +136,9 @@ def _rows_on_intervals(done: list[Result]) -> list[ScoreRow]:
 
 
 def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | None:
-    """Return the gains over the null of the repaired model and of model `best` on the held-out runs, at most 100 nats.
+    """Return (gain of the repaired model, gain of model `best`) over the null in nats, summed over the held-out runs.
 
-    None if a run lacks a finite density under one of the three models.
+    Each is capped at 100. None if a run lacks a density under one of the three models.
     """
     own = [result["held_out"][run] for run in _RUNS]
     if any(model not in scores for scores in own for model in ("null", "repaired", best)):
@@ -180,7 +180,7 @@ def _rows_on_unlisted_laws(done: list[Result]) -> list[ScoreRow]:
 
 
 def _gains_as_much_as_true_law(result: Result) -> bool:
-    """Return whether a name or formula gains most of what the true law does; aliases count too."""
+    """Return whether the right name or an alias leads, or the repaired model gains 80 % of the right model's nats."""
     if (
         names_match(leading_hypothesis(result, clean=True)[0], right_names_of_each_effect(result, merged=True))
         and result["verdict"] != "unknown"

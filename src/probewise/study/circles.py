@@ -1,4 +1,4 @@
-"""The circles and the noise that all rows of a study share."""
+"""The circles and the noise that the rows of a study share."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _SEED = 2013
 
 @dataclass(frozen=True)
 class Population:
-    """A distribution of circles, which is also the robot's prior."""
+    """A named distribution of circles, which is also the robot's prior."""
 
     name: str
     shape: Circle
 
     def circles(self, n: int, *, seed: int = _SEED) -> FloatArray:
-        """Return the first `n` circles of a seed: x_mm, y_mm and radius_mm, (n, 3)."""
+        """Return the first `n` circles of a seed: rows (x_mm, y_mm, radius_mm), (n, 3). ParameterError if n < 1."""
         if n < 1:
             raise ParameterError("n", n, "1 or more")
         return np.asarray(self.shape.prior.from_unit_cube(np.random.default_rng(seed).random((n, 3))))
@@ -39,5 +39,5 @@ POPULATIONS: Mapping[str, Population] = {
 
 
 def noise_of_run_in_sds(circle: int, n: int) -> FloatArray:
-    """Return the noise of a run's first `n` readings in units of its sd, (n,); the same for every strategy compared."""
+    """Return the noise of the first `n` readings over a circle, in units of its sd, (n,); the same in all rows."""
     return np.random.default_rng([circle, 99]).standard_normal(n)

@@ -1,8 +1,8 @@
 """Studies of the robot with a concealed fault: success rates, named faults, and runs that are sure and wrong.
 
-The sensor model is exact except for one concealed effect, at three sizes each. The world is `probewise.world`, which
-sums pixels and shares no code with the models. Every row has the same circles and the same noise, with and without
-doubt in the sensor.
+The sensor model is exact except for one concealed effect, at three sizes each. The readings are simulated by
+`probewise.world`, which sums pixels and shares no code with the models. Every row has the same circles and noise, at
+two prior probabilities that the sensor model is complete (`trust`): `TRUST` and 1.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
 
 @dataclass(frozen=True)
 class FadingLamp:
-    """A lamp that fades linearly: every eight seconds it loses the same share of its first signal, down to zero."""
+    """A lamp that fades linearly: every eight seconds it loses a `share` of its first signal, down to zero."""
 
     share: float
 
@@ -77,7 +77,7 @@ class FadingLamp:
     stage: ClassVar[Stage] = "gain"
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Multiply the signal by the share of light that the lamp still gives at each row's time."""
+        """Multiply the signal by the fraction of light that the lamp still gives at each row's time."""
         return np.asarray(values * np.maximum(1.0 - self.share * rows.time_s / _EACH_S, 0.0))
 
 
@@ -123,7 +123,7 @@ _REMEMBERING = frozenset({"lag", "correlated_noise"})  # effects by which a read
 
 @dataclass(frozen=True)
 class ConcealedTrial:
-    """One run: the concealed effect (empty: none), the index of its size, circle, seed, and trust in the sensor."""
+    """One run: concealed effect ("": none), index of its size, number of the circle, trust, reading limit, seed."""
 
     effect: str
     size: int
@@ -139,7 +139,7 @@ class ConcealedTrial:
 
     @property
     def true_circle_in_arm_frame(self) -> FloatArray:
-        """The true circle in the arm's own frame, (3,)."""
+        """The circle that the robot can find, (3,): the true one, but as changed by a tilt or an error of scale."""
         frame = _IN_ARM_FRAME.get(self.effect)
         return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
 
@@ -147,12 +147,12 @@ class ConcealedTrial:
 
     @property
     def right_answer(self) -> str:
-        """The name that a run should give: of the concealed effect, of an equivalent one, or clean."""
+        """The name that a run should give: of the concealed effect, of an equivalent one, or "clean"."""
         return NAMES.get(self.effect, self.effect)
 
     @property
     def key(self) -> str:
-        """Key of the run in the campaign's file."""
+        """Key of the run in the campaign's file: effect, size, circle and trust."""
         return f"{self.effect or CLEAN} / {self.size} / {self.circle} / {self.trust:g}"
 
 
@@ -161,8 +161,8 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
 
     Returns
     -------
-    A JSON object: whether the target precision was reached (`known`), number of `readings`; `error_mm`, `held` and
-    `chance_wrong` as in `run_trial`. Then the probability of the true effect (`p_truth`), the names in the `credible`
+    A dict for JSON: whether the target precision was reached (`known`), number of `readings`; `error_mm`, `held` and
+    `chance_wrong` as in `run_trial`. Then the probability of the right answer (`p_truth`), the names in the `credible`
     set, whether the run reports a fault (`noticed`). And processor time per decision in seconds (`cpu_s`): median and
     95 % quantile.
     """
@@ -228,7 +228,7 @@ def run_concealed(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> dict[ConcealedTrial, dict[str, Any]]:
-    """Run every row over the first circles, with and without doubt in the sensor, or resume an interrupted study.
+    """Run every row over the first circles, with trust `TRUST` and 1, or resume an interrupted study.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def run_concealed(
     max_readings
         A run that has not reached the target precision after this many readings is a miss.
     effects, sizes
-        Rows to run besides the clean one.
+        Names in CONCEALED and indices of sizes to run besides the clean row.
     n_clean
         Circles of the clean row; by default as many as for the others.
     seed
@@ -269,10 +269,10 @@ def run_concealed(
 
 @dataclass(frozen=True)
 class ConcealedRow:
-    """Summary of a row: shares with Wilson's 95 % intervals, the rest over the runs.
+    """Summary of a row: shares with Wilson's 95 % intervals, `readings` (median), `mean_readings`, processor time in s.
 
     `size` is None where nothing is concealed. `sure_and_wrong`: ended by the robot's own rule with a length off by more
-    than 12 mm. `noticed`: something left out leads, or the fit is doubted. `names`: mean size of the credible set.
+    than 12 mm. `noticed`: an effect leads, or the fit is doubted. `names`: mean number of names in the credible set.
     """
 
     concealed: str
@@ -295,7 +295,7 @@ _COLUMNS = tuple(column.name for column in fields(ConcealedRow))
 
 
 def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
-    """Summarise each row: effect, size and trust."""
+    """Summarise the runs of each row (effect, size and trust), in the order of `results`."""
     rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
     for trial, result in results.items():
         rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.right_answer, result))
@@ -303,7 +303,7 @@ def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[
 
 
 def concealed_csv_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Summarise each row for a CSV file: shares with their intervals as text."""
+    """Summarise each row as a dict for a CSV file: shares with their intervals as text."""
     return [{name: _csv_value(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
 
 

@@ -1,4 +1,4 @@
-"""The rows of a study: one factor at a time from a reference row."""
+"""The rows of a study, each a configuration that differs from a reference in one factor or two."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class SearchConfiguration:
         Distribution of the circles, which is also the prior: "anywhere" (radius 20 to 150 mm) or "inside" (50 to
         150 mm, entirely in the field).
     model
-        The robot's sensor model: "ssf" or "naive". The true sensor always has the SSF.
+        The robot's sensor model: "ssf" or "naive" (a point without SSF). The true sensor always has the SSF.
     utility
         Acquisition function by name (see `inquiry.utility_named`).
     noise_sd
-        Sd of the world's noise, which the robot knows, LEGO units.
+        Sd of the simulated noise, which the robot knows, LEGO units.
     width
         Width of the robot's SSF over the true one; 1 if right.
     learn_sensor
@@ -83,7 +83,7 @@ class SearchConfiguration:
 
     @property
     def name(self) -> str:
-        """Distribution of the circles, sensor model, and what else differs from the reference, in words.
+        """Distribution of the circles, sensor model, and other differences from the reference, in words.
 
         Two rows that differ have different names, by which a study's file keeps their runs.
         """
@@ -103,17 +103,17 @@ class SearchConfiguration:
         return ", ".join(words)
 
     def settings(self) -> dict[str, Any]:
-        """Return its fields as JSON values."""
+        """Return the fields by name, as JSON values."""
         return asdict(self)
 
 
 def _exact_number_text(value: float) -> str:
-    """Return a number as text, in six digits if these are all."""
+    """Return a number as text: six digits if they are exact, otherwise all."""
     return text if float(text := f"{value:g}") == value else repr(float(value))
 
 
 def _ssf_width_in_words(width: float) -> str:
-    """Describe a wrong width: in whole percent if it is one, otherwise as a factor."""
+    """Describe a wrong width: in whole percent if possible, otherwise as a factor."""
     if width != round(width, 2):
         return f"believed {float(width)!r} times as wide"
     return f"believed {abs(width - 1):.0%} too {'wide' if width > 1 else 'narrow'}"
@@ -125,7 +125,7 @@ REFERENCE = SearchConfiguration()
 def paper_comparison_rows(
     *, population: str = REFERENCE.population, nested_stop: NestedStop = "change"
 ) -> tuple[SearchConfiguration, ...]:
-    """Return rows with the reference's and the paper's method for each sensor model."""
+    """Return four rows: sensor model "ssf", then "naive", each with the reference's method, then the paper's."""
     paper = {"method": "paper", "utility": "entropy", "nested_stop": nested_stop}
     ways: tuple[dict[str, Any], ...] = ({}, paper)
     return tuple(

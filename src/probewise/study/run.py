@@ -1,4 +1,4 @@
-"""A study: rows by circles, run as a campaign and summarised as a table."""
+"""A study: every row over its circles, run as a campaign and summarised as a table."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from probewise.study.trial import Trial, run_trial
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Results of each row in the order of the circles, and the limit of readings."""
+    """Results (`run_trial`) of each row, in the order of the circles, and the limit of readings."""
 
     trials: Mapping[SearchConfiguration, tuple[Mapping[str, Any], ...]]
     max_readings: int
 
     def table(self) -> dict[SearchConfiguration, Summary]:
-        """Summarise every row with two or more runs."""
+        """Return the summary of every row with two or more runs, by row."""
         return {row: summarise(t, max_readings=self.max_readings) for row, t in self.trials.items() if len(t) > 1}
 
 
@@ -39,7 +39,7 @@ def run_study(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> Study:
-    """Run every row over the first circles of its population, or resume an interrupted study.
+    """Run every row over the first circles of its population, or resume an interrupted study; return the results.
 
     Parameters
     ----------
@@ -58,6 +58,8 @@ def run_study(
 
     Raises
     ------
+    ParameterError
+        If there is no row, or a row has no circle.
     FileError, NotConvergedError
         See `run_campaign`.
     """
@@ -83,12 +85,9 @@ def run_study(
 
 
 def read_study(path: str | os.PathLike[str], rows: Sequence[SearchConfiguration]) -> Study:
-    """Read the results of these rows from a study's file, finished or not.
+    """Read the results of these rows from a study's file, finished or not; runs not in the file are left out.
 
-    Raises
-    ------
-    FileError
-        If the file does not belong to a study.
+    Raises FileError if the file does not belong to a study.
     """
     found = read_campaign(path)
     if "study" not in found.settings:

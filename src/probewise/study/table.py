@@ -1,4 +1,4 @@
-"""Summary of a row of a study, with errors."""
+"""Summary of the runs of a row of a study, with errors."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ class Summary:
     bits_each
         Bits per reading: prior minus posterior differential entropy.
     error_mm
-        Largest error of a length at the stop, median over runs that reached the precision.
+        Largest error of a length at the stop, median over runs that reached the precision; NaN if none did.
     wrong
         Number of runs that reached the precision with an error above `WRONG_MM`.
     wrong_expected, wrong_limit
         Number expected from their own posteriors, and the 99 % quantile of a Poisson distribution with that mean.
     held
-        Coverage of the 95 % intervals at the stop, with the standard error over runs.
+        Share of the 95 % intervals at the stop that hold the truth, over runs that reached the precision.
     arm_s
         Arm time per run in seconds, with the standard error.
     cpu_s
@@ -87,10 +87,7 @@ class Summary:
 def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summary:
     """Summarise the runs of one row, each a result of `run_trial`.
 
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two runs, which have no standard error.
+    Raises ParameterError if there are fewer than two runs, which have no standard error.
     """
     if len(trials) < 2:
         raise ParameterError("number of trials", len(trials), "2 or more, so that there is a standard error")
@@ -119,10 +116,7 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
 
 
 def share_with_interval(k: int, n: int) -> Estimate:
-    """Estimate a share from k of n, with Wilson's 95 % interval.
-
-    Wilson's interval has its nominal coverage also near 0 and 1 (Wilson 1927).
-    """
+    """Estimate the share k / n, with Wilson's 95 % interval (Wilson 1927)."""
     found = binomtest(k, n).proportion_ci(method="wilson")
     return Estimate(k / n, float(found.low), float(found.high))
 
@@ -135,10 +129,7 @@ def _mean_with_error(values: FloatArray) -> Estimate:
 
 
 def _median_with_interval(values: FloatArray) -> Estimate:
-    """Return the median with a distribution-free 95 % interval of order statistics.
-
-    The range of fewer than six values covers the median less often, so that there is no interval.
-    """
+    """Return the median with a distribution-free 95 % interval of order statistics, NaN bounds below six values."""
     ordered = np.sort(values)
     if len(ordered) < LEAST_FOR_MEDIAN:
         return Estimate(float(np.median(ordered)), math.nan, math.nan)

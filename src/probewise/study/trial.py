@@ -48,7 +48,7 @@ _UNROUNDED = ReadingScale(-math.inf, math.inf, None)
 
 @dataclass(frozen=True)
 class Trial:
-    """A task of a study: the row, the number of the circle, and the limit of readings."""
+    """A task of a study: the row, the number of the circle, from 0, and the limit of readings."""
 
     row: SearchConfiguration
     circle: int
@@ -61,7 +61,7 @@ class Trial:
 
     @property
     def truth(self) -> FloatArray:
-        """The circle: x_mm, y_mm, radius_mm, (3,)."""
+        """The true circle: x_mm, y_mm, radius_mm, (3,)."""
         return np.asarray(POPULATIONS[self.row.population].circles(self.circle + 1)[self.circle])
 
 
@@ -111,9 +111,9 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 
     Returns
     -------
-    A JSON object. Search: whether the target precision was `reached`, number of `readings`, number of the first one on
-    white (`first_white`, or None), `bits` gained in all and up to that one (`bits_at_white`). Result: largest error of
-    a length (`error_mm`), its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 % interval
+    A dict for JSON. Search: whether the target precision was `reached`, number of `readings`, number of the first one
+    on white (`first_white`, or None), `bits` gained in all and up to that one (`bits_at_white`). Result: largest error
+    of a length (`error_mm`), its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 % interval
     covers the truth (`held`), p-value of the fit (`p_value`), widest posterior sd after each reading (`widest_mm`).
     Cost: arm time in seconds (`arm_s`), median processor time per decision in seconds (`cpu_s`).
     """
@@ -142,7 +142,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 def timed_steps(
     arm: SimulatedArm, experiment: Experiment, *, circle: int, max_readings: int, seed: int = SEED
 ) -> Iterator[tuple[Step, float]]:
-    """Yield the steps of a run and the processor time of each (s); randomness depends on seed and circle only."""
+    """Yield each step of a run with its processor time in s; randomness depends on seed and circle only."""
     rng = np.random.default_rng([seed, circle])
     with arm:
         steps = explore(arm, experiment, rng=rng, max_readings=max_readings)
@@ -161,7 +161,7 @@ def has_reached_target(last: Step, experiment: Experiment) -> bool:
 
 
 def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
-    """Compare the last posterior with the true shape, (3,): `error_mm`, `chance_wrong` and `held` of `run_trial`."""
+    """Return `error_mm`, `chance_wrong` and `held` of `run_trial`, from the last posterior and the true shape, (3,)."""
     columns = experiment.shape_columns
     theta, weight = last.posterior.theta[:, columns], last.posterior.weight
     held = []
@@ -176,7 +176,7 @@ def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> 
 
 
 def arm_of(trial: Trial) -> SimulatedArm:
-    """Return an arm that reaches the whole grid over the circle, with the noise that all rows share."""
+    """Return a simulated arm that reaches the whole grid over the circle, with the noise that all rows share."""
     world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
@@ -192,12 +192,12 @@ def arm_of(trial: Trial) -> SimulatedArm:
 
 @lru_cache(maxsize=1)
 def footprint_pixels() -> Spot:
-    """Return the footprint of the study's sensor as pixels."""
+    """Return the footprint of the study's simulated sensor as pixels."""
     return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
 
 
 def _prior_of_sensor_changes() -> Product:
-    """Return the prior of changes of the sensor, the default of `experiment.sensor_prior`."""
+    """Return the normal prior of changes of the SSF and of the levels, about the sensor's true values."""
     change = SensorChangeSds()
     level = change.level * (BRIGHT - DARK)
     size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)

@@ -13,11 +13,11 @@ The commands of the command line as functions:
 `Recording.from_arrays` and `Recording.from_table` make recordings, `read_recording`, `read_plan` and `read_sensor` read
 files. Results display themselves in notebooks.
 
-The parts are packages, loaded as they are used. In the order of one reading's path: `arm` (where readings come from),
+The parts are packages, loaded at first use. In the order of one reading's path: `arm` (where readings come from),
 `recordings`, `scene` (what lies under the sensor), `sensor` (from scene to reading), `inference`, `nested` (evidence
-and posterior: `nested.run`), `inquiry` (where to measure next), `experiment` (the loop), `calibration`, `effects` and
-`diagnosis` (what the model leaves out), `study`, `challenge`, `report`; `world` is the simulated world apart,
-`emulator` a LEGO brick in software.
+and posterior: `nested.run`), `inquiry` (where to measure next), `experiment` (the loop), `calibration`, `effects`,
+`diagnosis` and `investigation` (what the model leaves out), `systems` (simulators of users), `study`, `challenge`,
+`report`; `world` is an independent simulator, `emulator` a LEGO brick in software.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def __dir__() -> list[str]:
 
 
 def _load_renderers() -> None:
-    """Let results show themselves with pictures; matplotlib is loaded no sooner."""
+    """Import the module by which results display themselves as pictures; it is the first to load matplotlib."""
     import probewise.report.notebook  # noqa: F401
 
 

@@ -15,9 +15,9 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 
 
 def floats(values: ArrayLike, name: str = "values") -> FloatArray:
-    """Convert numbers (an array, a list, a column of a table) to an array of floats.
+    """Convert numbers (an array, a list, a column of a table) to an array of floats; a float64 array is not copied.
 
-    None becomes NaN, and so do the masked values of a masked array.
+    None becomes NaN, and so do the masked values of a masked array. `name` is that of the argument in messages.
 
     Raises
     ------
@@ -42,21 +42,21 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
 
 
 def read_only_floats(values: ArrayLike, name: str = "values") -> FloatArray:
-    """Copy to a read-only array of floats."""
+    """Copy numbers to a read-only array of floats; ParameterError as of `floats`."""
     array = np.array(floats(values, name))
     array.flags.writeable = False
     return array
 
 
 def frozen_int(values: ArrayLike) -> IntArray:
-    """Copy to a read-only array of integers."""
+    """Copy numbers to a read-only array of integers."""
     array = np.array(values, dtype=np.int64)
     array.flags.writeable = False
     return array
 
 
 def require_finite(name: str, values: FloatArray) -> None:
-    """Raise ParameterError naming the first value that is not finite."""
+    """Raise ParameterError if a value is not finite; the message gives index and value of the first."""
     bad = ~np.isfinite(values)
     if bad.any():
         at = int(np.flatnonzero(bad.ravel())[0])

@@ -1,7 +1,7 @@
-"""Display of results in a notebook, without an import of plotting from the packages that define them.
+"""Display of results in a notebook; the packages that define the results need not import plotting.
 
-A value derives from `ShowsItself`; `report.notebook`, higher in the layers, registers its renderer.
-The package registers the function that loads the renderers, and the first display calls it.
+A result's class derives from `ShowsItself`; `report.notebook`, higher in the layers, registers its renderer.
+The first display of a result loads `report.notebook`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ _waiting: list[Callable[[], object]] = []
 
 
 def before_first_display(load: Callable[[], object]) -> None:
-    """Register `load`, to be called once when a value is first displayed: plotting is imported only then."""
+    """Register `load`, to be called once, before a result is first displayed: plotting is imported only then."""
     _waiting.append(load)
 
 
 @functools.singledispatch
 def render_html(value: object) -> str:
-    """Render a value as an HTML fragment; types without a renderer show their summary."""
+    """Return a result as an HTML fragment; of a type without a registered renderer, the text of its `str`."""
     return f"<pre>{html.escape(str(value))}</pre>"
 
 
@@ -34,9 +34,9 @@ class Printer(Protocol):
 
 
 class ShowsItself:
-    """Base of values that display themselves: HTML in a notebook, the summary in a terminal and as `str`.
+    """Base of results that display themselves: HTML in a notebook, the text of `summary()` in a terminal and as `str`.
 
-    The `repr`, which lists, debuggers and error messages show, is one line: all its arrays would fill a megabyte.
+    The `repr`, which lists, debuggers and error messages show, is one line.
     """
 
     __slots__ = ()

@@ -1,4 +1,4 @@
-"""Checks of argument types, with messages that say what is allowed."""
+"""Checks of arguments, with messages that say what is allowed; `name` is the argument's name in the message."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST_LISTED = 250  # characters of names, so that what was perhaps meant is not
 
 
 def require_rng(rng: object) -> None:
-    """Raise ParameterError unless `rng` is a NumPy generator; a seed is the usual mistake."""
+    """Raise ParameterError unless `rng` is a NumPy generator; the message shows how to make one from a seed."""
     if isinstance(rng, np.random.Generator):
         return
     seed = int(rng) if isinstance(rng, Integral) and not isinstance(rng, bool) and int(rng) >= 0 else 0
@@ -29,7 +29,7 @@ def require_rng(rng: object) -> None:
 
 
 def checked_number(name: str, value: object, allowed: str = "a number") -> float:
-    """Return a real number as a float; raise ParameterError for a text, a list, None, an array of several."""
+    """Return a real number (NaN and infinity included) as a float; raise ParameterError for anything else."""
     if isinstance(value, Real) or (isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf"):
         return float(value)
     raise ParameterError(name, value, allowed)
@@ -44,7 +44,7 @@ def checked_finite_number(name: str, value: object, allowed: str = "a finite num
 
 
 def checked_whole(name: str, value: object, *, least: int | None = 1) -> int:
-    """Return a whole number, of at least `least` where that is given, as an int, or raise ParameterError."""
+    """Return a whole number as an int; raise ParameterError for anything else or, unless `least` is None, less."""
     if isinstance(value, Integral) and not isinstance(value, bool) and (least is None or int(value) >= least):
         return int(value)
     raise ParameterError(name, value, "a whole number" + ("" if least is None else f", {least} or more"))
@@ -60,7 +60,7 @@ def checked_pair(name: str, value: object, allowed: str = "two finite numbers (x
 
 
 def checked_one_or_several_numbers(name: str, value: object) -> tuple[float, ...]:
-    """Return a number, or each of a list of finite numbers, as a tuple; raise ParameterError for a text or None."""
+    """Return a finite number, or several in a list or array, as a tuple; raise ParameterError for anything else."""
     if isinstance(value, Real):
         value = (value,)
     array_like = isinstance(value, Sequence | np.ndarray | range) and not isinstance(value, str | bytes)
@@ -70,7 +70,7 @@ def checked_one_or_several_numbers(name: str, value: object) -> tuple[float, ...
 
 
 def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
-    """Raise ParameterError unless `value` is one of these names; the message suggests the nearest."""
+    """Raise ParameterError unless `value` is one of the names `known`; the message suggests the nearest."""
     if isinstance(value, str) and value in known:
         return
     listed = ", ".join(map(repr, known))
@@ -80,7 +80,7 @@ def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
 
 
 def warn_of_likely_degrees(name: str, values: float | NDArray[np.float64]) -> None:
-    """Warn of angles (radians) beyond a full turn either way, which somebody may have given in degrees."""
+    """Warn (UnitWarning) if an angle in radians is beyond a full turn either way: somebody may have given degrees."""
     widest = abs(values) if isinstance(values, float) else float(np.abs(values).max(initial=0.0))
     if _FULL_TURN_RAD < widest < math.inf:
         said = f"{name} reaches {widest:.6g} rad, beyond a full turn (6.283 rad): convert degrees with numpy.radians"
@@ -88,18 +88,18 @@ def warn_of_likely_degrees(name: str, values: float | NDArray[np.float64]) -> No
 
 
 def did_you_mean(value: object, known: Iterable[str]) -> str:
-    """Suggest the known name nearest to a misspelt one, to end a message; "" where none is near."""
+    """Return "; did you mean NAME?" with the known name nearest to a misspelt one, or "" if none is near."""
     near = difflib.get_close_matches(value, list(known), n=1) if isinstance(value, str) else []
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def require_flag(name: str, value: object) -> None:
-    """Raise ParameterError unless `value` is True or False; a text such as "no" would count as True."""
+    """Raise ParameterError unless `value` is True or False; a text such as "no" is refused too."""
     require_kind(name, value, (bool, np.bool_), "True or False")
 
 
 def checked_path(name: str, value: object, allowed: str = "the name of a file: a text or a Path") -> Path:
-    """Return a file name as a Path, or raise ParameterError."""
+    """Return the name of a file, a text or Path, as a Path; raise ParameterError for anything else."""
     if isinstance(value, os.PathLike) or (isinstance(value, str) and value):
         named = os.fspath(value)
         if isinstance(named, str):
@@ -108,7 +108,7 @@ def checked_path(name: str, value: object, allowed: str = "the name of a file: a
 
 
 def require_kind(name: str, value: object, kind: type | tuple[type, ...], allowed: str) -> None:
-    """Raise ParameterError unless `value` is an instance of `kind`."""
+    """Raise ParameterError unless `value` is an instance of `kind`; `allowed` says in the message what is."""
     if not isinstance(value, kind):
         method = getattr(value, "__name__", "") if hasattr(value, "__self__") else ""
         call = f"this is the method {method}, call it: {method}(); " if method else ""
@@ -116,7 +116,7 @@ def require_kind(name: str, value: object, kind: type | tuple[type, ...], allowe
 
 
 def require_like(name: str, value: object, attributes: Sequence[str], allowed: str) -> None:
-    """Raise ParameterError unless `value` has these attributes; a class (`Circle` for `Circle()`) is refused too."""
+    """Raise ParameterError unless `value` has these attributes; a class in place of its instance is refused too."""
     if isinstance(value, type):
         raise ParameterError(name, value, f"{allowed}; this is the class, a value of it is {value.__name__}(...)")
     for attribute in attributes:
@@ -131,7 +131,7 @@ def require_callable(name: str, value: object, allowed: str) -> None:
 
 
 def require_accepts_named(name: str, value: object, arguments: Sequence[str], allowed: str) -> None:
-    """Raise ParameterError unless `value` can be called with these arguments, by their names."""
+    """Raise ParameterError unless `value` can be called with keyword arguments of these names."""
     _require_accepts_call(name, value, f"{allowed} {name}({', '.join(arguments)})", (), dict.fromkeys(arguments))
 
 
@@ -143,7 +143,7 @@ def require_accepts_positional(name: str, value: object, n_arguments: int, allow
 def _require_accepts_call(
     name: str, value: object, allowed: str, arguments: tuple[None, ...], named: Mapping[str, None]
 ) -> None:
-    """Raise ParameterError unless `value` can be called so; a function that hides its signature passes."""
+    """Raise ParameterError unless `value` can be called so; a function without a readable signature passes."""
     require_callable(name, value, allowed)
     try:
         inspect.signature(value).bind(*arguments, **named)  # type: ignore[arg-type]
@@ -154,7 +154,7 @@ def _require_accepts_call(
 
 
 def require_progress(value: object, allowed: str = "a function") -> None:
-    """Raise ParameterError unless `value` takes what a `Progress` is called with."""
+    """Raise ParameterError unless `value` can be called as a `Progress`: stage, done, total, note."""
     require_accepts_named("progress", value, ("stage", "done", "total", "note"), allowed)
 
 
@@ -166,7 +166,7 @@ def checked_text(name: str, value: object, allowed: str = "a text") -> str:
 
 
 def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
-    """Return several texts as a tuple; raise ParameterError for a single text, whose letters it would be."""
+    """Return several texts, none empty, as a tuple; raise ParameterError for anything else, also for a single text."""
     if isinstance(value, str) or not isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping):
         raise ParameterError(
             name, value, f"{allowed}, in a list" + (f": [{value!r}]" if isinstance(value, str) else "")
@@ -175,7 +175,7 @@ def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
 
 
 def require_mapping(name: str, value: object, allowed: str) -> None:
-    """Raise ParameterError unless `value` is a dict or the like, with texts for its names."""
+    """Raise ParameterError unless `value` is a dict or the like whose keys are texts, none empty."""
     require_kind(name, value, Mapping, allowed)
     assert isinstance(value, Mapping)
     for each in value:

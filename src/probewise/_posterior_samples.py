@@ -1,4 +1,4 @@
-"""Posterior samples that a model's file keeps, of a sensor as of any system: statistics by parameter, and checks."""
+"""Posterior samples in a model's file, for sensors and other systems alike: statistics by parameter, and checks."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ MIN_SAMPLES = 500
 
 
 class NamedSamples(ShowsItself):
-    """Base of models that hold posterior samples, (n_samples, n_params), whose columns have names."""
+    """Base of models with posterior `samples`, (n_samples, n_params), and `names`, one per column."""
 
     names: tuple[str, ...]
     samples: FloatArray
 
     def mean(self) -> dict[str, float]:
-        """Posterior mean by parameter."""
+        """Return the posterior mean by name of the parameter."""
         return dict(zip(self.names, self.samples.mean(axis=0).tolist(), strict=True))
 
     def sd(self) -> dict[str, float]:
-        """Posterior standard deviation by parameter."""
+        """Return the posterior standard deviation by name of the parameter."""
         return dict(zip(self.names, self.samples.std(axis=0).tolist(), strict=True))
 
     def median(self) -> dict[str, float]:
-        """Posterior median by parameter, robust against single outlying samples."""
+        """Return the posterior median by name of the parameter; single outlying samples hardly change it."""
         return dict(zip(self.names, np.median(self.samples, axis=0).tolist(), strict=True))
 
     def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Central interval of each parameter that holds `mass`."""
+        """Return the central interval (low, high) that holds a share `mass` of the samples, by parameter name."""
         if not 0 < mass < 1:
             raise ParameterError("mass", mass, "greater than 0, less than 1")
         low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
@@ -41,7 +41,7 @@ class NamedSamples(ShowsItself):
 
 
 def interval_table_lines(rows: Sequence[tuple[str, float, tuple[float, float]]]) -> list[str]:
-    """Return the lines of a text table: name, median and 95 % interval of each quantity."""
+    """Return the lines of a text table with a header; `rows` are (name, median, (low, high)), the 95 % interval."""
     width = max(9, *(len(name) for name, _, _ in rows))
     return [
         f"{'parameter':<{width}}  {'median':>11}  95 % interval",
@@ -50,12 +50,12 @@ def interval_table_lines(rows: Sequence[tuple[str, float, tuple[float, float]]])
 
 
 def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return read-only copies of samples (n_samples, n_params) and noise sds (n_samples,).
+    """Return read-only copies of samples (n_samples, n_params) and noise sds (n_samples,); `names` has n_params names.
 
     Raises
     ------
     ShapeError, ParameterError
-        If the shapes do not fit, there are too few samples, a value is not finite, or an sd is not positive.
+        If the shapes do not fit, there are fewer than 500 samples, a value is not finite, or an sd is not positive.
     """
     samples, noise_sd = read_only_floats(samples), read_only_floats(noise_sd)
     if samples.ndim != 2 or samples.shape[1] != len(names):
@@ -72,7 +72,7 @@ def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
 
 
 def require_masks_of_absent_effects(absent: Mapping[str, BoolArray], effects: tuple[str, ...], n_samples: int) -> None:
-    """Raise ParameterError unless `absent` holds truth values, (n_samples,), by names of the model's effects."""
+    """Raise ParameterError unless `absent` maps names in `effects` to boolean arrays of shape (n_samples,)."""
     for name, without in absent.items():
         if name not in effects or without.shape != (n_samples,):
             raise ParameterError("absent", name, f"effects of the model, each with {n_samples} truth values")

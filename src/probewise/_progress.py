@@ -28,16 +28,16 @@ _WITHOUT = "{desc} [{elapsed}]{postfix}"
 
 @contextlib.contextmanager
 def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Iterator[Progress]:
-    """Yield a progress function whose display appears once the work has taken two seconds.
+    """Yield a progress function (a `Progress`) whose display appears once the work has taken two seconds.
 
     Parameters
     ----------
     quiet
         Show nothing.
     beat
-        Update the elapsed time between reports; not while the program prompts at the same terminal.
+        Update the elapsed time between reports; False while the program prompts at the same terminal.
     lines
-        Write lines of text where standard error is neither a terminal nor a notebook.
+        Write lines of text where standard error is neither a terminal nor a notebook; False: nothing there.
     """
     looked_at = sys.stderr.isatty() or "ipykernel" in sys.modules
     if quiet or not (looked_at or lines):
@@ -66,12 +66,12 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
 
 @contextlib.contextmanager
 def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
-    """Yield the caller's progress function, a bar in a terminal or notebook (True), or nothing (False).
+    """Yield the caller's progress function, that of a bar in a terminal or notebook (True), or a silent one (False).
 
     Raises
     ------
     ParameterError
-        If it is none of these.
+        If `progress` is none of these.
     """
     if isinstance(progress, bool):
         with progress_shown(quiet=not progress, lines=False) as shown:
@@ -82,9 +82,9 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
 
 
 def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary | TemperatureSummary], None]:
-    """Return a function that passes the reports of nested sampling and SMC runs to a progress function.
+    """Return a function (run, summary) that reports the state of nested sampling or SMC to a progress function.
 
-    It takes the name of a run, or its number of Gaussians, and the sampler's summary.
+    `run` is its name or its number of Gaussians.
     """
 
     def tell(what: int | str, state: RoundSummary | TemperatureSummary) -> None:
@@ -157,7 +157,7 @@ class _StageBars:
 
 
 class _TextProgress:
-    """Lines of text on standard error: after two seconds, then every five, after 100 seconds at growing intervals."""
+    """A progress function that writes a line after two seconds, then every five (later, every 5 % of the time passed)."""
 
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()
@@ -169,7 +169,7 @@ class _TextProgress:
         self.refresh()
 
     def refresh(self) -> None:
-        """Write a line if it is time for one."""
+        """Write the last report as a line if the wait since the line before is over."""
         now = time.monotonic()
         wait = max(_BETWEEN_LINES_S, _SHARE_OF_ALL * (now - self._began)) if self._said else _PATIENCE_S
         if now - self._last < wait:

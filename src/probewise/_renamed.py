@@ -1,4 +1,4 @@
-"""Arguments under their names of the last release: accepted for one release, with a warning."""
+"""Arguments under the names that they had in the last release: accepted for one release, with a warning."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def renamed_arguments(**new_by_old: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Return a decorator: the function also accepts keyword arguments by their old names, with a warning."""
+    """Return a decorator (old="new", ...): the function accepts old keywords too, with a DeprecationWarning."""
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         @functools.wraps(function)

@@ -1,4 +1,4 @@
-"""Signals that end a program, and a way to defer them during a critical block."""
+"""Signals that end a program, and a way to defer such a signal while a critical block runs."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ SAME_S: Final = 1.0
 
 @contextlib.contextmanager
 def defer_signals() -> Iterator[None]:
-    """Defer signals that end the program until the block ends; another one more than a second later acts at once.
+    """Defer signals that end the program until the block ends; another signal more than a second later acts at once.
 
-    For blocks that must not be interrupted: stopping motors, putting files in place. Outside the main
-    thread, which alone receives signals, it does nothing.
+    For blocks that must not be interrupted: stopping motors, putting files in place. Outside the main thread, the only
+    one that receives signals, it does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -30,7 +30,7 @@ Result = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class CampaignContents:
-    """Contents of a campaign's file: its settings, and the results by key in order of completion."""
+    """Contents of a campaign's file: its settings, and results by task key in the order in which the tasks ended."""
 
     settings: Mapping[str, Any]
     results: Mapping[str, Result]
@@ -49,18 +49,18 @@ def run_campaign(
     progress: Progress = silent,
     noun: str = "tasks",
 ) -> dict[str, Result]:
-    """Run the tasks whose results are not yet in the file.
+    """Run the tasks whose results are not yet in the file; return the results of all.
 
     Parameters
     ----------
     work
-        Function from a task to its result, a JSON object; defined at module level if workers are processes.
+        Function from a task to its result, a dict for JSON; defined at module level if workers are processes.
     tasks
         Tasks by key. Each carries its own seed, so that the order and the worker do not matter.
     path
         The campaign's file; created if missing, continued if present.
     settings
-        Everything that determines the results, a JSON object; a file with other settings is refused.
+        Everything that determines the results, a dict for JSON; a file with other settings is refused.
     executor
         Any `concurrent.futures.Executor`, also of other machines; None runs the tasks here, one by one.
     progress
@@ -133,7 +133,7 @@ def _parsed_line(path: str | os.PathLike[str], number: int, line: bytes) -> dict
 
 
 class _ResultLog:
-    """A campaign's file, open for results: lines are synced to disk one by one; an incomplete last line is cut off."""
+    """A campaign's file, open for results: each added line is synced to disk; an incomplete last line is cut off."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, fresh: bool) -> None:
         if fresh:
@@ -150,7 +150,7 @@ class _ResultLog:
         self._file.close()
 
     def add(self, key: str, result: Result) -> str:
-        """Write one finished task and return its line."""
+        """Write one finished task; return its line of JSON, {"key": ..., "result": ...}."""
         try:
             line = json.dumps({"key": key, "result": result}, allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -165,7 +165,7 @@ class _ResultLog:
 def _results_as_tasks_end(
     work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
 ) -> Iterator[Iterator[tuple[str, Result]]]:
-    """Give an iterator over (key, result) as tasks end; on leaving, cancel the tasks that have not begun."""
+    """Yield an iterator over (key, result), in the order in which tasks end; at exit, cancel tasks not begun."""
     if executor is None:
         yield ((key, work(task)) for key, task in tasks.items())
         return

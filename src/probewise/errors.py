@@ -1,4 +1,4 @@
-"""Errors and warnings of the package; each error also derives from the builtin a caller would expect."""
+"""Errors and warnings of the package; each error also derives from the builtin error that a caller would expect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LONGEST_PART = 400  # characters of each part of a message
 
 
 def shortened(text: str, most: int = _LONGEST_PART) -> str:
-    """Cut a text after `most` characters, say how long it was, and escape control characters."""
+    """Return a text cut after `most` characters, with its full length then, and with control characters escaped."""
     begun = text[:most]
     if not begun.isprintable():
         begun = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in begun)
@@ -33,7 +33,7 @@ def shortened(text: str, most: int = _LONGEST_PART) -> str:
 
 
 def shown(value: object, most: int = _LONGEST_VALUE) -> str:
-    """Return the repr of a value on one line, cut after `most` characters."""
+    """Return the `repr` of a value on one line, cut after `most` characters; never fails for huge values."""
     try:
         text = " ".join(repr(value).split())
     except (ValueError, RecursionError):  # an integer of thousands of digits, or a list nested too deep
@@ -46,7 +46,7 @@ class ProbewiseError(Exception):
 
 
 class ParameterError(ProbewiseError, ValueError):
-    """Report a value outside what is allowed."""
+    """Report an argument outside what is allowed; `name`, `value` and `allowed` are in the message."""
 
     def __init__(self, name: str, value: object, allowed: str) -> None:
         self.name, self.value, self.allowed = name, value, allowed
@@ -62,7 +62,7 @@ class ShapeError(ProbewiseError, ValueError):
 
 
 class FileError(ProbewiseError, ValueError):
-    """Report a file that cannot be used: the file, the place in it, what was found, what is allowed."""
+    """Report a file that cannot be used: `path`, place (`row`, `column`), what was `found`, what is `allowed`."""
 
     def __init__(
         self, path: object, found: str, allowed: str, *, row: int | None = None, column: str | None = None
@@ -85,7 +85,7 @@ class ReachError(ParameterError):
 
 
 class LinkError(ProbewiseError, OSError):
-    """Report an instrument that does not answer."""
+    """Report an instrument, such as a robot, that does not answer."""
 
 
 class NotConvergedError(ProbewiseError, RuntimeError):
@@ -109,7 +109,7 @@ class NotSavedWarning(UserWarning):
 
 
 class PipeWarning(UserWarning):
-    """Warn that reading waits for a pipe, which whoever writes to it ends."""
+    """Warn that reading from a pipe waits until its writer ends."""
 
 
 class UnitWarning(UserWarning):

@@ -1,6 +1,6 @@
 """Prior distributions of named parameters.
 
-Shapes, sensors and effects each carry their own prior, so this module stands below them.
+The packages of shapes, sensors and effects all import this module, so it imports none of them.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ __all__ = [
 
 @runtime_checkable
 class Prior(Protocol):
-    """A distribution of several named parameters, with a map from the unit cube."""
+    """A distribution of several named parameters, with a map from the unit cube and back."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameter names, one per column of theta."""
+        """Names of the parameters, in the order of the columns of theta."""
         ...
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map points of the unit cube, shape (n_samples, n_params), to parameters of the same shape."""
+        """Map points of the unit cube, (n_samples, n_params), to parameters of that shape: uniform draws to draws."""
         ...
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map parameters to a point of the unit cube that maps back to them, same shapes."""
+        """Map parameters (n_samples, n_params) to points of the unit cube that `from_unit_cube` maps back to them."""
         ...
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
@@ -54,7 +54,7 @@ class Prior(Protocol):
 
 
 class Coordinates(Protocol):
-    """Coordinates in which the posterior is simpler than in the parameters or the unit cube.
+    """Coordinates in which a sampler explores the posterior, simpler there than in parameters or unit cube.
 
     A prior with a property `coordinates` of this kind is sampled in them. A quantity that the readings
     determine sharply should be an axis there, not a curved surface across several axes.
@@ -65,23 +65,23 @@ class Coordinates(Protocol):
         ...
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters; also return the prior's log density in the coordinates, (n_samples,).
+        """Map coordinates (n_samples, n_params) to parameters; also return the prior's log density in the coordinates.
 
-        Any finite coordinates are allowed; the density is -inf where they match no parameters.
+        Any finite coordinates are allowed; the density, (n_samples,), is -inf where they match no parameters.
         """
         ...
 
 
 @runtime_checkable
 class Marginal(Protocol):
-    """A distribution of one parameter."""
+    """A distribution of one parameter; its methods take and return arrays of any one shape."""
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape."""
+        """Evaluate the quantile function: probability in 0..1 -> value."""
         ...
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape: the inverse of `from_unit`."""
+        """Evaluate the cumulative distribution function, the inverse of `from_unit`: value -> probability."""
         ...
 
     def log_prob(self, value: FloatArray) -> FloatArray:
@@ -91,7 +91,7 @@ class Marginal(Protocol):
 
 @dataclass(frozen=True)
 class Uniform:
-    """Uniform distribution between two bounds."""
+    """Uniform distribution from `low` to `high`."""
 
     low: float
     high: float
@@ -121,7 +121,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class LogUniform:
-    """Log-uniform distribution between two bounds (Jeffreys' prior of a scale, made proper)."""
+    """Log-uniform distribution from `low` > 0 to `high` (Jeffreys' prior of a scale, made proper)."""
 
     low: float
     high: float
@@ -183,7 +183,7 @@ class Normal:
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Distribution of a positive number whose logarithm is normal, by its median and the sd of the logarithm."""
+    """Log-normal distribution of a positive number, by its `median` and the sd `log_sd` of its natural logarithm."""
 
     median: float
     log_sd: float
@@ -216,7 +216,7 @@ class LogNormal:
 
 @dataclass(frozen=True)
 class Product:
-    """Joint distribution of independent marginals, by name."""
+    """Joint distribution of independent parameters: `marginals`, a mapping of name to the distribution of one."""
 
     marginals: Mapping[str, Marginal]
 
@@ -230,17 +230,17 @@ class Product:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The marginals' names, in order."""
+        """Names of the parameters, in the order of `marginals`."""
         return tuple(self.marginals)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map each coordinate by its own marginal, both (n_samples, n_params)."""
+        """Map each column of the unit cube by its own marginal, (n_samples, n_params) -> same shape."""
         u = checked_columns(u, self.names)
         columns = [m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())]
         return np.stack(columns, axis=-1) if columns else u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map each parameter by its own marginal, both (n_samples, n_params)."""
+        """Map each column of the parameters by its own marginal, (n_samples, n_params) -> same shape."""
         theta = checked_columns(theta, self.names)
         columns = [m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())]
         return np.stack(columns, axis=-1) if columns else theta
@@ -256,7 +256,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Joint:
-    """Joint distribution of independent priors of several parameters each, in order."""
+    """Joint distribution of independent priors `parts`, each of one or more parameters; columns in order of parts."""
 
     parts: tuple[Prior, ...]
 
@@ -269,17 +269,17 @@ class Joint:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parts' names, in order."""
+        """Names of the parameters of all parts, in order."""
         return tuple(name for part in self.parts for name in part.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map each part's coordinates by that part, both (n_samples, n_params)."""
+        """Map the columns of each part by that part, (n_samples, n_params) -> same shape."""
         u = checked_columns(u, self.names)
         columns = [p.from_unit_cube(c) for p, c in self._parts_with_columns(u)]
         return np.concatenate(columns, axis=-1) if columns else u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map each part's parameters by that part, both (n_samples, n_params)."""
+        """Map the columns of each part by that part, (n_samples, n_params) -> same shape."""
         theta = checked_columns(theta, self.names)
         columns = [p.to_unit_cube(c) for p, c in self._parts_with_columns(theta)]
         return np.concatenate(columns, axis=-1) if columns else theta
@@ -293,7 +293,7 @@ class Joint:
         return total
 
     def _parts_with_columns(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
-        """Return each part with its columns, (n_samples, n_params of the part)."""
+        """Return pairs of a part and its columns, (n_samples, n_params of the part)."""
         ends = np.cumsum([len(p.names) for p in self.parts])
         return [(p, columns[:, end - len(p.names) : end]) for p, end in zip(self.parts, ends, strict=True)]
 
@@ -304,24 +304,24 @@ class Empty:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """No names."""
+        """The empty tuple."""
         return ()
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Return the points unchanged: they have no coordinates."""
+        """Return the points, (n_samples, 0), unchanged."""
         return u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Return the points unchanged: they have no coordinates."""
+        """Return the parameters, (n_samples, 0), unchanged."""
         return theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return zero for each sample: the only hypothesis has probability 1."""
+        """Return zero for each sample, (n_samples,): the density of the only point is 1."""
         return np.zeros(len(theta))
 
 
 def require_prior(name: str, prior: object, *more: str) -> None:
-    """Raise ParameterError unless `prior` has `names`, `from_unit_cube` and the methods `more`."""
+    """Raise ParameterError unless `prior` has `names`, `from_unit_cube` and the methods named in `more`."""
     allowed = "a prior of named parameters, such as Product({'x_mm': Uniform(0.0, 1.0)})"
     require_like(name, prior, ("names", "from_unit_cube"), allowed)
     missing = [method for method in more if not hasattr(prior, method)]
@@ -330,7 +330,7 @@ def require_prior(name: str, prior: object, *more: str) -> None:
 
 
 def checked_columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:
-    """Convert parameters to floats; raise ShapeError unless they are (n_samples, n_params)."""
+    """Return parameters as floats; raise ShapeError unless their shape is (n_samples, number of `names`)."""
     array = floats(values, "parameters")
     if array.ndim != 2 or array.shape[1] != len(names):
         raise ShapeError(f"parameters have shape {array.shape}; allowed: (n_samples, {len(names)}) for {names}")

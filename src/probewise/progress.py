@@ -1,4 +1,4 @@
-"""The protocol by which a long computation reports its progress; silent by default."""
+"""The protocol by which a long computation reports its progress."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["Progress", "silent"]
 
 
 class Progress(Protocol):
-    """A function called as a computation proceeds; the command line shows a bar, a notebook may print."""
+    """A function (stage, done, total, note) called as a computation proceeds, e.g. to show a bar or to print."""
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
         """Report the progress of a stage.
@@ -25,4 +25,4 @@ class Progress(Protocol):
 
 
 def silent(stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-    """Ignore the report: a `Progress` that shows nothing."""
+    """Ignore the report: the default `Progress`, which shows nothing."""

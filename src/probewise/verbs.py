@@ -1,6 +1,6 @@
 """The commands of the command line as Python functions, with the same names and defaults.
 
-The packages below offer the same with every option. Heavy imports happen inside the functions, so that
+The package of each offers the same with every option. Heavy imports happen inside the functions, so that
 `import probewise` and `probewise --help` are quick.
 """
 
@@ -74,13 +74,12 @@ def calibrate(
     orders
         Numbers of Gaussians to compare.
     n_live
-        Live points of nested sampling, where a number of Gaussians is searched in full: fewer are faster but make the
-        evidences less precise.
+        Live points of a full nested sampling: fewer are faster, but make the evidences less precise.
     method
-        "quick" (the default): widths evenly probable over orders of magnitude; each number of Gaussians is reached by
-        sequential Monte Carlo, from the peak of its likelihood or from the number below. One search of the whole prior
-        with few live points checks the chosen number; a number in doubt is searched in full.
-        "full": the same priors; every number is searched by nested sampling, and its evidence refined by importance
+        "quick" (the default): log-uniform priors of the widths; each number of Gaussians is fitted by sequential Monte
+        Carlo, from the peak of its likelihood or from the posterior of one Gaussian less. Nested sampling of the whole
+        prior with few live points checks the chosen number; a number in doubt gets nested sampling with `n_live`.
+        "full": the same priors; every number is fitted by nested sampling, and its evidence refined by importance
         sampling. Takes two to ten times as long. "refined" is its former name.
         "paper": uniform priors, and the evidence of nested sampling alone. All have the Student-t likelihood.
     nested_stop
@@ -153,7 +152,7 @@ def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:
     Returns
     -------
     Prediction
-        Predictive mean and sd of a reading for each row, and the log density of each recorded reading.
+        Predictive mean and sd of a reading for each row; log density of each recorded reading, NaN for a plan.
 
     Raises
     ------
@@ -207,7 +206,7 @@ def explore(
     Parameters
     ----------
     sensor
-        A fitted sensor, of `calibrate` or `read_sensor`.
+        A fitted sensor: `sensor` of a result of `calibrate`, or from `read_sensor`.
     shape
         The hypothesis: "circle", "ellipse", "rectangle", "triangle", "hexagon", several of them, or a shape
         of `probewise.scene`.
@@ -220,7 +219,7 @@ def explore(
         `measure(pose)` that returns a number or a dict; see `probewise.arm.as_instrument`. Of a `LegoArm` whose
         geometry was fitted to marks, the arm's own error is part of the sds, and of the stopping rule.
     field
-        Width and height of the field; by default those of the paper.
+        Field of this width and height, `probewise.scene.Field(width_mm, height_mm)`; by default the paper's.
     model
         The robot's sensor model: "ssf" or "naive".
     method
@@ -246,9 +245,9 @@ def explore(
         Prior probability that the sensor model is complete; below 1 the run also infers which effect it leaves out.
         By default 0.9; 1 with the naive model, `learn_sensor`, another utility, several shapes, or the method "paper".
     cards
-        Reference cards of known position and albedo on the field,
-        `probewise.scene.Card(x_mm, y_mm, width_mm, height_mm, albedo)`: they separate a tilt or a scale error from
-        another shape.
+        Rectangles of known position and albedo on the field,
+        `probewise.scene.Card(x_mm, y_mm, width_mm, height_mm, albedo)`: readings over them separate a tilt or a scale
+        error from another shape.
     max_readings
         Stop after so many readings at the latest.
     journal
@@ -376,9 +375,9 @@ def _naive_levels(
     has_arm: bool,
     rng: np.random.Generator,
 ) -> Naive | None:
-    """Return the levels of the paper's naive model, from a recording or the simulated sensor; None if it is not used.
+    """Return the levels of the paper's naive model, from a recording or the simulated sensor; None if not used.
 
-    Raises ParameterError if `levels` is missing with an arm, or given without that model.
+    Raises ParameterError if `levels` is missing with an arm of one's own, or given without that model.
     """
     from probewise import experiment as posing
     from probewise.errors import ParameterError
@@ -402,7 +401,7 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progres
     plan
         The plan, or a recording, of which only the plan is used.
     sensor
-        The calibrated sensor; by default a typical one.
+        The calibrated sensor, by which detectability is computed; by default a typical one.
     progress
         Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 

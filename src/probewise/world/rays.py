@@ -109,6 +109,6 @@ def _seen_white_fraction_of_block(
 
 
 def _sequence_offset_of_pixels(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return each pixel's shift (u, v) of the ray sequence, in pixels, spread evenly along rows and columns."""
+    """Return each pixel's shift (u, v) of the ray sequence, 0 to 1 pixel, spread evenly along rows and columns."""
     golden = 0.6180339887498949
     return np.mod(row * golden + column * _STEP_V, 1.0), np.mod(column * golden + row * _STEP_U, 1.0)

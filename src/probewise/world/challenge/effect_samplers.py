@@ -98,12 +98,12 @@ def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float
 
 
 def make_draw_without_random_parameters(make: OfAmplitude) -> Draw:
-    """Return the `draw` of an `EffectSampler` whose amplitude is its only parameter: nothing is drawn."""
+    """Return `EffectSampler.draw` for an effect whose only parameter is its amplitude: nothing is drawn."""
     return lambda setup, rng: make
 
 
 def make_draw_with_random_sign(make: OfAmplitude) -> Draw:
-    """Return the `draw` of an `EffectSampler` that draws only the sign of the amplitude."""
+    """Return `EffectSampler.draw` for an effect of which only the sign of the amplitude is drawn."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s = draw_sign(rng)

@@ -21,7 +21,7 @@ from probewise.world.challenge.effect_samplers import (
 
 
 def _make_draw_with_random_direction(make: Callable[[float, float], concealed.Concealed]) -> Draw:
-    """Return the `draw` of a vector effect: direction within 60 degrees of +X or -X, length = amplitude."""
+    """Return `EffectSampler.draw` for a vector: direction within 60 degrees of +X or -X, length = amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, angle = draw_sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
@@ -68,7 +68,7 @@ def _draw_scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAm
 
 
 def _make_draw_with_random_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
-    """Return the `draw` of an effect of random sign on a random scan or, as likely, all scans at its orientation."""
+    """Return `EffectSampler.draw` for an effect of random sign on a random scan or all scans at its orientation."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, scan = draw_sign(rng), str(rng.choice(setup.edge_scan_names))

@@ -75,7 +75,10 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
 
 
 def _randomly_displaced_pattern(pattern: Pattern, rng: np.random.Generator) -> Pattern:
-    """Return a boundary (also turned by up to 2 degrees), quadrant or disc (also resized) moved by up to 0.5 mm."""
+    """Return a boundary (also turned by up to 2 degrees), quadrant or disc (also resized) moved by up to 0.5 mm.
+
+    Other patterns are returned unchanged.
+    """
     dx, dy, turn = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), math.radians(rng.uniform(-2, 2))
     match pattern:
         case HalfPlane():

@@ -25,7 +25,7 @@ from probewise.world.concealed import (
 
 @dataclass(frozen=True)
 class CovariateRegion:
-    """The interval `low` to `high` of a covariate in its unit, or `scans` by name."""
+    """The interval `low` to `high` of `covariate`, in its unit; for the covariate "scan", the names `scans` instead."""
 
     covariate: str
     low: float | None = None

@@ -120,7 +120,7 @@ def draw_sensor(ssf: str, noise_level: str, *, rng: np.random.Generator) -> Worl
 def with_noise_model(world: World, model: str, *, duration_s: float) -> World:
     """Return the world with a noise model of NOISE_MODELS added; its `noise_sd` is unchanged.
 
-    It is the sd at the start for "drifting", on black for "signal_dependent", of the core for "outliers".
+    This sd is that at the start for "drifting", on black for "signal_dependent", of the core for "outliers".
     "quantised" readings are rounded to whole units, which the plan should declare.
     """
     if model == "quantised":

@@ -130,7 +130,7 @@ class EffectSizer:
         ).without_declared_range()
 
     def size(self, *concealed: Concealed) -> float:
-        """Return lambda of the effects together: norm after the refit / noise sd; of noise, `noise_effect_size`."""
+        """Return the joint lambda of effects: norm after the refit / noise sd; of one on noise, `noise_effect_size`."""
         if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
             return noise_effect_size(
                 concealed[0], self._clean_view, self.clean_recording.readings, self.setup.world.noise_sd

@@ -11,7 +11,7 @@ CaseKind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ss
 
 @dataclass(frozen=True)
 class Stratum:
-    """A kind of case, the size lambda of each effect (0 for clean), and whether the noise is drawn from OTHER_NOISE."""
+    """A case's kind (`CaseKind`), lambda of each effect (0 for clean), and whether its noise is one of OTHER_NOISE."""
 
     kind: CaseKind
     size: float = 0.0

@@ -100,7 +100,7 @@ class ExtraGaussian:
 
 @dataclass(frozen=True)
 class EdgeShadow:
-    """Shadow along edges of the pattern: the seen fraction falls by `amp` at an edge, less within about `w` mm."""
+    """Shadow along edges of the pattern: the seen fraction falls by `amp` exp(-d^2 / 2 `w`^2), d mm from an edge."""
 
     name: ClassVar[str] = "edge_shadow"
     stage: ClassVar[Stage] = "seen"

@@ -40,7 +40,7 @@ class GainDrift:
 
 @dataclass(frozen=True)
 class BatterySag:
-    """LED brightness that follows the battery: the signal changes by a fraction `per_volt` per volt above `full_v`."""
+    """LED brightness that follows the battery: the signal times 1 + `per_volt` (volts of `battery_mv` - `full_v`)."""
 
     name: ClassVar[str] = "battery_sag"
     stage: ClassVar[Stage] = "gain"

@@ -112,7 +112,7 @@ class ThermalGain:
     phases: tuple[float, ...]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Multiply the signal by 1 + frac w, w of sd 1 over the longest wave."""
+        """Multiply the signal by 1 + frac w, where the sum of waves w has sd 1 over the longest period."""
         order = np.arange(1, len(self.phases) + 1)
         waves = np.cos(2 * math.pi * np.outer(rows.time_s / self.longest_s, order) + np.array(self.phases))
         heights = np.sqrt(1 / order)
@@ -172,7 +172,7 @@ class AfterGlow:
     level: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp exp(-t / tau) for every such rise, where t >= 0 is the time since the rise."""
+        """Add amp exp(-t / tau) for every rise of the reading through `level`, t >= 0 the time since then."""
         bright = values > self.level
         rises = rows.time_s[np.flatnonzero(bright & ~np.concatenate([[True], bright[:-1]]))]
         since = rows.time_s[:, None] - rises

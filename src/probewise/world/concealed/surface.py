@@ -26,7 +26,7 @@ class EdgeMisplacement:
 
 @dataclass(frozen=True)
 class ScanMisplacement:
-    """As `EdgeMisplacement`, by `offset_mm` in the one scan named `scan`."""
+    """A displacement of the pattern by `offset_mm` across its edges (else along X), in the one scan named `scan`."""
 
     name: ClassVar[str] = "scan_misplacement"
     stage: ClassVar[Stage] = "pattern"

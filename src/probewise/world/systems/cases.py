@@ -97,7 +97,7 @@ class DrawnSystem:
         )
 
     def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
-        """Return noise-free readings with these effects at all rows of `table`, (n_points,); may not be finite."""
+        """Return noise-free readings with these effects at all rows of `table`, (n_points,); not finite if diverged."""
         whole = ModelWithForms(self.kind, self.table)
         with np.errstate(all="ignore"):
             at = whole.coordinates_of(self.shared, self.by_run)

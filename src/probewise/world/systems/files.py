@@ -53,7 +53,7 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
 
 
 def truth_json(case: SystemCase) -> dict[str, Any]:
-    """Return the truth of a case as a dict for JSON, the content of truth.json."""
+    """Return a dict for truth.json: effects, their aliases ("rivals"), parameters, noise, noise-free readings."""
     seen = case.drawn.diagnosed_row_numbers
     later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
     pair = len(case.effects) == 2

@@ -37,7 +37,7 @@ class AddedForm:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquaresFit:
-    """A fit: coordinates, readings (n_points,), their derivatives (n_points, n_coordinates), sum of squares / sd^2."""
+    """A fit: coordinates, readings (n_points,), their derivatives (n_points, n_coordinates), chi-square (true sd)."""
 
     coordinates: FloatArray
     readings: FloatArray

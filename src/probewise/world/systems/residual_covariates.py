@@ -14,7 +14,7 @@ _PLAIN = 0.25  # least explained share of the sum of squares
 
 
 def residual_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
-    """Return names that a diagnosis may rank first: the form's covariates, then others that explain as much (to 10 %).
+    """Return names that a diagnosis may rank first: the form's covariates, then others that explain about as much.
 
     Parameters
     ----------

@@ -113,7 +113,7 @@ def rivals_with_nats(
 def _best_by_linearisation(
     true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
 ) -> list[_StartOfFit]:
-    """Return up to six candidates for full fits, at most two starts per form, by the least linearised loss first."""
+    """Return up to six candidates for full fits, smallest linearised loss first, with at most two starts per form."""
     size = float(left @ left)
     out = []
     for form, changes in templates_of(true, forms, fitted, model).items():
@@ -166,7 +166,7 @@ def templates_of(
 
 
 def _split_by_way_of_simulation(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
-    """Divide forms into two lists: those to be simulated each alone, and those that share one integration."""
+    """Return forms to be simulated each alone (friction, bounds, or no law), and forms that share one integration."""
     alone = [f for f in forms if f.sticks or f.stops or true.kind.law is None]
     return alone, [f for f in forms if f not in alone]
 

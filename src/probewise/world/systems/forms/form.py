@@ -49,7 +49,7 @@ class Form:
     name
         `name` or `name:target`.
     side
-        What it changes: inputs, a parameter, the rate of a state, or readings.
+        What it changes: "input", "parameter", "rate" (of a state) or "reading".
     act
         Its function, by side: input (columns, rows, parameters) to columns; parameter (now, parameters) to a term to
         add; rate (states, now, parameters) to a term to add; reading (readings, rows, parameters) to readings.

@@ -69,7 +69,7 @@ def proportional_to_column(true: TrueSystem, column: str) -> Modulation:
 
 
 def step_at_change_point(true: TrueSystem) -> Modulation:
-    """Return a step at a time "at_s", or at a row "at_row" if the table has no time."""
+    """Return the modulation 0, then a after a time "at_s", or after a row "at_row" if the table has no time."""
     at, timed = ("at_s", True) if true.table.time is not None else ("at_row", False)
     moments = np.quantile(np.unique(true.table.t), np.linspace(0.02, 0.98, 40))
 
@@ -143,7 +143,7 @@ def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
 
 
 def settling(true: TrueSystem) -> Modulation:
-    """Return an exponential decay that starts with each run."""
+    """Return the modulation a exp(-t / tau_s), t the time since the start of the run."""
     longest = float(true.table.time_since_start.max())
     taus = np.geomspace(true.table.median_gap, longest, 12)
     return Modulation(

@@ -19,7 +19,7 @@ _N_WAVES = 240
 
 
 def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
-    """Yield every form of the reading."""
+    """Yield every form on the reading that this system can have."""
     yield from _modulated_forms(true)
     yield from _hysteresis_bend_and_saturation_forms(true)
     yield from _lag_and_delay_forms(true)
@@ -69,7 +69,7 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
 
 
 def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
-    """Return the sign of each reading's last change in its run (before any, of the first), (n_samples, n_points)."""
+    """Return the sign of the change from the row before in a run; 0 keeps the last sign, the first row has the next."""
     out = np.zeros_like(y)
     for own in rows.rows_by_run:
         for i in range(len(y)):

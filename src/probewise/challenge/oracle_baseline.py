@@ -71,9 +71,9 @@ def _rate_against_closest_rival(hidden: Hidden, right: Set[str]) -> float:
 
 
 def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
-    """Return the distance d (module) of every rival in noise sds, by name; {} for a noise effect.
+    """Return the distance of each rival in noise sds, by name; {} for a noise effect.
 
-    Rivals of a system's effect have a loss in nats, d^2 / 2; those of the light sensor a cosine.
+    It is lambda sqrt(1 - rho^2), or sqrt(2 nats) where the case holds the rival's loss of log likelihood (systems).
     """
     if "rival_nats" in hidden:
         return {name: float(np.sqrt(2 * nats)) for name, nats in hidden["rival_nats"].items()}

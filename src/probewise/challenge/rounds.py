@@ -21,7 +21,7 @@ _BOOTSTRAPS = 2000
 
 
 def score_rounds(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
-    """Return rows for results of `RunCaseInRounds`: each target after the last round and, below it, after the first."""
+    """Return rows for `RunCaseInRounds` results: each target after the last round and the first, then costs."""
     last = [r for r in results if "failed" not in r]
     first = [r | r["rounds"][0] for r in last]
     return (

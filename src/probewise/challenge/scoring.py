@@ -83,7 +83,7 @@ def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) ->
 
 
 def is_distinguishable_from_ssf(result: Result) -> bool:
-    """Return whether some concealed effect cannot be imitated by one more Gaussian in the SSF."""
+    """Return whether any concealed effect cannot be imitated by one more Gaussian in the SSF; False if clean."""
     return any(not right & NO_PHYSICS for right in right_names_of_each_effect(result, merged=True))
 
 
@@ -98,7 +98,7 @@ def acts_on_mean(result: Result) -> bool:
 
 
 def leading_hypothesis(result: Result, *, clean: bool) -> tuple[Names, float]:
-    """Return names and probability of the most probable hypothesis; `clean`: whether the clean one, (), may be it."""
+    """Return (names, probability) of the most probable hypothesis; the clean one, (), counts only if `clean`."""
     options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
     return max(options, key=lambda option: option[1], default=((), 0.0))
 
@@ -122,7 +122,7 @@ def is_leading_name_right(result: Result) -> bool:
 
 
 def leading_probability_and_correctness(result: Result) -> tuple[float, bool]:
-    """Return the probability of the leading hypothesis, which may be clean, and whether it is the truth (no alias)."""
+    """Return the leading hypothesis's probability and whether it is right; an alias is, outside the vocabulary only."""
     names, probability = leading_hypothesis(result, clean=True)
     return probability, names_match(names, right_names_of_each_effect(result, merged=False))
 

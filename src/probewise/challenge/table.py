@@ -91,7 +91,7 @@ def score(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
 
 
 def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
-    """Return by name the shares of cases detected at alpha .01, and named first, of single effects of this size."""
+    """Return by name of single effects of this size: (share detected at alpha .01, share with the right name first)."""
     singles = cases_with_one_effect([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}

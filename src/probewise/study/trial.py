@@ -67,7 +67,7 @@ class Trial:
 
 @lru_cache(maxsize=16)
 def experiment_of(row: SearchConfiguration) -> Experiment:
-    """Build the experiment of a row, cached per process with its tables."""
+    """Build the experiment of a row; cached per process."""
     scene = HypothesisScene(POPULATIONS[row.population].shape)
     common: dict[str, Any] = {
         "noise_sd": row.noise_sd,

@@ -44,7 +44,7 @@ def checked_finite_number(name: str, value: object, allowed: str = "a finite num
 
 
 def checked_whole(name: str, value: object, *, least: int | None = 1) -> int:
-    """Return a whole number as an int; raise ParameterError for anything else or, unless `least` is None, less."""
+    """Return a whole number, `least` or more (None: any), as an int; raise ParameterError for anything else."""
     if isinstance(value, Integral) and not isinstance(value, bool) and (least is None or int(value) >= least):
         return int(value)
     raise ParameterError(name, value, "a whole number" + ("" if least is None else f", {least} or more"))
@@ -108,7 +108,7 @@ def checked_path(name: str, value: object, allowed: str = "the name of a file: a
 
 
 def require_kind(name: str, value: object, kind: type | tuple[type, ...], allowed: str) -> None:
-    """Raise ParameterError unless `value` is an instance of `kind`; `allowed` says in the message what is."""
+    """Raise ParameterError, which says what is `allowed`, unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         method = getattr(value, "__name__", "") if hasattr(value, "__self__") else ""
         call = f"this is the method {method}, call it: {method}(); " if method else ""

@@ -157,7 +157,7 @@ class _StageBars:
 
 
 class _TextProgress:
-    """A progress function that writes a line after two seconds, then every five (later, every 5 % of the time passed)."""
+    """A progress function that writes a line after two seconds, then every five, later every 5 % of the time passed."""
 
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()

@@ -153,7 +153,7 @@ class LogUniform:
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal distribution with this mean and sd."""
+    """Normal distribution with `mean` and standard deviation `sd`."""
 
     mean: float
     sd: float

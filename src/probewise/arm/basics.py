@@ -1,4 +1,4 @@
-"""Types that arm and brick share: a clock, and the side from which a joint arrives."""
+"""Types that arm and brick share: a clock, and the direction from which a motor arrives at a count."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Side: TypeAlias = Literal[-1, 1]
 
 
 class Clock(Protocol):
-    """A clock with `sleep`; the module `time` is one."""
+    """A clock that can wait; Python's module `time` is one."""
 
     def monotonic(self) -> float:
         """Return seconds since an arbitrary time."""

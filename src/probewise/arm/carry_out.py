@@ -24,14 +24,14 @@ BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
 
 
 class RequestToPerson(str):
-    """A request to the person at the bench, as a sentence; a simulated bench uses its attributes.
+    """A request to the person at the bench: a sentence for the person, and attributes for a simulated bench.
 
     Attributes
     ----------
     pattern
-        Name of the pattern to be laid under the arm, or None.
+        Name of the pattern to be laid under the arm; None: unchanged.
     turned_rad
-        Angle to which the sensor is to be turned on its mount; None: unchanged.
+        Angle to which the sensor is to be turned on its mount, anticlockwise from its usual one; None: unchanged.
     """
 
     __slots__ = ("pattern", "turned_rad")
@@ -54,12 +54,12 @@ def carry_out(
     ask: Callable[[RequestToPerson], None],
     first: int = 0,
 ) -> Iterator[Reading]:
-    """Take a plan's readings, in order.
+    """Take a plan's readings, in order; a person changes the pattern and turns the sensor on its mount.
 
-    The LEGO arm's orientation follows from its pose; the person turns the sensor on its mount by right angles to come
-    as close to the planned orientation as possible. With a user's own instrument that does not turn its sensor, the
-    person turns it to the planned orientation. The reading holds the true orientation. Where the sensor was left turned
-    by an earlier plan, or may have been by the first rows of this one, the person is asked to turn it.
+    The LEGO arm's sensor turns with the base; the person turns the sensor by the right angles that come nearest to the
+    planned orientation. With a user's own instrument that cannot turn its sensor, the person turns the sensor to the
+    planned orientation. The person is asked whenever the angle on the mount changes, and before row `first` if an
+    earlier plan, or earlier rows of this one, turned the sensor.
 
     Parameters
     ----------
@@ -76,15 +76,15 @@ def carry_out(
 
     Yields
     ------
-    A reading for each row, in the plan's frame, at the true place if the arm measures it (a motor stops within a count
-    of its goal, and its counter says where), otherwise at the planned place.
+    A reading for each row, in the plan's frame, at the place and orientation that the arm measured; at the planned ones
+    if the arm does not measure them.
 
     Raises
     ------
     ReachError
-        If the arm cannot take some row; nothing moves.
+        If a row is out of the arm's reach; nothing moves.
     ParameterError
-        If the plan needs what this arm lacks: another height, the LED off.
+        If the plan needs the LED off, or a height at which this arm does not read.
     """
     arm = as_instrument(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
@@ -139,7 +139,7 @@ def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], f
 def _place_in_plan_frame_mm(
     reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return x and y of a reading in the plan's frame: exactly the planned ones if taken there, else to a micron."""
+    """Return x and y of a reading in the plan's frame: the planned ones if it was taken there, else to a micron."""
     x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
     if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
         return x_mm, y_mm
@@ -147,7 +147,7 @@ def _place_in_plan_frame_mm(
 
 
 class _LegoRowMeasurer:
-    """Measurer of a plan's rows with the LEGO arm: its base turns the sensor; a person turns it by right angles."""
+    """Helper of `carry_out` for the LEGO arm: the base turns the sensor, and a person adds turns by right angles."""
 
     from_where = "anticlockwise seen from above, from where the geometry has it"
 
@@ -156,19 +156,19 @@ class _LegoRowMeasurer:
         arm.turned_rad = 0.0
 
     def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
-        """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
+        """Return the angle to which a person turns the sensor for each row, (n_points,): 0 to 3 right angles."""
         off = plan.orientation_rad - self._arm.orientation_rad(places_mm)
         return np.asarray(np.rint(off / QUARTER_RAD) % 4 * QUARTER_RAD)
 
     def measure_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Move to the place of a row, measure, and return the reading, with its place in the lab frame."""
+        """Measure at a row's place with the sensor turned by hand; place and reading are in the lab frame."""
         self._arm.turned_rad = turned_rad
         standing = self._arm.orientation_rad(np.array([[x_mm, y_mm]]))
         return self._arm.measure(Pose(x_mm, y_mm, float(standing[0])))
 
 
 class _OwnRowMeasurer:
-    """Measurer of a plan's rows with a user's own instrument or the simulated arm, which may turn the sensor itself."""
+    """Helper of `carry_out` for a user's own instrument, which may turn the sensor itself, or the simulated arm."""
 
     from_where = "anticlockwise seen from above, from how it stands by itself"
 
@@ -177,34 +177,31 @@ class _OwnRowMeasurer:
         self._turns, self._lifts = _can_turn_sensor(arm), _can_lift_sensor(arm)
 
     def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
-        """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
+        """Return the angle to which a person turns the sensor for each row, (n_points,): 0 if the instrument does."""
         if self._turns:
             return np.zeros(len(plan))
         off = (plan.orientation_rad - self._arm.orientation_rad(places_mm)) % math.tau
         return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
 
     def measure_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Move to the place of a row, measure, and return the reading, with its place in the lab frame."""
+        """Measure at a row's place, orientation and, if possible, height; place and reading are in the lab frame."""
         height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._lifts else math.nan
         up_mm = None if math.isnan(height_mm) else float(height_mm)
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
 
 def _can_turn_sensor(arm: OwnInstrument | SimulatedArm) -> bool:
-    """Return whether an arm can turn its sensor."""
     return isinstance(arm, SimulatedArm) or arm.can_turn
 
 
 def _can_lift_sensor(arm: OwnInstrument | SimulatedArm) -> bool:
-    """Return whether an arm can read at a requested height."""
     return isinstance(arm, SimulatedArm) or arm.can_lift
 
 
 def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
-    """Build a recording of the plan's first rows with true places, orientations, times, battery voltage and heights.
+    """Build a recording of the plan's first rows, with the readings' own places, orientations, times and covariates.
 
-    A covariate that a reading lacks is the planned one, or NaN if none is planned. The sessions of a plan that was read
-    from joined recordings are left out.
+    A covariate that a reading lacks is the planned one, or NaN if none is planned. `Plan.sessions` is left out.
 
     Parameters
     ----------

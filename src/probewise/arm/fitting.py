@@ -1,7 +1,7 @@
-"""Calibration of an arm's geometry from marks to which its sensor was brought: home angles, links, base.
+"""Calibration of an arm's geometry (home angles, links, base) from marks to which its sensor was brought.
 
-Each mark gives the sensor's place and, if touched, its height, with the angles of the joints from home. The current
-geometry file counts as a measurement by ruler and eye (`RULER_SDS`); the fit is by least squares.
+Each mark gives the angles of the joints from home, the sensor's place and, if the sensor touched the surface, its
+height. The prior is the current geometry with the sds of a ruler and the eye, `RULER_SDS`; the fit is by least squares.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class FittedGeometry:
     geometry
         The geometry, with its accuracy.
     before, values, sds
-        Parameters before and after the fit, and their sds, (9,) in the order of `FITTED`.
+        Parameters before and after the fit, and their sds, (9,) in the order of `FITTED`; radians, mm.
     residuals_mm
         Mark minus fitted place and height, (n_marks, 3); NaN without a height.
     p_value
-        Probability that marks of the stated accuracy fit worse.
+        Probability that marks of the accuracy `touch_mm` fit worse.
     """
 
     geometry: Geometry
@@ -91,7 +91,7 @@ def fit_geometry(
     turned_rad
         Angle of each joint from home at each mark, (n_marks, 3): base, shoulder, elbow.
     marks_mm
-        Place of the sensor's face at each mark, (n_marks, 3): lab frame, and height; NaN: no height.
+        Place of the sensor's face at each mark, (n_marks, 3): x, y (lab frame) and height; NaN: height not measured.
     touch_mm
         Sd of a mark's place and height, from positioning by eye and from the motors.
 
@@ -100,9 +100,9 @@ def fit_geometry(
     ShapeError
         If there is not one row of three numbers per mark.
     ParameterError
-        If the marks are too few, or their places do not determine the geometry.
+        If there are fewer than five marks, they do not determine the geometry, or `touch_mm` is not above 0.
     MarksDisagreeError
-        If no geometry explains them.
+        If the best fit has a p-value below 0.001.
     """
     turned, marks = floats(turned_rad, "turned_rad"), floats(marks_mm, "marks_mm")
     if turned.ndim != 2 or turned.shape[1] != 3 or marks.shape != turned.shape:
@@ -137,7 +137,7 @@ def fit_geometry(
 def _least_squares_fit(
     geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Return the most probable parameters, chi-square there, and the Jacobian of the residuals, (n_residuals, 9)."""
+    """Return the most probable parameters, and chi-square and Jacobian, (n_residuals, 9), of marks and prior there."""
     known = np.isfinite(marks)
 
     def scaled_residuals(scaled: FloatArray) -> FloatArray:
@@ -156,7 +156,7 @@ def _disagreement_message(
     touch_mm: float,
     residuals: FloatArray,
 ) -> str:
-    """Build the error message; name the mark, if any, without which the others agree."""
+    """Build the error's message, with the mark, if any, without which the other marks agree."""
     rms = np.sqrt(np.nanmean(residuals**2))
     off = f"the marks disagree: {rms:.1f} mm root mean square, where each is good to {touch_mm:g} mm"
     for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
@@ -172,7 +172,7 @@ def _disagreement_message(
 
 
 def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accuracy:
-    """Propagate the parameters' covariance, (9, 9), to sds of place, height and scale over the field."""
+    """Return sds of place, height and scale over the field, from the covariance, (9, 9), of the fitted parameters."""
     places = geometry.reachable_grid_mm
     if not len(places):
         raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
@@ -191,7 +191,7 @@ def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -
 
 
 def _geometry_with_values(geometry: Geometry, values: Sequence[float] | FloatArray) -> Geometry:
-    """Return the geometry with fitted values; limits and stops are counted by the motors, so they shift with home."""
+    """Return the geometry with values of `FITTED`; limits and stops, counted from home, shift with the home angles."""
     joints = []
     for joint, home in zip(geometry.joints, values[:3], strict=True):
         by = float(home) - joint.home_rad

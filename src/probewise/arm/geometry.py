@@ -1,9 +1,8 @@
 """The arm's geometry: forward and inverse kinematics, and the limits of the joints.
 
-A base turns about a vertical axis; an upper and a lower link move in the vertical plane that
-turns with it. Parallelograms carry the sensor's attitude from the base to the wrist, so that it
-looks straight down whatever the links do (paper: the trapezoidal linkage keeps it at nadir), and
-turns about the vertical with the base alone.
+A base turns about a vertical axis; an upper and a lower link move in a vertical plane that turns with the base.
+Parallelograms keep the sensor looking straight down whatever the links do (paper: the trapezoidal linkage keeps it at
+nadir); about the vertical, the sensor turns with the base alone.
 """
 
 from __future__ import annotations
@@ -97,21 +96,21 @@ class Joint:
         Raises
         ------
         ParameterError
-            If it has no stop.
+            If the joint has no stop.
         """
         if self.stop_rad is None or self.stop_side is None:
             raise ParameterError("stop_deg", None, "an angle: without one the joint has no stop to be found")
         return self.counts_at(self.stop_rad, self.stop_side)
 
     def counts_at(self, angle_rad: float, side: int = 0) -> int:
-        """Return the motor count that puts the joint at an angle, approached upwards (1) or downwards (-1).
+        """Return the motor count that puts the joint at an angle, approached with the angle rising (1) or falling (-1).
 
-        The joint lags behind by half the play; with side 0 it is in the middle of the play, as at home.
+        The joint lags behind its motor by half the play; with side 0 it is in the middle of the play, as at home.
         """
         return round((angle_rad + side * self.play_rad / 2 - self.home_rad) * self.counts_per_rad)
 
     def angle_at(self, counts: float, side: int = 0) -> float:
-        """Return the joint angle (radians) at a motor count; see `counts_at`."""
+        """Return the joint angle, in radians, at a motor count reached from `side`: the inverse of `counts_at`."""
         return self.home_rad + counts / self.counts_per_rad - side * self.play_rad / 2
 
 
@@ -134,12 +133,11 @@ class Accuracy:
     place_sd_mm
         Sd of the sensor's place along x and y, root mean square over the field.
     height_sd_mm
-        Largest sd of its height on the field.
+        Largest sd of the sensor's height over the field.
     scale_sd
-        Sd of the ratio of lengths on the field to lengths as the arm measures them.
+        Sd of the ratio of true lengths on the field to lengths as the arm measures them.
     covariance
-        Covariance of the errors of the nine fitted parameters (`arm.uncertainty.FITTED`), nine rows of nine; radians,
-        mm.
+        Covariance of the errors of the nine fitted parameters (`arm.uncertainty.FITTED`): nine rows; radians, mm.
     """
 
     marks: int
@@ -174,11 +172,11 @@ class Geometry:
     field_mm
         Width and height of the field, whose lower left corner is the lab frame's origin.
     axis_mm
-        Place of the base's vertical axis.
+        Place (x, y) of the base's vertical axis.
     shoulder_mm
-        Distance from that axis forward to the shoulder's axis, and height of the latter above the surface.
+        Distance forward from the base's axis to the shoulder's axis, and the shoulder's height above the surface.
     links_mm
-        Shoulder to elbow, elbow to wrist.
+        Lengths of the upper link, shoulder to elbow, and of the lower link, elbow to wrist.
     elbow_is_relative
         Whether the elbow's angle is measured from the direction of the upper link; otherwise, from the horizontal.
     sensor_port
@@ -196,8 +194,8 @@ class Geometry:
     accuracy
         Accuracy of a geometry fitted to marks; None: not fitted.
     light_per_mm
-        Relative decrease of a reading over white per mm of height, as `arm heights` measures it; None: light falls
-        with the square of the height.
+        Relative decrease of a reading over white per mm of height, measured by the command `arm heights`; None: light
+        falls with the square of the height.
     """
 
     field_mm: tuple[float, float]
@@ -265,7 +263,7 @@ class Geometry:
 
     @property
     def rest_mm(self) -> tuple[float, float]:
-        """Place of the sensor when all joints are at home."""
+        """Place (x, y) of the sensor when all joints are at home."""
         home = np.array([[joint.home_rad for joint in self.joints]])
         x_mm, y_mm, _ = self.position_mm(home)[0]
         return float(x_mm), float(y_mm)
@@ -286,7 +284,7 @@ class Geometry:
 
     @property
     def reachable_grid_mm(self) -> FloatArray:
-        """Places of a grid over the field at which the sensor can read, (n, 2); the grid has 12 by 12."""
+        """Places, (n, 2), of a 12 by 12 grid over the field at which the sensor can read."""
         sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
         places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
         return places[self.contains(places)]
@@ -294,7 +292,7 @@ class Geometry:
     places_over_field_mm = reachable_grid_mm  # its old name
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
-        """Compute place and height of the sensor's face in the lab frame from joint angles, both (n, 3)."""
+        """Compute x, y and height of the sensor's face, (n, 3), lab frame, from joint angles, (n, 3)."""
         return forward_kinematics_mm(
             angles_rad,
             self.links_mm,
@@ -305,7 +303,7 @@ class Geometry:
         )
 
     def height_slopes_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
-        """Return the derivative of the sensor's height with each joint angle: (n, 3) to (n, 3), mm per radian."""
+        """Return the derivative of the sensor's height by each joint angle, (n, 3), at joint angles, (n, 3)."""
         _, shoulder, elbow = np.moveaxis(_checked_rows(angles_rad, 3), -1, 0)
         lower = shoulder + elbow if self.elbow_is_relative else elbow
         upper_rise, lower_rise = self.links_mm[0] * np.cos(shoulder), self.links_mm[1] * np.cos(lower)
@@ -344,7 +342,7 @@ class Geometry:
         return angles
 
     def contains(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, (n, 2), are on the field and in reach with room for the motors to approach, (n,)."""
+        """Return which places, (n, 2), are on the field and in reach with room for the motors to overshoot: (n,)."""
         places = _checked_rows(places_mm, 2)
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
         return np.asarray(on_field & self._room_to_approach_mask(places))
@@ -353,7 +351,7 @@ class Geometry:
     """The old name of `contains`."""
 
     def are_within_joint_limits(self, angles_rad: FloatArray) -> BoolArray:
-        """Return which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""
+        """Return which rows of joint angles, (n, 3), are within all joints' limits, shape (n,); NaN is outside."""
         angles = _checked_rows(angles_rad, 3)
         low = np.array([joint.low_rad for joint in self.joints])
         high = np.array([joint.high_rad for joint in self.joints])
@@ -378,14 +376,14 @@ class Geometry:
         )
 
     def _room_to_approach_mask(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, (n, 2), leave the motors room to approach, at reading and at travel height, (n,)."""
+        """Return which places, (n, 2), leave each motor `ROOM_COUNTS` both ways, at reading and travel height: (n,)."""
         room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
         read, travel = (self.angles_rad(places_mm, height) for height in (self.read_height_mm, self.travel_height_mm))
         roomy = [self.are_within_joint_limits(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
         return np.asarray(np.all(roomy, axis=0))
 
     def _radii_with_room_mm(self) -> tuple[float, float]:
-        """Return the least and greatest distance from the axis, in whole mm, with room for the motors; NaN: no room."""
+        """Return least and greatest distance in reach, in whole mm, with the base in mid-range; NaN: none."""
         middle = (self.base.low_rad + self.base.high_rad) / 2
         away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
@@ -402,7 +400,7 @@ def forward_kinematics_mm(
     *,
     elbow_is_relative: bool,
 ) -> FloatArray:
-    """Compute place and height of the sensor in the lab frame from joint angles, both (n, 3), for given lengths."""
+    """Compute x, y and height of the sensor's face, (n, 3), from joint angles, (n, 3), and lengths as in `Geometry`."""
     base, shoulder, elbow = np.moveaxis(_checked_rows(angles_rad, 3), -1, 0)
     lower = shoulder + elbow if elbow_is_relative else elbow
     away = shoulder_mm[0] + links_mm[0] * np.cos(shoulder) + links_mm[1] * np.cos(lower) + sensor_mm[0]

@@ -28,12 +28,12 @@ def shipped_geometry_path() -> Path:
 
 
 def read_geometry(path: str | Path) -> Geometry:
-    """Read an arm's geometry, format "arm/1".
+    """Read an arm's geometry from a TOML file of format "arm/1".
 
     Raises
     ------
     FileError
-        If the file is missing or not TOML, a number is missing or not allowed, or a name is unknown; the message gives
+        If the file is missing or not TOML, an entry is missing or not allowed, or a name is unknown; the message gives
         file, entry, content and what is allowed.
     """
     path = checked_path("path", path)
@@ -90,7 +90,8 @@ def read_geometry(path: str | Path) -> Geometry:
 def text_with_fitted_values(text: str, geometry: Geometry) -> str:
     """Return the text of a geometry file with the fitted values and their accuracy replaced.
 
-    Limits and stops of the joints, which shift with their home angles, are replaced too; a missing entry is not added.
+    Limits and stops of the joints, which shift with their home angles, are replaced too. The table [accuracy] is added
+    if missing; no other entry is.
 
     Parameters
     ----------
@@ -140,7 +141,7 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
 
 
 class _TomlTable:
-    """One table of the file; entries are ticked off as they are read, and none may be left."""
+    """One table of the file; `require_all_taken` raises FileError if an entry, being unknown, was never taken."""
 
     def __init__(self, path: Path, where: str, content: dict[str, Any]) -> None:
         self.path, self.where, self.content = path, where, content

@@ -1,8 +1,7 @@
 """A check of the sensor's height by its light: over white, a lower sensor reads more.
 
 The decrease of the reading with height is measured at one place. A reading elsewhere over the same white then gives the
-sensor's height there, to be compared with that by the motors' counters. An inverse-square law is only a first
-approximation: it does not hold for the room's light, nor for the LED's near the surface, which the sensor shades.
+sensor's height there, to be compared with the height by the motors' counters.
 """
 
 from __future__ import annotations
@@ -42,10 +41,10 @@ class HeightCheck:
     per_mm
         Relative decrease of a reading per mm, at the lowest of the heights at the first place.
     off_mm, sd_mm
-        Height by the light minus that by the motors' counters at each other place, relative to the first, and its sd,
-        (n_places,).
+        Height by the light, relative to the first place, minus height by the motors' counters, at each other place, and
+        its sd, (n_places,).
     p_value
-        Probability of readings at least this odd if the counters are right.
+        Chi-square p-value of `off_mm`: probability of larger ones if the counters are right.
     """
 
     per_mm: float
@@ -55,7 +54,7 @@ class HeightCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether the heights by the light agree with those by the motors' counters."""
+        """Whether the heights by the light agree with those by the motors' counters: a p-value of 0.001 or more."""
         return self.p_value >= _LEAST_P
 
 
@@ -72,7 +71,8 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     Raises
     ------
     ParameterError
-        If there are too few heights or places, or the readings at the first place do not fall with the height.
+        If there are fewer than three heights, no other place, a standard error that is not above 0, or readings at the
+        first place that do not fall with the height by five sds or more.
     """
     n_heights = len({look.height_mm for look in curve})
     if n_heights < LEAST_HEIGHTS:
@@ -89,7 +89,8 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     fall, noise = value[low] - value[high], float(np.hypot(error[low], error[high]))
     if fall < _TELLS * noise or min(look.value for look in (*curve, *others)) <= 0:
         raise _uninformative_readings_error(curve[low], curve[high], noise)
-    # The logarithm by that of the height: light that falls with its square is a straight line, other light bends it.
+    # The logarithm by that of the height: light that falls with its square is a straight line, other light bends it
+    # (the room's, and the LED's near the surface, which the sensor shades).
     lowest_mm, y = float(height.min()), np.log(value)
 
     def fit_curve(error: FloatArray) -> tuple[FloatArray, FloatArray]:

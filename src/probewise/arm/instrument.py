@@ -13,7 +13,7 @@ from probewise._kinds import checked_number, require_kind, warn_of_likely_degree
 
 @dataclass(frozen=True)
 class Pose:
-    """A pose of the sensor in the lab frame; `height_mm` above the surface, None: the arm's default."""
+    """A pose of the sensor in the lab frame; `height_mm` is above the surface, None: the arm's default."""
 
     x_mm: float
     y_mm: float
@@ -30,7 +30,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Reading:
-    """A sensor reading with time and pose: the commanded pose, or the true one if the arm measures it."""
+    """A sensor reading with time, covariates by name, and pose: as measured by the arm, else as commanded."""
 
     value: float
     pose: Pose
@@ -46,7 +46,7 @@ class Reading:
 
 
 def require_pose(pose: object, more: str = "") -> None:
-    """Raise ParameterError unless `pose` is a Pose; a pair of numbers is the usual mistake."""
+    """Raise ParameterError unless `pose` is a Pose; `more` is added to the message."""
     require_kind("pose", pose, Pose, f"a Pose: Pose(x_mm, y_mm){', ' if more else ''}{more}")
 
 
@@ -64,9 +64,9 @@ class Instrument(Protocol):
         ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at places, (n_places, 2), to which a design's is added: shape (n_places,).
+        """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,).
 
-        For an arm whose sensor turns with its base, this is the only possible orientation.
+        For an arm that turns its sensor only with its base, this is the only possible orientation.
         """
         ...
 

@@ -34,7 +34,7 @@ COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.6
 
 @dataclass(frozen=True)
 class JointTarget:
-    """Target of a joint: the count of its motor, and the direction of approach (1 upwards)."""
+    """Target of a joint: the count of its motor, and the approach (1: with the joint's angle rising, -1: falling)."""
 
     counts: int
     side: Side
@@ -43,7 +43,7 @@ class JointTarget:
 def percent_to_lego_units(percent: float, geometry: Geometry) -> float:
     """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, 1 to 100, as in recordings.
 
-    They are whole numbers where the geometry has `whole_percent`; NaN stays NaN.
+    With `geometry.whole_percent`, fractions are dropped; NaN stays NaN.
     """
     if geometry.whole_percent and math.isfinite(percent):
         percent = math.floor(percent)  # the brick truncates fractions
@@ -69,10 +69,10 @@ class LegoArm:
     turned_rad
         Angle by which the sensor has been turned by hand on its mount, relative to the geometry.
     mounted_rad
-        Angle to which a person was last asked to turn it, see `carry_out`; NaN: not known.
+        Angle to which a person was last asked to turn the sensor on its mount, see `carry_out`; NaN: not known.
     first_down
-        Function called before each step of the first lowering with the height that the sensor should have; it returns
-        when a person has confirmed it. None: the arm lowers in one move.
+        Function that the arm calls with the height, in mm, after each step of its first lowering; it returns when a
+        person has confirmed that height. None: the first lowering is one move, like all later ones.
     """
 
     def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
@@ -108,11 +108,11 @@ class LegoArm:
 
     @property
     def position_mm(self) -> FloatArray:
-        """Place of the sensor's face in the lab frame, and its height, shape (3,)."""
+        """Place and height (x, y, height) of the sensor's face by the motors' counters, lab frame, shape (3,)."""
         return np.asarray(self.geometry.position_mm(self.angles_rad[None, :])[0])
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at each place, (n_places, 2): shape (n_places,)."""
+        """Return the sensor's orientation at places, (n_places, 2), its turn by hand included: shape (n_places,)."""
         return wrapped_to_pi(self.geometry.orientation_rad(places_mm) + self.turned_rad)
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
@@ -137,9 +137,10 @@ class LegoArm:
         Raises
         ------
         ReachError
-            If the arm cannot reach the pose (nothing moves), or the sensor cannot rise from where it is.
+            If the arm cannot reach the place, or has another orientation or height there (nothing moves); or if the
+            sensor cannot rise from where it is.
         LinkError
-            If the brick does not answer, or a motor does not move; not after the reading, while the sensor rises.
+            If the brick does not answer, or a motor does not move, before the reading is taken.
         """
         place = np.array([[pose.x_mm, pose.y_mm]])
         require_within_reach(self.geometry, place, "pose")
@@ -182,7 +183,7 @@ class LegoArm:
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
         """Move the sensor over a place and lower it, by default to reading height.
 
-        With `first_down`, the first lowering to reading height is in steps, each confirmed by it.
+        If `first_down` is set, the first lowering to reading height is in steps, and `first_down` is called after each.
 
         Raises
         ------
@@ -228,7 +229,7 @@ class LegoArm:
     rise = raise_sensor  # its old name
 
     def home(self) -> None:
-        """Move all joints home (counter 0); joints with a stop find it first to set their counters.
+        """Move all joints home (counter 0); joints with a stop first turn to the stop, which sets their counters.
 
         The links find their stops before the base, so that the sensor is up when the base turns.
 
@@ -258,7 +259,7 @@ class LegoArm:
             self._machine.reset(stopped)
 
     def set_home(self) -> None:
-        """Define the current position, set by hand, as home."""
+        """Define the current position, set by hand, as home: set all counters to 0."""
         self._machine.reset((BASE, SHOULDER, ELBOW))
 
     def release(self) -> None:
@@ -282,7 +283,7 @@ class LegoArm:
         self._machine.keep_awake()
 
     def turn_joint(self, joint: int, by_rad: float) -> None:
-        """Turn one joint (0 to 2: base, shoulder, elbow) by an angle; ReachError if it would leave the limits."""
+        """Turn one joint (0 to 2: base, shoulder, elbow) by an angle; ReachError if this would leave the limits."""
         angles = self.angles_rad
         angles[joint] += by_rad
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
@@ -297,7 +298,7 @@ class LegoArm:
         return Pose(float(x_mm), float(y_mm), float(wrapped_to_pi(standing)))
 
     def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[JointTarget]:
-        """Return the joints' goals for the sensor at a place and height; raise ReachError if it is out of reach."""
+        """Return the targets of base, shoulder and elbow for a place and height; ReachError if it is out of reach."""
         angles = self.geometry.angles_rad(np.array([[x_mm, y_mm]]), height_mm)[0]
         if not np.isfinite(angles).all():
             raise ReachError("the place (mm)", (round(x_mm, 1), round(y_mm, 1)), self.geometry.sentence())
@@ -312,19 +313,19 @@ class LegoArm:
         ]
 
     def _approach_sides_of(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
-        """Choose the direction from which each joint approaches these angles, (3,).
+        """Return for each joint whether it approaches these angles, (3,), with its angle rising (1) or falling (-1).
 
         The links approach a place from above, so that their weight and their motors take up the play in the same
-        direction; the base could approach from either side.
+        direction; the base always approaches with its angle rising.
         """
         _, shoulder, elbow = self.geometry.height_slopes_mm_rad(angles_rad[None, :])[0]
         return 1, (-1 if shoulder > 0 else 1), (-1 if elbow > 0 else 1)
 
     def _choose_link_order(self, goals: Sequence[JointTarget]) -> tuple[int, int]:
-        """Return in which order to move the two links, so that the sensor stays as high as possible.
+        """Return the two links (joint numbers) in the order of moving in which the sensor stays higher on the way.
 
-        The sensor is far down while the lower link swings through the vertical. If neither order leaves enough room,
-        this first moves the upper link, to the vertical, and then puts its move last.
+        If the sensor would go below its target height in either order, first move the upper link to the vertical, and
+        return the lower link before the upper one.
         """
         orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
         ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
@@ -336,7 +337,7 @@ class LegoArm:
         return ELBOW, SHOULDER
 
     def _heights_along_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
-        """Return the heights of the sensor along a path from the current counts through successive counts."""
+        """Return the sensor's heights, (n,), along successive moves (joint, target count) from the current counts."""
         counts = list(self._machine.limits.last_counts)
         heights = []
         for joint, goal in way:

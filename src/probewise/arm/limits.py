@@ -42,7 +42,7 @@ class SoftLimits:
     counts = last_counts  # its old name
 
     def heights_along_move_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
-        """Return the sensor's height at points along a move of one joint, shape (n,).
+        """Return the sensor's height at 33 points along a move of one joint, shape (33,).
 
         Parameters
         ----------
@@ -51,7 +51,7 @@ class SoftLimits:
         joint, to
             The joint that moves, and its target count.
         here
-            Starting count of that joint, if different.
+            Starting count of that joint; None: as in `counts`.
         """
         joints = self._geometry.joints
         way = np.empty((N_CHECKED, 3))
@@ -65,7 +65,8 @@ class SoftLimits:
     def require_allowed_move(self, joint: int, here: int, to: int) -> None:
         """Raise ReachError if a move of one joint, the others at rest, leaves the allowed range.
 
-        A joint that is already outside may move back. `here` and `to` are the counts of its motor at start and end.
+        `here` and `to` are the counts of the joint's motor at start and end. A joint beyond its limits may move back,
+        and a sensor below the lowest height may rise.
 
         Raises
         ------

@@ -13,7 +13,7 @@ from probewise.arm.limits import SoftLimits
 
 
 class Machine(Protocol):
-    """Three motors and a light sensor; joints are 0 to 2, base, shoulder, elbow. Leaving the block releases them."""
+    """Three motors and a light sensor; joints 0 to 2: base, shoulder, elbow. The end of `with` releases the motors."""
 
     limits: SoftLimits
 
@@ -36,7 +36,7 @@ class Machine(Protocol):
         ...
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint gently to its stop, its angle rising (side 1) or falling (-1), and set its counter there."""
+        """Turn a joint gently to its stop, angle rising (side 1) or falling (-1); its count becomes `stop_counts`."""
         ...
 
     def reset(self, joints: Sequence[int]) -> None:
@@ -64,7 +64,7 @@ class DryRun:
     geometry
         Geometry of the arm.
     say
-        Function called with one line per move.
+        Function called with one line per command.
     """
 
     def __init__(self, geometry: Geometry, say: Callable[[str], None]) -> None:

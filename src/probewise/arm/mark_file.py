@@ -1,4 +1,4 @@
-"""File format of the marks for calibrating the geometry: one row each, joint angles from home and place."""
+"""File format of the marks for calibrating the geometry: CSV, a row per mark, joint angles from home, x, y, height."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _LARGEST = 1e4
 
 @dataclass(frozen=True)
 class TouchedMark:
-    """One mark: joint angles from home, and place of the sensor's face; a height of NaN: not measured."""
+    """A mark: angles of base, shoulder, elbow from home; x, y, height of the sensor's face (NaN: not measured)."""
 
     turned_rad: tuple[float, float, float]
     place_mm: tuple[float, float, float]
 
 
 def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Read marks: turns in radians and places in mm, both (n_marks, 3).
+    """Read marks: joint angles from home in radians, and x, y, height in mm, both (n_marks, 3).
 
     Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty, which gives NaN.
     """
@@ -39,7 +39,7 @@ def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def write_marks(marks: Sequence[TouchedMark], path: Path) -> None:
-    """Write marks as `read_turns_and_places` reads them, angles in degrees and places in mm, atomically."""
+    """Write marks for `read_turns_and_places`, angles in degrees and places in mm, atomically."""
     turned = np.degrees([mark.turned_rad for mark in marks]).reshape(-1, 3).round(4)
     place = np.array([mark.place_mm for mark in marks]).reshape(-1, 3).round(4)
     columns = dict(zip((*_TURNED, *_PLACE), np.concatenate([turned, place], axis=1).T.tolist(), strict=True))

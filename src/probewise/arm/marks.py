@@ -20,7 +20,7 @@ def spread_mark_places(geometry: Geometry) -> FloatArray:
 
     Returns
     -------
-    Shape (n_marks, 2), at most eight, in mm, in the order of use.
+    Five to eight places, shape (n_marks, 2), in mm, in the order of use.
 
     Raises
     ------

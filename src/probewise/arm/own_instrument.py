@@ -36,7 +36,7 @@ class Measures(Protocol):
     """The minimal interface of a user's own instrument; see `as_instrument` for optional methods."""
 
     def measure(self, pose: Pose, /) -> Any:
-        """Move to a pose and read; return a number, or a dict with "value" and further numbers."""
+        """Move to a pose and read; return a number, a dict with "value" and further numbers, or a Reading."""
         ...
 
 
@@ -48,8 +48,8 @@ class OwnInstrument:
     connect
         Function that returns the object; called once, when the instrument is entered.
     source
-        The file that it comes from. Errors inside become a one-line `LinkError` with the file's line number; without
-        `source`, they pass through.
+        Path of the file that the object comes from. Errors of the object become a `LinkError` of one line, with the
+        line number in the file; without `source`, these errors pass through.
     start_s
         Time at the start, for resuming an earlier run.
     clock
@@ -58,7 +58,7 @@ class OwnInstrument:
     Attributes
     ----------
     mounted_rad
-        Angle to which a person was last asked to turn its sensor, see `carry_out`; NaN: not known.
+        Angle to which a person was last asked to turn the sensor, see `carry_out`; NaN: not known.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class OwnInstrument:
 
     @classmethod
     def from_file(cls, path: str | Path, *, start_s: float = 0.0, clock: Clock = time) -> Self:
-        """Load a user's file, whose function `connect()` returns the instrument; it is called on entering.
+        """Load a user's file; its function `connect()`, which returns the instrument, is called on entering.
 
         Raises
         ------
@@ -126,14 +126,14 @@ class OwnInstrument:
 
     @property
     def can_turn(self) -> bool:
-        """Whether it turns its sensor to `pose.orientation_rad`, as declared by `turns = True`."""
+        """Whether the object turns its sensor to `pose.orientation_rad`: its attribute `turns`, by default False."""
         return bool(getattr(self._own, "turns", False))
 
     turns = can_turn  # its old name
 
     @property
     def can_lift(self) -> bool:
-        """Whether it reads at a given `pose.height_mm`, as declared by `lifts = True`."""
+        """Whether the object reads at a given `pose.height_mm`: its attribute `lifts`, by default False."""
         return bool(getattr(self._own, "lifts", False))
 
     lifts = can_lift  # its old name
@@ -160,14 +160,14 @@ class OwnInstrument:
     """The old name of `contains`."""
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at each place, (n_places, 2), by default 0: shape (n_places,)."""
+        """Return the sensor's own orientation at places, (n_places, 2), by default 0: shape (n_places,)."""
         own = getattr(self._own, "orientation_rad", 0.0)
         with self._errors_located("orientation_rad"):
             angles = own(places_mm) if callable(own) else own
             return _finite_array_per_place("orientation_rad", angles, len(places_mm), "a finite number of radians")
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Return the seconds to move from `start` to each place and read, (n_places,); by default, by distance."""
+        """Return the seconds to move from `start` to each place and read, (n_places,); default: 100 mm/s plus 1.2 s."""
         own = getattr(self._own, "travel_s", None)
         if own is None:
             away = np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm)
@@ -190,7 +190,7 @@ class OwnInstrument:
         ParameterError
             If the result is not a valid reading; the object's own errors pass through.
         LinkError
-            In place of all these, for an instrument from a file.
+            Instead of any of these errors, for an instrument with a `source`.
         """
         with self._errors_located("measure"):
             return self._as_reading(self._own.measure(pose), pose)
@@ -213,9 +213,9 @@ class OwnInstrument:
 
     @contextlib.contextmanager
     def _errors_located(self, what: str) -> Iterator[None]:
-        """Convert errors inside `what` to a one-line error with the line number of the user's file.
+        """Turn errors of the object's method `what` into a LinkError of one line with the line number in its file.
 
-        Output that the file prints goes to standard error, separate from results.
+        What the file prints goes to standard error. Without a `source`, do nothing.
         """
         aside = contextlib.redirect_stdout(sys.stderr) if self.source else contextlib.nullcontext()
         try:
@@ -243,12 +243,13 @@ def as_instrument(
     ----------
     own
         Its `measure(pose)` moves to `pose.x_mm`, `pose.y_mm`, orientation `pose.orientation_rad` and, if not None,
-        height `pose.height_mm`, and returns a number; or a dict with "value" and optionally the true pose `x_mm`,
-        `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates. It may also have
-        `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`, seconds from a
-        pose to each place; `orientation_rad(places_mm)`, the sensor's orientation at each place; a single value applies
-        to all places. Attributes `turns = True` and `lifts = True` declare that it turns its sensor to the pose's
-        orientation and reads at the pose's height. `close()`, or `__exit__`, is always called at the end.
+        height `pose.height_mm`, and returns a number, a Reading, or a dict with "value" and optionally the true pose
+        `x_mm`, `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates. Optional
+        methods: `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`,
+        seconds from a pose to each place; `orientation_rad(places_mm)`, the sensor's own orientation at each place; a
+        single value applies to all places. Attributes `turns = True` and `lifts = True` declare that the sensor is
+        turned to the pose's orientation and reads at the pose's height. `__exit__`, or else `close()`, is always called
+        at the end.
     start_s
         Time at the start, for resuming an earlier run; without effect on instruments of this package.
     name
@@ -257,7 +258,7 @@ def as_instrument(
     Raises
     ------
     ParameterError
-        If it has no `measure`.
+        If `own` has no method `measure`.
     """
     if isinstance(own, OwnInstrument | LegoArm | SimulatedArm):
         return own
@@ -295,7 +296,7 @@ def _checked_reading(found: Reading) -> Reading:
 
 
 def _checked_covariate(name: object, number: object) -> float:
-    """Return a further number of a reading as a float; NaN if missing."""
+    """Return a covariate of a reading as a float, NaN if missing; ParameterError for a name that is not allowed."""
     if not isinstance(name, str) or not name.isprintable() or name != name.strip() or name in ("", *_TAKEN):
         taken = "no name that a recording has a column for" if name in _TAKEN else "a printable text"
         raise ParameterError("a name in what measure returned", name, f"{taken}; of an angle: orientation_rad")

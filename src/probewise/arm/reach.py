@@ -32,7 +32,7 @@ class Workspace(Protocol):
 
     @property
     def rest_mm(self) -> tuple[float, float]:
-        """Rest position of the sensor."""
+        """Rest position (x, y) of the sensor."""
         ...
 
     def contains(self, places_mm: FloatArray) -> BoolArray:
@@ -40,7 +40,7 @@ class Workspace(Protocol):
         ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,)."""
+        """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,)."""
         ...
 
     def sentence(self) -> str:
@@ -58,7 +58,7 @@ def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: 
     places_mm
         Shape (n_places, 2).
     of
-        What has a place, for messages; its first word gets the number: "row of the plan" becomes "row 3 of the plan".
+        Noun for messages; its first word gets the place's number: "row of the plan" becomes "row 3 of the plan".
     way_out
         Further advice, added at the end of the message.
 
@@ -83,11 +83,11 @@ def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: 
 
 @dataclass(frozen=True)
 class Reach:
-    """A ring about the arm's axis, intersected with the field.
+    """The reachable places of an arm: a ring about its axis, intersected with the field.
 
     The axis stands beyond the middle of the field's upper long side. The default is the reach of the LEGO arm whose
-    geometry ships with the package. It excludes 2 % of the field: the two corners farthest from the axis, at the bottom
-    of the paper's entropy map, and the places nearest to the axis, where the arm cannot fold.
+    geometry ships with the package: all but 2 % of the field, at the corners farthest from the axis and nearest to the
+    axis, where the arm cannot fold.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class Reach:
 
     @classmethod
     def over_whole_field(cls, field_mm: tuple[float, float] = FIELD_MM) -> Self:
-        """Return the reach of an arm long enough for the whole field."""
+        """Return the reach of an arm long enough for the whole field, its axis 60 mm beyond the upper side."""
         width, height = field_mm
         beyond = 60.0
         return cls(field_mm, beyond, 0.0, math.hypot(width / 2, height + beyond) + 1.0)
@@ -141,12 +141,12 @@ class Reach:
 
     @property
     def axis_mm(self) -> tuple[float, float]:
-        """Place of the axis, lab frame."""
+        """Place (x, y) of the axis, lab frame."""
         return self.field_mm[0] / 2, self.field_mm[1] + self.axis_beyond_mm
 
     @property
     def rest_mm(self) -> tuple[float, float]:
-        """Rest position: as near below the axis as the arm folds (with a distant axis, at the edge of the field)."""
+        """Rest position (x, y): `nearest_mm` from the axis, straight towards the field, and within the field."""
         x_mm, y_mm = self.axis_mm
         return x_mm, max(0.0, min(self.field_mm[1], y_mm - self.nearest_mm))
 

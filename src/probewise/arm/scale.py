@@ -12,7 +12,7 @@ from probewise.errors import ParameterError
 class ReadingScale:
     """Conversion of a value to a reading: rounded to multiples of `step` (None: not rounded), clipped to `low`, `high`.
 
-    By default the LEGO brick's.
+    The default is the scale of LEGO units.
     """
 
     low: float = 1.0

@@ -42,13 +42,13 @@ class SimulatedArm:
     Parameters
     ----------
     light
-        Function of pose, time and height that returns the reading before the brick's conversion.
+        Function of pose, time (s) and height (mm) that returns the reading before the conversion by `scale`.
     reach
         Reachable places and orientations: a `Reach`, whose sensor does not turn, or the `Geometry` of a real arm.
     speed
         Speed of moving and reading.
     scale
-        The conversion to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
+        Conversion of readings, by default to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
     height_mm
         Height of the sensor above the surface when reading, unless the pose gives one.
     last
@@ -57,7 +57,7 @@ class SimulatedArm:
     Attributes
     ----------
     mounted_rad
-        Always 0: it turns its sensor itself.
+        Always 0, since no person turns the sensor.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class SimulatedArm:
         return self.reach.contains(_checked_places(places_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at places, (n_places, 2), to which a design's is added: shape (n_places,).
+        """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,).
 
         Raises
         ------
@@ -139,7 +139,7 @@ class SimulatedArm:
         Raises
         ------
         ReachError
-            If the arm cannot reach the pose; it does not move.
+            If the arm cannot reach the place, or the height is not above 0; the arm does not move.
         """
         require_pose(pose)
         place = np.array([[pose.x_mm, pose.y_mm]])

@@ -24,7 +24,7 @@ def fitted_parameter_values(geometry: Geometry) -> FloatArray:
 
 
 def places_at_parameters(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
-    """Return the sensor's places and heights, (n, 3), from values of `FITTED` and joint turns from home, (n, 3)."""
+    """Return x, y, height of the sensor, (n, 3), for values of `FITTED`, (9,), and joint angles from home, (n, 3)."""
     return forward_kinematics_mm(
         values[:3] + turned_rad,
         values[3:5],
@@ -36,14 +36,14 @@ def places_at_parameters(geometry: Geometry, values: FloatArray, turned_rad: Flo
 
 
 def place_jacobian(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
-    """Return the derivatives of the sensor's true place and height with respect to each parameter `FITTED`.
+    """Return the derivatives of the sensor's place and height by each parameter `FITTED`, joint angles from home fixed.
 
     Parameters
     ----------
     geometry
         The nominal geometry.
     places_mm
-        The sensor's places by that geometry, (n, 2), at the reading height.
+        Places of the sensor by the nominal geometry, (n, 2), at the reading height.
 
     Returns
     -------

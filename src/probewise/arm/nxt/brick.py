@@ -36,12 +36,12 @@ NO_PROGRAM = 0xEC
 
 
 class Brick:
-    """A LEGO NXT; use it in a `with` block, which at its end releases the motors, puts LEDs out and disconnects.
+    """A LEGO NXT; a `with` block, at its end, releases the motors, switches the LEDs off and disconnects.
 
     Parameters
     ----------
     link
-        The connection to it.
+        The connection to the brick.
     clock
         Clock used for waiting.
     """
@@ -54,12 +54,12 @@ class Brick:
 
     @classmethod
     def open(cls, path: str) -> Self:
-        """Open the connection at a serial port: /dev/rfcomm0, COM5, a pseudo-terminal.
+        """Return the brick at a serial port, opened here: /dev/rfcomm0, COM5, a pseudo-terminal.
 
         Raises
         ------
         LinkError
-            If it cannot be opened.
+            If the port cannot be opened.
         """
         return cls(Link(SerialPort.open(path)))
 
@@ -98,18 +98,17 @@ class Brick:
     def battery_mv(self) -> int:
         """Read the battery's voltage, in mV; warn once if it is low.
 
-        The first voltage, and one far from the last, must be confirmed by a second reading, since the protocol has no
-        checksum.
+        Since the protocol has no checksum, the voltage is read until two successive values agree within 50 mV.
 
         Raises
         ------
         LinkError
-            If the brick does not answer, or answers with a different voltage every time.
+            If the brick does not answer, or no two of six successive voltages agree.
 
         Warns
         -----
         LowBatteryWarning
-            If it is below 6 V.
+            If the voltage is below 6 V.
         """
         for _ in range(N_ASKED):
             before, self._last_mv = self._last_mv, self.link.ask(GetBatteryLevel()).millivolt
@@ -130,15 +129,15 @@ class Brick:
         return self._last_mv
 
     def name(self) -> str:
-        """Return its name."""
+        """Return the brick's name."""
         return self.link.ask(GetDeviceInfo()).brick_name
 
     def version(self) -> FirmwareVersion:
-        """Return the versions of its firmware and protocol."""
+        """Return the versions of the brick's firmware and protocol."""
         return self.link.ask(GetFirmwareVersion())
 
     def running_program(self) -> str | None:
-        """Return the program running on it, which could interfere with motors and sensors, or None."""
+        """Return the file name of the program running on the brick, which could drive motors and sensors, or None."""
         try:
             return self.link.ask(GetCurrentProgramName()).file
         except BrickError as error:
@@ -149,9 +148,9 @@ class Brick:
     program = running_program  # its old name
 
     def _switch_off_motors_and_leds(self) -> None:
-        """Release the motors and switch the LEDs off, each even if another fails.
+        """Release the motors and switch the LEDs off, each even if another fails; then raise the last LinkError.
 
-        First send all commands without waiting for answers, which may be missing or late; then confirm.
+        First send all commands without asking for answers, which may be missing or late; then send them with answers.
         """
         commands: list[Request[Done]] = [
             SetOutputState(ALL_OUTPUTS),

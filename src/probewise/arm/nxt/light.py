@@ -1,4 +1,4 @@
-"""The light sensor 9844: its LED, and conversion of its counts as in the brick's firmware."""
+"""The LEGO light sensor 9844: its LED, and conversion of its A/D counts as in the brick's firmware."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def normalized_from_counts(raw_counts: int) -> int:
 
 @dataclass(frozen=True)
 class LightReading:
-    """One reading, in A/D counts."""
+    """One reading, in A/D counts, 0 (bright) to 1023 (dark)."""
 
     raw_counts: int
 
@@ -63,11 +63,11 @@ class LightSensor:
     link
         The connection to the brick.
     port
-        0 to 3, for 1 to 4.
+        0 to 3, for inputs 1 to 4.
     clock
         Clock used for waiting.
     valid_s
-        Seconds for which a read repeats a reading that the brick marks as invalid, three times at least.
+        Seconds for which a read is repeated while the brick marks the reading as invalid; at least three attempts.
     """
 
     def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:
@@ -118,9 +118,9 @@ class LightSensor:
 
 
 def _require_consistent(values: InputValues) -> None:
-    """Raise TelegramError for values that the firmware never sends: it converts each reading in four consistent ways.
+    """Raise TelegramError if counts and converted values contradict each other: a byte was corrupted on the way.
 
-    The protocol has no checksum. A corrupted byte makes the four values inconsistent, or changes none that is used.
+    The protocol has no checksum, but the firmware sends each reading four times, as counts and converted.
     """
     if values.valid not in (0, 1) or values.calibrated or values.raw > AD_MAX:
         raise TelegramError(

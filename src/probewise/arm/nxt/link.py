@@ -1,9 +1,9 @@
 """Exchange of telegrams with the brick over a byte stream whose data may come in pieces, late, or not at all.
 
-The stream keeps the order of bytes, so one rule assigns answers reliably. A command whose answer did not come stays
+The stream keeps the order of bytes, so one rule assigns answers reliably. An answer that did not come in time stays
 *owed*; before the next question, the stream is drained and a fence is sent: a harmless question with another opcode.
-When its answer comes, any owed answer has either been read and dropped or will never come, so a late answer is never
-taken for the next one. The same is done if data are waiting before a question is sent, such as a duplicated answer.
+Once the fence is answered, any owed answer has been dropped or will never come, so no late answer is taken for another.
+The same is done if data are waiting before a question is sent, such as a duplicated answer.
 """
 
 from __future__ import annotations
@@ -75,15 +75,15 @@ class Timing:
     Parameters
     ----------
     answer_s
-        Timeout of an answer; stalls of over 2 s occur and are best treated as lost.
+        Timeout of an answer.
     turn_s
-        Turnaround time of the radio; a question with its answer takes two.
+        Time in which the radio changes between sending and receiving; a question with its answer takes two.
     gap_s
         Pause after a telegram without an answer.
     silence_s
         Silence after which the stream counts as drained.
     keep_awake_s
-        Longest interval between keep-alive commands, or a third of the brick's sleep limit if shorter.
+        Interval between keep-alive commands; a third of the brick's sleep limit if that is shorter.
     n_repeats
         Number of repeats of a question without a valid answer, if repeating it is harmless.
     """
@@ -112,7 +112,7 @@ class Timing:
 
 
 class NoAnswerError(LinkError):
-    """Raised if the brick did not answer a command in time; it may or may not have executed it."""
+    """Raised if the brick did not answer a command in time; the command may or may not have been executed."""
 
 
 class Link:
@@ -125,7 +125,7 @@ class Link:
     clock
         Clock used for waiting; a fake clock in tests.
     timing
-        Deadlines and pauses.
+        Timeouts and pauses.
 
     Attributes
     ----------
@@ -160,9 +160,9 @@ class Link:
         Raises
         ------
         BrickError
-            If the brick refuses it.
+            If the brick refuses the command.
         NoAnswerError
-            If the brick did not answer, although the connection may still work.
+            If the brick did not answer in time, although the connection may still work.
         TelegramError
             If the received bytes are not an answer.
         LinkError
@@ -195,9 +195,9 @@ class Link:
         self._free_at = self._clock.monotonic() + self._timing.gap_s
 
     def keep_awake(self) -> None:
-        """Reset the brick's sleep timer if it is due; `ask` does so too.
+        """Reset the brick's sleep timer if the last reset is `keep_awake_s` ago; `ask` does so too.
 
-        Call it now and then if the connection is idle for minutes.
+        Call this now and then if the connection is idle for minutes.
         """
         if self._clock.monotonic() < self._awake_until:
             return
@@ -212,7 +212,7 @@ class Link:
         self._stream.close()
 
     def _exchange(self, request: Request[A]) -> Reply:
-        """Send a command and wait for its reply, which counts as owed until it is received."""
+        """Send a command and return its reply, which counts as owed until received."""
         self._owed.add(request.OPCODE)
         self._send(encode(request))
         self.n_asked += 1
@@ -224,7 +224,7 @@ class Link:
         return reply
 
     def _discard_late_answers(self) -> None:
-        """Ensure that no answer to an earlier command can still arrive."""
+        """Ensure that no answer to an earlier command can still arrive; LinkError if the brick answers no fence."""
         self._drain()
         for fence in FENCES:
             if fence.OPCODE in self._owed:
@@ -239,7 +239,7 @@ class Link:
         raise LinkError(f"the NXT on {self.name} does not answer any more; is it on, charged and near?")
 
     def _drain(self) -> None:
-        """Read and drop bytes until the stream is silent: late or incomplete answers."""
+        """Read and drop bytes (late or incomplete answers) until the stream is silent, for `answer_s` at most."""
         deadline = self._clock.monotonic() + self._timing.answer_s
         while self._clock.monotonic() < deadline and self._stream.read(LONGEST, self._timing.silence_s):
             pass
@@ -272,7 +272,7 @@ class Link:
         return self._read_exactly(length, request, deadline)
 
     def _read_exactly(self, size: int, request: Request[A], deadline: float) -> bytes:
-        """Read exactly `size` bytes, in any number of pieces."""
+        """Read exactly `size` bytes, in any number of pieces; NoAnswerError at the deadline."""
         got = b""
         while len(got) < size:
             left_s = deadline - self._clock.monotonic()

@@ -56,12 +56,12 @@ class BrickMachine:
         self.brick.__exit__(kind, error, trace)
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Turn a joint's motor to a count, approaching in the motor's direction `side`; see `Motor.move_to`."""
+        """Turn a joint's motor to a count from home, approaching with the count rising (side 1) or falling (-1)."""
         with self._recording_counts(joint) as motor:
             motor.move_to(goal + self._zeros[joint], side)
 
     def move_near(self, joint: int, goal: int) -> None:
-        """Turn a joint's motor approximately to a count, and hold it; see `Motor.move_near`."""
+        """Turn a joint's motor approximately to a count from home, and hold it; see `Motor.move_near`."""
         with self._recording_counts(joint) as motor:
             motor.move_near(goal + self._zeros[joint])
 
@@ -71,7 +71,7 @@ class BrickMachine:
             motor.release()
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint to its stop, its angle rising (side 1) or falling (-1); then its counts fit the geometry."""
+        """Turn a joint gently to its stop, angle rising (side 1) or falling (-1); its count becomes `stop_counts`."""
         mechanics = self._joints[joint]
         motor = self._motors[joint]
         with_gears: Side = side if mechanics.gear_ratio > 0 else -side
@@ -110,5 +110,5 @@ class BrickMachine:
             self.limits.record_present_count(joint, motor.last_counts - self._zeros[joint])
 
     def _require_allowed_move(self, joint: int, here: int, to: int) -> None:
-        """Raise ReachError if a move, in counts of the motor, leaves the limits, whose counts are from home."""
+        """Raise ReachError if the limits, in counts from home, refuse a move between values of a motor's counter."""
         self.limits.require_allowed_move(joint, here - self._zeros[joint], to - self._zeros[joint])

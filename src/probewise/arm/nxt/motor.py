@@ -1,10 +1,10 @@
-"""A motor that turns to a count and holds it, given how the brick's firmware treats a limit.
+"""A motor that turns to a count and holds it, although the brick's firmware only limits the turn and cuts the power.
 
 The firmware counts a limited move from its own running *target*, not from the motor's position; at the target it cuts
 the power, and the motor *coasts* by some counts. So the target is tracked here, the coast is learned by direction and
-power, and every move is computed from the last count: a fast move that stops short, then slow ones, always approaching
-from the same side, so that the play of the gears is always taken up in the same direction. Telegrams have no checksum:
-an unexpected state is read again, and accepted once two successive answers agree.
+power, and every move is computed from the last count: a fast move that stops short, then slow ones in the direction of
+approach, which take up the play of the gears. Telegrams have no checksum: an unexpected state is read again, and
+accepted once two successive answers agree.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ N_UNTAKEN = 3  # successive commands ignored by the brick after which a move fai
 
 
 class MotorError(LinkError):
-    """Raised for a motor that does not reach its target: stuck, slipping, or not plugged in."""
+    """Raised for a motor that is stuck, slipping or not plugged in, or whose reported states contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class DriveParameters:
     fast_power, slow_power
         Power of fast moves, and of the final approach, 1 to 100; each unit is about 10 counts/s.
     seek_power
-        Unregulated power towards a mechanical stop, which limits the force on it.
+        Unregulated power towards a mechanical stop, low enough to limit the force on the stop.
     coast_counts
-        First estimate of the coast after a fast move; for slow moves in proportion.
+        First estimate of the coast after a fast move; for slow moves in proportion to the power.
     tolerance_counts
         Largest distance from the goal that counts as reached.
     lead_counts
@@ -64,7 +64,7 @@ class DriveParameters:
     runaway_counts
         Overrun at which a motor is stopped.
     settle_s
-        Waiting time before a motor counts as at rest.
+        Waiting time after stopping until the count is read.
     stuck_s
         Time without a change of count after which a running motor is stuck.
     n_moves
@@ -119,7 +119,7 @@ class Motor:
     Attributes
     ----------
     last_counts
-        Last value of the rotation counter.
+        Last value read of the rotation counter; 0 at first.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class Motor:
         return self._read_confirmed_state().rotation_counts
 
     def reset_counter(self) -> None:
-        """Set its counter to 0."""
+        """Set the rotation counter to 0."""
         state = self._read_confirmed_state()
         self._link.ask(ResetMotorPosition(self.port, 0))
         if self._target is not None:
@@ -160,22 +160,22 @@ class Motor:
     reset = reset_counter  # its old name
 
     def hold(self) -> None:
-        """Hold its position against a load."""
+        """Stop the motor and hold its position against a load."""
         self._link.ask(self._drive_command(0, 0))
 
     def stop_and_settle(self) -> int:
-        """Stop and hold it; return its count once it has settled."""
+        """Stop and hold the motor; return its count once it has settled."""
         self.hold()
         self._clock.sleep(self.drive.settle_s)
         return self.counts()
 
     def release(self) -> None:
-        """Let it turn freely."""
+        """Let the motor turn freely."""
         self._link.ask(SetOutputState(self.port))
         self._arrived = None
 
     def move_to(self, goal: int, side: Side) -> int:
-        """Turn to a count, approaching in direction `side`, and hold it there.
+        """Turn to a count, approaching with the count rising (side 1) or falling (-1), and hold the motor there.
 
         Returns
         -------
@@ -186,7 +186,7 @@ class Motor:
         ReachError
             If the guard refuses a move, which is then not made.
         MotorError
-            If it does not reach the goal.
+            If the motor does not reach the goal.
         """
         here = self.counts()
         for _ in range(self.drive.n_moves):
@@ -206,7 +206,7 @@ class Motor:
         )
 
     def move_near(self, goal: int) -> int:
-        """Turn approximately to a count, by one fast move if needed, and hold; return the count at rest."""
+        """Turn near a count by one fast move (none if it would overrun); return the count at rest."""
         here = self.counts()
         side: Side = 1 if goal >= here else -1
         if self._target is None:
@@ -222,7 +222,7 @@ class Motor:
         Parameters
         ----------
         side
-            The direction.
+            Direction of turning: 1 with the count rising, -1 falling.
         farthest
             Largest distance to the stop, in counts.
 
@@ -233,7 +233,7 @@ class Motor:
         Raises
         ------
         MotorError
-            If nothing stops it.
+            If the motor meets no stop within `farthest`.
         """
         start = self._find_firmware_target()
         power = side * self.drive.seek_power
@@ -253,7 +253,7 @@ class Motor:
 
     @property
     def _checked_target(self) -> int:
-        """The firmware's target; MotorError if it is unknown."""
+        """The firmware's target, in rotation counts; MotorError if it is unknown."""
         if self._target is None:
             raise MotorError(f"motor {self.letter}: its counters jumped; did a program start on the brick?")
         return self._target
@@ -288,7 +288,7 @@ class Motor:
         return round(self._coast.get((power, side), share * self.drive.coast_counts))
 
     def _make_limited_move(self, target: int, side: Side, power: int, here: int) -> int:
-        """Make one limited move to a firmware target, and read the resulting count."""
+        """Make one limited move to a firmware target; return the count at rest. MotorError if stuck or overrunning."""
         stop = target + side * self._coast_counts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
@@ -336,9 +336,9 @@ class Motor:
         return True
 
     def _find_firmware_target(self) -> int:
-        """Find the firmware's target, which follows a motor that is driven without a limit; stop and return the count.
+        """Drive the motor without a limit, so that the firmware's target becomes its count; stop, return the count.
 
-        The motor is driven with too little power to turn, so that a lost connection or a repeated command does no harm.
+        The power is too little to turn the motor, so that a lost connection or a repeated command does no harm.
         """
 
         def has_faint_power(state: OutputState) -> bool:
@@ -356,7 +356,7 @@ class Motor:
         return self.stop_and_settle()
 
     def _await_idle_or_trouble(self, start: int, farthest: int, target: int) -> str:
-        """Wait for a limited move to end; return a text on the trouble if it sticks or overruns, otherwise ""."""
+        """Wait for a limited move to end; return `STUCK` or `BEYOND` if the motor sticks or overruns, otherwise ""."""
         side = 1 if farthest > 0 else -1
 
         def is_plausible(state: OutputState) -> bool:
@@ -375,9 +375,9 @@ class Motor:
         return ""
 
     def _read_confirmed_state(self, is_plausible: Callable[[OutputState], bool] = lambda state: True) -> OutputState:
-        """Read the motor's state; if it is implausible or a counter jumped, read until two successive states agree.
+        """Read the motor's state; if it is implausible or one counter jumped, read until two successive states agree.
 
-        A corrupted byte shifts one of the three counters against the others.
+        A corrupted byte changes one of the three counters but not the others.
         """
         state, before = self._read_state(), None
         n_asked = 1
@@ -406,7 +406,7 @@ class Motor:
 
 
 def _counter_offsets(state: OutputState) -> tuple[int, int]:
-    """Return the differences of the counters, which motion does not change."""
+    """Return the tacho counter minus the rotation and minus the block counter; motion does not change either."""
     return state.tacho_counts - state.rotation_counts, state.tacho_counts - state.block_counts
 
 

@@ -1,9 +1,9 @@
 """Encoding and decoding of the brick's telegrams: pure functions without input or output.
 
-A telegram is a type byte, an opcode and a body; on Bluetooth its length goes before it
-(`framed`). One class per command holds the body's fields in the order of the bytes; its
-`REPLY` is the class of a successful answer. Values out of bounds are refused on construction, and bytes that are not an
-answer raise TelegramError. Only the commands that the arm needs are here.
+A telegram is a type byte, an opcode and a body, on Bluetooth preceded by its length (`framed`). One class per command
+holds the body's fields in the order of the bytes; its `REPLY` is the class of a successful answer. Construction raises
+ParameterError for values out of bounds, and decoding TelegramError for bytes that are not an answer. Only the commands
+that the arm needs are here.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SensorMode(IntEnum):
 
 
 class OutputMode(IntFlag):
-    """Driving mode of a motor."""
+    """Driving mode of a motor, flags."""
 
     IDLE = 0x00
     ON = 0x01
@@ -59,7 +59,7 @@ class Regulation(IntEnum):
 
 
 class RunState(IntEnum):
-    """Run state of a motor; the brick also reports transient ones."""
+    """Run state of a motor; the brick also reports transient states, which have no name here."""
 
     IDLE = 0x00
     RUNNING = 0x20
@@ -72,14 +72,14 @@ class Done(Answer):
 
 @dataclass(frozen=True)
 class Request(CommandFields, Generic[A_co]):
-    """A command; `A_co` is the type of a successful answer."""
+    """A command, generic in the type of a successful answer, `REPLY`."""
 
     OPCODE: ClassVar[int]
     REPLY: ClassVar[type[Answer]] = Done
 
     @property
     def is_repeatable(self) -> bool:
-        """Whether the command is idempotent."""
+        """Whether repeating the command does no harm."""
         return True
 
     @property
@@ -93,7 +93,7 @@ class Request(CommandFields, Generic[A_co]):
         Raises
         ------
         BrickError
-            If the brick refused it; the status gives the reason.
+            If the brick refused the command; the status gives the reason.
         TelegramError
             If the reply belongs to another command or port, or its length is wrong.
         """
@@ -112,7 +112,7 @@ class Request(CommandFields, Generic[A_co]):
 
 @dataclass(frozen=True)
 class SetOutputState(Request[Done]):
-    """Drive a motor, or all with port 255; a limit of 0 counts means no limit. By default they idle, free to turn."""
+    """Drive a motor, or all with port 255; `limit_counts` 0 is no limit. The defaults release the motor."""
 
     OPCODE = 0x04
     port: int = packed_field(IntegerField("B", 0, 2, (ALL_OUTPUTS,)))
@@ -167,7 +167,7 @@ class GetOutputState(Request[OutputState]):
 
 @dataclass(frozen=True)
 class InputValues(Answer):
-    """Values of an input; meaningless while `valid` is 0."""
+    """Values of an input, raw and converted; out of date while `valid` is 0."""
 
     LAYOUT = "BBBBBHHhh"
     port: int
@@ -201,7 +201,7 @@ class ResetMotorPosition(Request[Done]):
 
 @dataclass(frozen=True)
 class BatteryLevel(Answer):
-    """The battery's voltage."""
+    """The battery's voltage, in mV."""
 
     LAYOUT = "H"
     millivolt: int
@@ -217,7 +217,7 @@ class GetBatteryLevel(Request[BatteryLevel]):
 
 @dataclass(frozen=True)
 class SleepLimit(Answer):
-    """Time without keys or keep-alives after which the brick switches itself off; 0: never."""
+    """Time in ms without keys or keep-alives after which the brick switches itself off; 0: never."""
 
     LAYOUT = "I"
     limit_ms: int
@@ -311,5 +311,5 @@ def decode(telegram: bytes) -> Reply:
 
 
 def framed(telegram: bytes) -> bytes:
-    """Prefix a telegram with its length, as on Bluetooth."""
+    """Prefix a telegram with its length, two bytes, as on Bluetooth."""
     return struct.pack("<H", len(telegram)) + telegram

@@ -12,12 +12,12 @@ from probewise.errors import LinkError, ParameterError
 
 
 class TelegramError(LinkError):
-    """Raised for bytes that are not a telegram; the message gives them and what was expected."""
+    """Raised for bytes that are not the expected telegram; the message shows the bytes and the expectation."""
 
 
 @dataclass(frozen=True)
 class IntegerField:
-    """An integer field: `code` as in the module struct, range `low` to `high`, or one of `others`."""
+    """An integer field: its `code` in Python's module struct; allowed are `low` to `high`, and `others`."""
 
     code: str
     low: int
@@ -33,7 +33,7 @@ class IntegerField:
 
 
 def packed_field(kind: IntegerField, default: Any = dataclasses.MISSING) -> Any:
-    """Return a dataclass field of a command, packed with this byte layout."""
+    """Return a dataclass field of a command, packed as `kind`; without a default, the field is required."""
     return dataclasses.field(default=default, metadata={"kind": kind})
 
 
@@ -55,7 +55,7 @@ class CommandFields:
 
 @dataclass(frozen=True)
 class Answer:
-    """Body of an answer: successive fields; `LAYOUT` as in the module struct."""
+    """Body of an answer: successive fields, with their little-endian `LAYOUT` as in Python's module struct."""
 
     LAYOUT: ClassVar[str] = ""
 

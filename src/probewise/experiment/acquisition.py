@@ -23,8 +23,8 @@ from probewise.nested.importance import Weighted
 class ArmReachAndTravel:
     """Reach, orientation of the sensor and travel time of an arm at the places of a grid.
 
-    `reachable` marks the places within reach, `orientation_rad` is the sensor's orientation there, to which that of a
-    design is added; both (n_places,). `travel_s(pose, places_mm)` returns the seconds from a pose to the end of a
+    `reachable` marks the places within reach; `orientation_rad` is the sensor's own orientation at each place, to which
+    a design's is added; both (n_places,). `travel_s(pose, places_mm)` returns the seconds from a pose to the end of a
     reading at each place.
     """
 
@@ -67,11 +67,11 @@ def predict_readings_and_utilities(
     at
         The last reading, which says where the arm is. None before the first reading, which costs no travel time.
     goal
-        What the readings have to reach; None: the experiment's own.
+        Sd that the lengths have to reach; None: the experiment's own goal.
 
     Returns
     -------
-    Posterior, designs and predictive distributions; and the utility of each design.
+    The input of utilities (posterior, available designs, their costs in seconds); and the utility of each design.
     """
     designs = experiment.designs
     rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.setting_combinations))
@@ -113,7 +113,7 @@ def predict_readings_and_utilities(
 def next_poses(
     experiment: Experiment, utility_input: UtilityInput, utilities: UtilityMap, *, rng: np.random.Generator
 ) -> tuple[Pose, ...]:
-    """Choose the next pose, or the experiment's batch of poses; each comes as often as its design repeats it."""
+    """Choose the next pose, or the experiment's `batch` of poses; each comes as often as its design repeats it."""
     if experiment.batch > 1:
         rows = choose_several(utility_input, experiment.batch, rng=rng)
     else:

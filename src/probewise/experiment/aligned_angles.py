@@ -1,4 +1,4 @@
-"""Samples of a posterior with a shape's angles about their mean, so that moments of angles and sides mean something."""
+"""Posterior samples with a shape's angles brought near their mean, so that means and sds of angles are meaningful."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from probewise.scene.symmetry import mean_angles, with_angles_near
 
 
 def with_aligned_angles(experiment: Experiment, posterior: Weighted) -> Weighted:
-    """Return the same hypotheses with angles within half a turn of their circular mean, and sides swapped accordingly.
+    """Return the posterior of the same shapes with angles brought near their circular mean, and sides swapped to match.
 
     An angle may then lie outside its prior's range.
     """
@@ -20,7 +20,7 @@ def with_aligned_angles(experiment: Experiment, posterior: Weighted) -> Weighted
 
 
 def theta_with_aligned_angles(experiment: Experiment, theta: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return weighted samples, (n_samples, n_params), aligned as by `with_aligned_angles`."""
+    """Return samples, (n_samples, n_params), aligned as by `with_aligned_angles`; `weight` (n_samples,)."""
     own = theta[:, experiment.shape_columns]
     aligned = with_angles_near(experiment.shape, own, mean_angles(experiment.shape, own, weight))
     if aligned is own:

@@ -1,13 +1,12 @@
 """Effect of an error in the arm's geometry on the posterior of the shape.
 
 A geometry fitted to marks has one error that all readings of a run share: the sensor stood elsewhere than commanded. No
-reading of the run shows that error; it moves the whole shape. To first order, for any likelihood, the posterior mean of
-the shape moves by a covariance over the posterior: of its parameters with the log likelihood's slope by the error. So
-the samples at the end of a run suffice, without another inference.
+reading of the run shows that error, which moves the whole shape. To first order, for any likelihood, the posterior mean
+of the shape's parameters moves by their posterior covariance with the log likelihood's slope by the error. So the
+samples at the end of a run suffice, without another inference.
 
-If the log likelihood is quadratic, its slope by the error is a linear function of its slopes by the shape's parameters,
-and the coefficients are the answer, however few the samples. So these slopes serve as control variates: their
-covariance with the parameters is known, minus the identity matrix (Stein), and the samples only estimate the rest.
+The log likelihood's slopes by the shape's parameters serve as control variates: their covariance with the parameters is
+known, minus the identity matrix (Stein), so that the samples only estimate the rest, 0 for a quadratic log likelihood.
 """
 
 from __future__ import annotations
@@ -57,11 +56,11 @@ def arm_error_in_posterior(
     experiment, arm, readings
         The experiment, the arm, the readings so far.
     posterior, kinds
-        The posterior given them, joined and kind by kind, by the same odds.
+        The posterior given the readings: the samples of all kinds joined, and kind by kind with the same probabilities.
     mean, sd, likely_shape
-        Moments of the shape's parameters, (n_params,) each, and the label of the most probable shape, see `Step`.
+        Mean and sd of the shape's parameters, (n_params,) each, and the name of the most probable shape, see `Step`.
     rng
-        Source of the errors, drawn for each posterior sample.
+        Random generator of the errors, one drawn for each posterior sample.
 
     Raises
     ------
@@ -93,9 +92,9 @@ def arm_error_in_posterior(
 def draw_shape_shifts_from_arm_error(
     experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw an error of the arm for each sample of the shape's parameters, and return the shift that it causes.
+    """Draw an error of the arm for each sample of the shape's parameters, and return the shifts that the errors cause.
 
-    `theta` and the shifts are (n_samples, n_params), `slopes` (n_params, n_errors) those of `ArmError`. Samples of
+    `theta` and the shifts are (n_samples, n_params); `slopes` (n_params, n_errors) are `ArmError.slopes`. Samples of
     other shapes than `likely_shape` are not shifted.
     """
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
@@ -105,7 +104,7 @@ def draw_shape_shifts_from_arm_error(
 
 
 def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
-    """Return the change of x, y, height and orientation at places, (n_points, 2), by each error of one sd.
+    """Return the change of x, y, height and orientation at places, (n_points, 2), by each independent error of one sd.
 
     The result is (n_points, 4, n_errors). Raises ParameterError for a place out of the arm's reach.
     """
@@ -118,7 +117,7 @@ def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accura
 
 
 def _covariance_factor(covariance: FloatArray) -> FloatArray:
-    """Factorise a covariance: return the matrix, (n, n), whose product with its transpose it is."""
+    """Return a factor, (n, n), of a covariance: the factor times its own transpose is the covariance."""
     scale = np.sqrt(np.diagonal(covariance))
     scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -136,7 +135,7 @@ def _posterior_mean_shifts(
     sd: FloatArray,
     likely_shape: str,
 ) -> FloatArray:
-    """Return the shift of the shape's posterior mean by each error of one sd, (n_params, n_errors)."""
+    """Return the shift of the likely shape's posterior mean by each error of one sd, (n_params, n_errors)."""
     n_sensor = int(experiment.shape_columns[0])
     likely, columns = shape_and_columns(experiment.shape, likely_shape)
     own = np.arange(n_sensor, n_sensor + len(columns))
@@ -170,7 +169,7 @@ def _minus_weighted_mean(columns: FloatArray, weight: FloatArray) -> FloatArray:
 def _log_likelihood_slopes_by_shape(
     kind: HypothesisKind, theta: FloatArray, recording: Recording, columns: IntArray, steps: FloatArray
 ) -> FloatArray:
-    """Differentiate each hypothesis's log likelihood by each parameter of the shape: (n_samples, n_columns)."""
+    """Return each hypothesis's slope of log likelihood by the parameters `columns` of theta, (n_samples, n_columns)."""
     problem, slopes = kind.problem(recording), []
     for column, step in zip(columns.tolist(), steps.tolist(), strict=True):
         up, down = theta.copy(), theta.copy()
@@ -183,15 +182,15 @@ def _log_likelihood_slopes_by_shape(
 def _log_likelihood_slopes_by_error(
     kind: HypothesisKind, theta: FloatArray, recording: Recording, off: FloatArray, dark: float
 ) -> FloatArray:
-    """Differentiate each hypothesis's log likelihood by each independent error in its sds: (n_samples, n_errors).
+    """Return each hypothesis's slope of log likelihood by each independent error, per sd, (n_samples, n_errors).
 
-    `off` (n_points, 4, n_errors) are the changes of the pose by each error of one sd, with light in place of height.
+    `off` (n_points, 4, n_errors) are changes by each error of one sd: of x, y, light above black (share), orientation.
     """
     plan, usable = recording.plan, recording.usable
     predicted = kind.model.predict(theta, plan)
 
     def prediction_slope_by(name: str, step: float) -> FloatArray:
-        """Differentiate the predictions by a column of the plan: (n_samples, n_points)."""
+        """Return the slope of the predictions by the plan's column `name`, (n_samples, n_points)."""
         ends = [kind.model.predict(theta, replace(plan, **{name: getattr(plan, name) + way * step})) for way in (1, -1)]
         return np.asarray((ends[0] - ends[1]) / (2 * step))
 

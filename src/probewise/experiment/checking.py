@@ -1,8 +1,8 @@
-"""Checks before a run ends: readings for faults of the sensor, and on the side of the shape that has none yet.
+"""Checks before a run ends: further readings that would show a fault of the sensor, or an unread side of the shape.
 
-A dozen readings that fit the plain sensor cannot exclude most faults, and a single further reading would show some of
-them. And if a shape was read from one side only, its far side is computed from the sensor model alone: with a fault
-outside the vocabulary, that result may be wrong by any amount. A run that doubts its sensor checks both.
+A dozen readings that fit the sensor without faults cannot exclude most faults, and one further reading would show some.
+And if a shape was read from one side only, its far side follows from the sensor model alone: with an unknown fault, the
+result may be wrong by any amount. A run with `trust` below 1 checks both.
 """
 
 from __future__ import annotations
@@ -37,16 +37,15 @@ _AT_EDGE = 1.0  # spacings of the grid within which a reading is at the edge
 def expected_bits_about_left_out_effect(
     weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout
 ) -> FloatArray:
-    """Return the expected information of a reading about the name of what is left out: the smaller of two estimates.
+    """Return the expected information of a reading about the name of the effect left out: the smaller of two estimates.
 
-    Parameters of the shape and the effect do not count. Both estimates err upwards. The estimate by a Gaussian for each
-    name does so where a few predictions lie far from the others; that by the cells of the reading, where a name has few
-    hypotheses.
+    The parameters of shape and effect do not count. Both estimates err upwards: one Gaussian per name, where a few
+    predictions lie far from the others; a histogram of the readings, where a name has few hypotheses.
 
     Parameters
     ----------
     weight, names
-        Weight and name of each hypothesis, (n,).
+        Weight, sum 1, and name of each hypothesis, (n,).
     answers
         Predicted readings, (n, n_designs).
     readout
@@ -94,7 +93,7 @@ def _expected_bits_by_gaussians(
 def _expected_bits_by_cells(
     weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout
 ) -> FloatArray:
-    """Return bits about the name, (n_designs,): entropy of the reading's cell minus its mean entropy given the name."""
+    """Return bits about the name, (n_designs,): entropy of the histogram of readings minus its mean given the name."""
     given = WeightsGivenReading(answers, weight, readout, fine=_CELL)
     told = entropy_bits(given.weight_by_cell)
     for own in each:
@@ -105,16 +104,16 @@ def _expected_bits_by_cells(
 
 @dataclass(frozen=True, eq=False)
 class OutlineReadingDistances:
-    """The part of a probable shape's outline within reach, and its distances from the readings taken near it.
+    """The part of a probable shape's outline within reach, and distances from the readings taken near this outline.
 
     Attributes
     ----------
     edge_mm
         Places on the outline, (n, 2).
     nearest
-        Index of the available design nearest to each, (n,).
+        Index of the available design nearest to each place, (n,).
     apart_mm
-        Distance of each from the nearest reading at the outline, (n,); infinite if there is none.
+        Distance of each place from the nearest reading at the outline, (n,); infinite if there is none.
     spacing_mm, diameter_mm
         Spacing of the grid, and diameter of the outline within reach.
     """
@@ -127,7 +126,7 @@ class OutlineReadingDistances:
 
     @classmethod
     def from_region(cls, utility_input: UtilityInput, region: Region, readings: Sequence[Reading]) -> Self | None:
-        """Build from one region and the readings so far; None if it is no ellipse or polygon, or out of reach."""
+        """Build from one region and the readings so far; None if that is no ellipse or polygon, or out of reach."""
         if not isinstance(region, EllipseRegion | PolygonRegion):
             return None
         edge = outlines(region)[0]
@@ -155,15 +154,15 @@ class OutlineReadingDistances:
 
     @property
     def far_side_design(self) -> int | None:
-        """Index of the available design at the place on the outline farthest from the readings near it.
+        """Index of the available design at the place on the outline farthest from the readings at the outline.
 
-        None if that place is within `_FAR` of the diameter from a reading.
+        None if a reading at the outline is nearer to that place than 0.75 of the diameter.
         """
         farthest = int(self.apart_mm.argmax())
         return int(self.nearest[farthest]) if self.apart_mm[farthest] > _FAR * self.diameter_mm else None
 
     def leaves_no_far_side_mask(self, places_mm: FloatArray) -> BoolArray:
-        """Mark the places at which one more reading leaves no far side, (n_places, 2) -> (n_places,)."""
+        """Mark places at which one more reading would leave `far_side_design` None, (n_places, 2) -> (n_places,)."""
         return np.asarray(self.nearest_reading_distances_if_read_at(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
 
 

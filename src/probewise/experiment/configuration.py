@@ -67,7 +67,7 @@ class OneScan:
             )
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log likelihood of each hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log likelihood, (n_samples,), of readings (n_points,) given predictions (n_samples, n_points)."""
         one = np.zeros(readings.size, dtype=np.int64)
         return StudentT(one, self.sd_floor, self.sd_ceiling).log_prob(readings, predicted)
 
@@ -92,9 +92,10 @@ class Experiment:
         The utility; by default the expected information about all parameters and, near the end, the probability that
         the reading ends the run.
     sensor_prior
-        Prior of the sensor's parameters, which precede the shape's, if the sensor is inferred too; None: it is known.
+        Prior of the sensor's parameters, if these are inferred too, as the first columns of theta; None: the sensor is
+        known.
     step, reading_range
-        Rounding step of the readings (None: not rounded), and their smallest and largest possible values.
+        Rounding step of the readings (None: not rounded), and the smallest and largest possible reading.
     orientations_rad, repeats
         Possible turns of the sensor, added to the arm's orientation, and numbers of repeated readings.
     heights_mm, calibrated_height_mm
@@ -104,17 +105,16 @@ class Experiment:
         Readings chosen together for their joint information; above 1 only with the default utility or
         `InformationGain`.
     stop_sd_mm
-        The run ends when the posterior sd of every parameter of the shape in mm is below it: 4 mm, half
-        the spacing of LEGO holes, in the paper. For a set of shapes: every parameter that the
-        most probable shape has.
+        The run ends when the posterior sds of all of the shape's parameters in mm are below this: 4 mm, half the
+        spacing of LEGO holes, in the paper. For a set of shapes, the parameters of the most probable shape.
     stop_probability
-        For a set of shapes, the required probability of that shape.
+        For a set of shapes, the probability that the most probable shape needs for the run to end.
     trust
-        Prior probability that the sensor model is complete. Below 1, the run also infers effects that it may leave out
-        (`experiment.rivals`), and ends only when the lengths are known under the mixture.
+        Prior probability that the sensor model is complete. Below 1, the run also infers which effect the model leaves
+        out (`experiment.rivals`), and ends only when the lengths are known whichever it is.
     doubt_p
-        p-value of the best hypothesis below which the run reports that none explains the readings and does not trust
-        its posterior; 0 for a model that is known to be coarse.
+        p-value of the best hypothesis below which the run reports that no hypothesis explains the readings and that
+        the posterior is not to be trusted; 0 for a model that is known to be coarse.
     n_particles
         Number of weighted posterior samples.
     n_samples
@@ -124,8 +124,8 @@ class Experiment:
     method
         Method of inference; None: `SequentialMonteCarlo` with `n_particles` and `n_live`.
     fitted_arm
-        The arm, where its own error is known: the run ends when the lengths are known with that error included, or when
-        that error alone leaves more than the target. None: it is not known, and no part of the sds.
+        The arm with the known error of its geometry: the run ends when the sds of the lengths with that error are below
+        the target, or when that error alone is above. None: the arm's error is not known and not part of the sds.
     """
 
     shape: Shape
@@ -209,12 +209,12 @@ class Experiment:
 
     @cached_property
     def inference_method(self) -> Method:
-        """Method of inference."""
+        """The method of inference: `method`, or the default that it stands for."""
         return SequentialMonteCarlo(self.n_particles, self.n_live) if self.method is None else self.method
 
     @cached_property
     def prior(self) -> Prior:
-        """Prior of all parameters."""
+        """Prior of all parameters: the sensor's, if inferred, then the shape's."""
         return self.shape.prior if self.sensor_prior is None else Joint((self.sensor_prior, self.shape.prior))
 
     @property
@@ -224,7 +224,7 @@ class Experiment:
 
     @property
     def cards(self) -> tuple[Card, ...]:
-        """Cards of known place and albedo on the field."""
+        """Reference cards of known place and albedo on the field."""
         return cards_of(self.model)
 
     @cached_property
@@ -240,13 +240,13 @@ class Experiment:
 
     @cached_property
     def designs(self) -> Designs:
-        """The possible readings."""
+        """The possible readings: place, turn of the sensor, number of repeats, height."""
         settings = (("height_mm", self.heights_mm),) if self.heights_mm else ()
         return Designs(self.grid, self.orientations_rad, self.repeats, settings)
 
     @cached_property
     def instrumentation(self) -> Instrumentation:
-        """Instrumentation of this sensor for plans."""
+        """Instrumentation for plans: `calibrated_height_mm`, and defaults for the rest."""
         return Instrumentation(height_mm=self.calibrated_height_mm)
 
     @cached_property
@@ -265,7 +265,7 @@ class Experiment:
         return forecast_of(self.model, highest=max(self.heights_mm) / self.calibrated_height_mm)
 
     def problem(self, readings: Sequence[Reading]) -> SensorProblem:
-        """Return the inference problem for these readings."""
+        """Return the inference problem for these readings; with `trust` below 1, its times are paced (see `Pace`)."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
         if self.trust < 1:
             recording = Pace.from_readings(readings).recording_with_paced_time(recording)
@@ -273,7 +273,7 @@ class Experiment:
 
     @cached_property
     def kinds(self) -> tuple[HypothesisKind, ...]:
-        """The competing kinds of hypotheses."""
+        """The competing kinds of hypotheses, see `kinds_of`; with `trust` 1, one kind for every shape."""
         rivals: tuple[SensorModelRival, ...] = ()
         if self.trust < 1:
             rivals = rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
@@ -291,8 +291,8 @@ class Experiment:
             Posterior sds of the shape's parameters, and the shapes' probabilities.
         chance_off
             Probability that a length is off by three times the target sd, see
-            `stopping_rule.probability_of_length_off`; it counts if the sensor is doubted, since the posterior then has
-            tails that sds do not show.
+            `stopping_rule.probability_of_length_off`. With `trust` below 1, this probability must be below 1 %, since
+            the posterior then has tails that sds do not show.
         """
         likely = max(shapes.values(), default=1.0)
         sure = self.trust == 1 or chance_off < MOST_OFF
@@ -302,7 +302,7 @@ class Experiment:
     """The old name of `may_stop`."""
 
     def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
-        """Return the settings for a journal's first line."""
+        """Return the settings for a journal's first line as JSON values; models and likelihoods also by digest."""
         method = {} if self.method is None else {"method": repr(self.method)}
         return {
             "version": __version__,
@@ -344,10 +344,10 @@ class Experiment:
 
 
 def largest_sd_mm(names: tuple[str, ...], sd: FloatArray) -> float:
-    """Return the largest sd among the parameters in mm (by name); NaN is ignored."""
+    """Return the largest sd among the parameters whose names end in _mm; NaN is ignored."""
     return float(np.nanmax([value for name, value in zip(names, sd, strict=True) if name.endswith("_mm")]))
 
 
 def seed_text(seed: np.random.SeedSequence) -> str:
-    """Return the seed as text, since it may exceed a JSON number."""
+    """Return the seed's entropy as text, since that integer may exceed a JSON number."""
     return str(seed.entropy) if isinstance(seed.entropy, int) else ",".join(str(word) for word in seed.entropy or ())

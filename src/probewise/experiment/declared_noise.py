@@ -19,8 +19,8 @@ from probewise.inference.rounded import ScaleEnds
 class DeclaredNoise:
     """Gaussian noise of sd `sd`, clipped to a scale and rounded to `step` within it (0: not rounded).
 
-    Methods return the log density of each reading, (n_samples, n_points). Of rounded readings they return the log
-    probability of the rounding cell, and of a reading at an end of the scale that of everything beyond it.
+    Methods return the log density of each reading, (n_samples, n_points); for rounded readings, the log probability of
+    the rounding cell, and for a reading at an end of the scale, the log probability of all values beyond.
     """
 
     sd: float
@@ -63,9 +63,9 @@ class DeclaredNoise:
         return self._with_probability_beyond_ends(readings, predicted, sd, within)
 
     def quick_log_density(self, readings: FloatArray, predicted: FloatArray, *, sd: float) -> FloatArray:
-        """Return the same as `log_density`, faster if the noise is wider than the rounding cell.
+        """Return the same as `log_density`, approximately and faster if the noise is wider than the rounding cell.
 
-        Then the density at the middle of the cell is used, with the variance of a uniform cell added.
+        In that case, take the density at the cell's middle, with the variance of a uniform cell added to the noise's.
         """
         if sd < self.step:
             return self.log_density(readings, predicted, sd=sd)
@@ -75,7 +75,7 @@ class DeclaredNoise:
         )
 
     def log_uniform_density(self, readings: FloatArray, low: float, high: float) -> FloatArray:
-        """Return the log density of readings, (n_points,), that are uniform from `low` to `high`; -inf beyond."""
+        """Return the log density, (n_points,), of readings that are uniform from `low` to `high`; -inf outside."""
         width = np.full(len(readings), self.step or 1.0)
         if self.ends is not None:
             width = np.where(
@@ -90,7 +90,7 @@ class DeclaredNoise:
     def _with_probability_beyond_ends(
         self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, within: FloatArray
     ) -> FloatArray:
-        """Replace the log densities of readings at an end of the scale by the log probability of all beyond it."""
+        """Replace the log densities of readings at an end of the scale by the log probability of all values beyond."""
         inside = self.inside_scale_mask(readings)
         if self.ends is None or inside.all():
             return within

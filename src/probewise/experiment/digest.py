@@ -14,15 +14,15 @@ from probewise.errors import ParameterError
 
 
 def value_digest(value: object) -> str:
-    """Digest a value built of frozen dataclasses, arrays, numbers and texts (sha256, hex).
+    """Digest a value built of dataclasses, arrays, mappings, sequences, numbers and texts (sha256, hex).
 
-    Two values have the same digest when their types, their fields and every bit of their
-    numbers are the same, in whatever process.
+    Two values have the same digest when their types, their fields and every bit of their numbers are the same, in
+    whatever process; a list counts as a tuple.
 
     Raises
     ------
     ParameterError
-        If it holds anything else, such as a function, which has no reproducible digest.
+        If the value holds anything else, such as a function, which has no reproducible digest.
     """
     digest = hashlib.sha256()
     _add_to_digest(digest, value)

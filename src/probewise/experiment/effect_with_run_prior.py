@@ -1,9 +1,8 @@
 """An effect with the prior that a single run needs: sizes large enough to matter, and times within the run.
 
-A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small for the dozen readings
-of a run. Such an effect changes neither the readings nor the shape: it counts as nothing left out. A change point
-is log-uniform over up to a hundred readings. A patch may lie anywhere on the
-field, not only along scanned lines.
+A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small to change the dozen readings
+of a run or its shape; here these are excluded. A change point is log-uniform over up to a hundred readings. A patch may
+lie anywhere on the field, not only along scanned lines.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class EffectWithRunPrior(WrappedEffect[Any]):
         return Product({name: self._marginal_for_run(name, marginal) for name, marginal in own.marginals.items()})
 
     def _marginal_for_run(self, name: str, marginal: Any) -> Any:
-        """Return a parameter's marginal without small sizes, or that of a change point within the run."""
+        """Return a parameter's marginal prior: a size without small values, a change point within the run, or as is."""
         if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
             return replace(marginal, smallest=_SMALLEST)
         return self.within_run.get(name, marginal)

@@ -1,4 +1,4 @@
-"""Evidence re-estimated from posterior samples, by bridge sampling with kernels fitted to them.
+"""Evidence re-estimated from posterior samples, by bridge sampling with kernels fitted to the samples.
 
 The sequential estimate of the evidence accumulates errors from reading to reading. Bridge sampling (Meng & Wong 1996)
 between the samples and draws from a kernel density fitted to them gives an estimate independent of the history. Each
@@ -46,7 +46,7 @@ def bridged_evidence(
     Parameters
     ----------
     posterior
-        Samples of its posterior.
+        Samples of the problem's posterior.
     problem
         Prior and likelihood.
     rng
@@ -56,8 +56,8 @@ def bridged_evidence(
 
     Returns
     -------
-    The mean of the two halves' evidences; its error is their standard error, or half their difference if larger. If too
-    few samples are distinct to fit kernels: the posterior's own evidence, with an error of 2 nats or more.
+    The mean of the evidences of two halves of the samples; its error is their standard error, or half the difference of
+    their logs if larger. If too few samples are distinct: the posterior's own evidence, its error 2 nats or more.
     """
     n = len(posterior.theta) // 2 * 2
     rows = resampled_rows(posterior.weight, n, rng)
@@ -88,7 +88,7 @@ def bridged_evidence(
 def posterior_sampled_about_points(
     points: FloatArray, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
 ) -> Weighted:
-    """Sample the posterior by importance sampling from kernels about points.
+    """Sample the posterior by importance sampling from a kernel density fitted to points.
 
     Parameters
     ----------
@@ -112,9 +112,9 @@ def posterior_sampled_about_points(
 def importance_weighted_draws(
     draws: FloatArray, log_density: Callable[[FloatArray], FloatArray], problem: SensorProblem, *, least: int = 1
 ) -> Weighted | None:
-    """Weigh draws from a density, (n_draws, n_params), by prior times likelihood over that density.
+    """Weight draws from a density, (n_draws, n_params), by prior times likelihood over that density.
 
-    None if fewer than `least` of them are possible.
+    Impossible draws are dropped; None if fewer than `least` remain.
     """
     theta = draws[np.isfinite(problem.prior.log_prob(draws))]
     log_likelihood = problem.log_likelihood(theta) if len(theta) else np.empty(0)
@@ -133,7 +133,7 @@ def importance_weighted_draws(
 
 @dataclass(frozen=True, eq=False)
 class _KernelDensity:
-    """A mixture of kernels with local widths, and some wider ones."""
+    """A density of local kernels, mixed with the same kernels three times as wide (15 %)."""
 
     near: LocalKernels
     far: LocalKernels
@@ -152,7 +152,7 @@ class _KernelDensity:
 
 
 def _bridged_log_z_and_error(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> tuple[float, float]:
-    """Return log evidence and error, from log ratios of prior times likelihood to density at draws and samples."""
+    """Return log evidence and error, from log ratios (prior times likelihood over density) at draws and at samples."""
     n_draws = len(at_draws)
     if not np.isfinite(at_draws).any():
         return -math.inf, math.inf

@@ -18,13 +18,13 @@ class FittedArm:
     Parameters
     ----------
     geometry
-        The arm's, fitted to marks.
+        The arm's geometry, fitted to marks; ParameterError for one without accuracy.
     levels
-        Readings over black and over white. Light above black falls with the height as the geometry says, otherwise with
-        its square.
+        Readings over black and over white. Light above black falls with the height by `geometry.light_per_mm`, or with
+        the height's square if that is None.
     calibrated_mm
         Place on the field where this arm took the readings of the calibration: the sensor's levels include the error of
-        the height there. Default: the middle of the field, as in `arm record`.
+        the height there. None: the middle of the field, as in the command `arm record`.
     """
 
     geometry: Geometry

@@ -26,9 +26,9 @@ _POLYGONS = {3: "triangle", 4: "square", 5: "pentagon", 6: "hexagon", 8: "octago
 
 @dataclass(frozen=True)
 class FoundParameter:
-    """A parameter of the shape: its name, which ends in its unit, and its posterior.
+    """A parameter of the shape: its name, which ends in its unit, and its posterior mean, sd and 95 % interval.
 
-    `arm_sd` is the part of the sd that is due to the arm's own error; None if that is unknown and not included.
+    `arm_sd` is the part of the sd that is due to the arm's own error; None if that error is unknown and not included.
     """
 
     name: str
@@ -71,7 +71,7 @@ def found_shape(run: Exploration) -> FoundShape:
 
 
 def result_json(run: Exploration) -> str:
-    """Serialise the result and its cost as strict JSON, format "exploration/1"."""
+    """Return a run's result, with its numbers of readings and seconds, as strict JSON, format "exploration/1"."""
     require_exploration(run)
     document = {
         "format": FORMAT,

@@ -35,7 +35,7 @@ def experiment_from_names(
     heights_mm: tuple[float, ...] = (),
     cards: tuple[Card, ...] = (),
 ) -> Experiment:
-    """Build an experiment; None means the method's default.
+    """Build an experiment; an option of None takes the default of the method.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def experiment_from_names(
     Raises
     ------
     ParameterError
-        If an option does not go with the method.
+        If a name is unknown, or an option does not go with the method.
     """
     bin_width = entropy_bin_width_of(sensor)
     chosen = utility_named(utility, bin_width=bin_width) if isinstance(utility, str) else utility

@@ -32,12 +32,12 @@ class HiddenShape:
 
     @classmethod
     def from_parameters(cls, name: str, shape: Shape, theta: FloatArray, *, called: str = "truth") -> HiddenShape:
-        """Build from parameters that the shape's prior allows; `called` is their name in messages.
+        """Build from parameters, (n_params,); `called` is the name of these in messages.
 
         Raises
         ------
         ParameterError
-            If the number of parameters is wrong, or the prior excludes one.
+            If the number of parameters is wrong, or the shape's prior excludes one, given the others.
         """
         prior = shape.prior
         values = floats(theta, called)
@@ -57,7 +57,7 @@ class HiddenShape:
 
     @classmethod
     def drawn_from_prior(cls, members: Mapping[str, Shape], *, rng: np.random.Generator) -> HiddenShape:
-        """Draw one of several shapes, and its parameters from its prior."""
+        """Draw one of several shapes, all equally probable, and its parameters from its prior."""
         require_rng(rng)
         name = list(members)[int(rng.integers(len(members)))]
         prior = members[name].prior
@@ -67,12 +67,12 @@ class HiddenShape:
     def given_or_drawn(
         cls, truth: Truth | None, members: Mapping[str, Shape], field: Field, *, rng: np.random.Generator
     ) -> HiddenShape:
-        """Build from given parameters, of the first member or as {shape: parameters}; if `truth` is None, draw a shape.
+        """Build from parameters, of the first of `members` or as {shape: parameters}; None: draw shape and parameters.
 
         Raises
         ------
         ParameterError
-            If the name is unknown, or the shape's prior excludes the numbers.
+            If the shape's name is unknown, or its prior excludes the numbers.
         """
         if truth is None:
             return cls.drawn_from_prior(members, rng=rng)
@@ -90,28 +90,28 @@ class HiddenShape:
 
     @property
     def journal_entry(self) -> dict[str, str | float]:
-        """Its entry in a journal, since a resumed run needs the same shape."""
+        """The shape's name and parameters for the journal's first line, since a resumed run needs the same shape."""
         return {"shape": self.name, **self.parameters}
 
     @property
     def surface(self) -> Surface:
-        """Its surface in the simulated world, which shares only geometry with the models."""
+        """The shape's surface in the simulated world, which shares only geometry with the models."""
         return surface_of_region(self.shape.region(self.theta[None, :]), self.name)
 
     @property
     def outline_mm(self) -> FloatArray:
-        """Its outline, closed, (n_points, 2)."""
+        """The shape's outline, closed, (n_points, 2)."""
         return outlines(self.shape.region(self.theta[None, :]))[0]
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Its parameters by name."""
+        """The shape's parameters by name."""
         return dict(zip(self.shape.prior.names, self.theta.tolist(), strict=True))
 
     def parameters_by_hypothesis_name(self, names: Sequence[str]) -> dict[str, float]:
-        """Return its parameters under the names of a hypothesis, such as "rectangle.width_mm" in a set of shapes.
+        """Return the parameters under the names of a hypothesis, such as "rectangle.width_mm" in a set of shapes.
 
-        Names of parameters that it does not have are left out.
+        Of `names`, those of parameters that this shape does not have are left out.
         """
         known, prefix = self.parameters, f"{self.name}."
         return {name: known[name.removeprefix(prefix)] for name in names if name.removeprefix(prefix) in known}
@@ -128,7 +128,7 @@ def possible_shapes_by_name(shape: Shape) -> dict[str, Shape]:
 def _theta_in_prior_order(names: Sequence[str], values: object) -> FloatArray:
     """Convert parameters, given by name or already in order, to an array in the order of `names`, (n_params,).
 
-    Raises ParameterError for other names than these.
+    Raises ParameterError if the names of the parameters are not `names`.
     """
     if not isinstance(values, Mapping):
         return floats(values, "truth")  # type: ignore[arg-type]

@@ -5,8 +5,8 @@ options. Every further line is a measurement: index, pose, time, reading and cov
 (mean and sd of each parameter, bits gained) and the next pose.
 
 A line reaches the disk in two parts. The reading is written and synchronised as soon as it is taken; the posterior
-summary ("belief") follows after inference. So a process that is killed at any time loses no reading: a last line
-without its summary is read as a reading alone, and one truncated earlier is dropped with a note.
+summary (key "belief") follows after inference. So a process that is killed at any time loses no reading: a last line
+without its summary is read as a reading alone, and a last line without a whole reading is dropped with a note.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class PosteriorSummary:
 
 @dataclass(frozen=True)
 class Entry:
-    """One measurement of a journal; `summary` is None if the run was killed before inference."""
+    """One measurement of a journal, its index from 1; `summary` is None if the run was killed before inference."""
 
     index: int
     reading: Reading
@@ -66,8 +66,8 @@ class Entry:
 class Journal:
     """Content of a journal file: settings, measurements, notes on dropped lines.
 
-    `n_bytes` is the length of the valid part, up to the last whole line or the reading of a truncated one; `n_torn`
-    that of the rest, which is removed on resuming.
+    `n_bytes` is the length of the valid part, up to the last whole line or the reading of a truncated one; `n_torn` is
+    the length of the rest, which is removed on resuming.
     """
 
     path: str
@@ -137,7 +137,7 @@ def recording_of(
 
 
 def _covariates_with_height(reading: Reading) -> Mapping[str, float]:
-    """Return a reading's covariates, with the commanded height of its pose where the instrument tells none."""
+    """Return a reading's covariates; `height_mm` is the pose's, if the pose has one and the covariates have none."""
     height_mm = reading.pose.height_mm
     return reading.covariates if height_mm is None else {"height_mm": height_mm, **reading.covariates}
 
@@ -193,7 +193,7 @@ def _parse_line(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
 
 
 def _line_without_summary(tail: bytes) -> bytes:
-    """Return an incomplete line without the posterior summary, of which a part may be written."""
+    """Return the start of an incomplete line, up to its reading, without the written part of the posterior summary."""
     mark = _SUMMARY_KEY.encode()
     head = tail.split(mark)[0]
     torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
@@ -211,7 +211,7 @@ def _parse_entry_without_summary(path: str | Path, head: bytes, index: int) -> E
 
 
 def _parse_entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
-    """Parse a measurement from a line's JSON object; errors name the row and the column."""
+    """Parse a measurement from a line's JSON object; a FileError names the row and the entry."""
     column = "index"
     try:
         index = line["index"]
@@ -238,7 +238,7 @@ def _parse_summary(line: Mapping[str, Any]) -> PosteriorSummary:
 
 
 def _null_if_nan(value: float) -> float | None:
-    """Return None for NaN (a missing reading or covariate) and infinities, which JSON has not; else the value."""
+    """Return None for NaN (a missing reading or covariate) and infinities, which JSON lacks; else the value."""
     return value if math.isfinite(value) else None
 
 
@@ -267,7 +267,7 @@ def _pose_as_json(pose: Pose) -> dict[str, float]:
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
     """Raise FileError with every setting in which a journal differs from the run that would resume it.
 
-    Version, arm and the name of the sensor's file may differ.
+    Version, arm, spawn key and the name of the sensor's file may differ.
     """
     there, here = _flattened_settings(journal.settings), _flattened_settings(json.loads(json.dumps(settings)))
     different = sorted(name for name in {*there, *here} - _FREE if there.get(name) != here.get(name))
@@ -282,7 +282,7 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
 
 
 def _flattened_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Flatten nested settings, such as "options.repeats", so that a message shows only the differences."""
+    """Flatten settings of two levels, to names such as "options.repeats", so that a message shows only differences."""
     out: dict[str, Any] = {}
     for name, value in settings.items():
         inner = value.items() if isinstance(value, dict) else ()
@@ -329,12 +329,12 @@ class JournalWriter:
     def resume(cls, journal: Journal) -> JournalWriter:
         """Continue after the last whole line of a journal, or the reading of a truncated one, and remove the rest.
 
-        A reading in an incomplete last line is kept, and its summary is appended.
+        After such a reading, `write_summary` completes the line.
 
         Raises
         ------
         FileError
-            If the file cannot be written, another process writes to it, or one has since it was read.
+            If the file cannot be written, or another process writes to it or has changed it since it was read.
         """
         with contextlib.ExitStack() as stack:
             stack.enter_context(hold_lock(journal.path))

@@ -29,9 +29,9 @@ _FEW = 600  # points up to which all distances are faster than a tree
 class LocalKernels:
     """A mixture of equally weighted Gaussians.
 
-    `centre` (n_kernels, n_params) are their means relative to `origin`, `root` (n_kernels, n_params, n_params) the
-    Cholesky factors of their covariances. `form` (n_features, n_kernels) gives the log density of each kernel as a
-    product with a point's features: one, the coordinates about `origin`, and their products.
+    `centre` (n_kernels, n_params) are the means relative to `origin`, `root` (n_kernels, n_params, n_params) the
+    Cholesky factors of the covariances. A point's features (1, its coordinates relative to `origin`, the products of
+    two coordinates) times `form` (n_features, n_kernels) are the log densities of the kernels there.
     """
 
     origin: FloatArray
@@ -43,7 +43,7 @@ class LocalKernels:
     def fitted_to(
         cls, points: FloatArray, *, rng: np.random.Generator, widened: float = 1.0, most: int = MOST_KERNELS
     ) -> Self:
-        """Fit at most `most` kernels to equally weighted samples, (n_samples, n_params), widened by a factor."""
+        """Fit at most `most` kernels to equally weighted samples, (n_samples, n_params), `widened` times as wide."""
         n_samples, n_params = points.shape
         origin = points.mean(axis=0)
         away = points - origin
@@ -86,7 +86,7 @@ class LocalKernels:
         return np.asarray(self.origin + self.centre[which] + np.einsum("nij,nj->ni", self.root[which], white))
 
     def log_density(self, points: FloatArray) -> FloatArray:
-        """Return the natural log of the density, (n, n_params) -> (n,)."""
+        """Return the natural log of the mixture's density at points, (n, n_params) -> (n,)."""
         upper = _upper_triangle_indices(points.shape[1])
         out = np.empty(len(points))
         for start in range(0, len(points), _BLOCK):
@@ -101,7 +101,7 @@ class LocalKernels:
 
 
 def _nearest_rows(points: FloatArray, rows: IntArray, n: int) -> IntArray:
-    """Return the indices of the `n` points nearest to each point of `rows`, itself included, (n_rows, n), unordered."""
+    """Return the indices, (n_rows, n), of the `n` points nearest to each point of `rows`, itself included; no order."""
     if len(points) > _FEW:
         return np.asarray(cKDTree(points).query(points[rows], k=n)[1].reshape(len(rows), n))
     square = (points**2).sum(axis=1)

@@ -1,4 +1,4 @@
-"""The kinds of hypotheses that a run compares: combinations of a shape and an effect that the sensor leaves out."""
+"""The kinds of hypotheses that a run compares: a shape, with an effect that the sensor model leaves out or none."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from probewise.sensor.stages import SensorModel
 
 @dataclass(frozen=True, eq=False)
 class HypothesisKind:
-    """A model with its own parameters and evidence, whose hypotheses are parameter values.
+    """A model with its own parameters and evidence; one of several that a run compares.
 
     Attributes
     ----------
     shape
-        Its shape in a set of shapes; empty for a single shape.
+        Name of the model's shape in a set of shapes; "" for a single shape.
     left_out
-        The effect that the sensor model leaves out; empty if none.
+        Name of the effect that the sensor model leaves out; "" if none.
     log_prior
-        Natural log of its prior probability.
+        Natural log of the model's prior probability.
     prior, model, likelihood
-        Prior, model and likelihood of its own parameters.
+        Prior, model and likelihood of the model's own parameters.
     to_whole_theta
-        Converts its hypotheses, (n, n_own), to those of the whole experiment, (n, n_params): missing parameters are
-        drawn from the prior, and those of the effect are dropped.
+        Function of the model's parameters, (n, n_own), and a random generator; returns the parameters of the whole
+        experiment, (n, n_params): missing ones are drawn from the prior, the effect's are dropped.
     whole_names
         Names of the experiment's parameters.
     effect
@@ -79,15 +79,21 @@ def kinds_of(
     shape
         The possible shape; each shape of a set has kinds of its own.
     sensor_prior
-        Prior of the parameters before the shape's, shared by every kind; or None.
+        Prior of the sensor's parameters, which come before the shape's in every kind; None: the sensor is known.
     prior, likelihood
         Prior and likelihood of all parameters of the experiment.
     models
         The sensor model, from tables where possible, for kinds without effects; the chain to which effects are added.
     trust
         Prior probability that the sensor model is complete, below 1 if there are rivals, which share the rest equally.
+        Below 1, the kinds without a rival also infer the effects that a repair of the sensor estimated.
     rivals
         Effects that the sensor model may leave out, and other likelihoods; those of one name share one probability.
+
+    Raises
+    ------
+    ParameterError
+        If an effect is to be added to a sensor model that is no `Chain`.
     """
     quick, chain = models
     ways = Counter(rival.name for rival in rivals)
@@ -133,7 +139,7 @@ def kinds_of(
 def _prior_and_model_with_estimated_effects(
     own: Prior, chain: SensorModel, quick: SensorModel
 ) -> tuple[Prior, SensorModel]:
-    """Return prior and model with the parameters of effects that a repair estimated; unchanged if there are none."""
+    """Return prior and model with parameters for the effects that a repair of the sensor estimated, if any."""
     estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
     if not estimated or not isinstance(chain, Chain):
         return own, quick
@@ -146,9 +152,10 @@ def _prior_and_model_with_estimated_effects(
 
 @dataclass(frozen=True, eq=False)
 class _MemberShape:
-    """One shape of a set, or the single one: its prior with the sensor's, its prior probability, its columns of theta.
+    """One shape of a set, or the single one: `prior` of the sensor's and its parameters, and their columns of theta.
 
-    `number` is its index in the set, None for a single shape; `n_sensor` the number of columns before the shape's.
+    `share` is the shape's prior probability, `whole` the experiment's prior, `number` the shape's index in the set (for
+    a single shape, None), `n_sensor` the number of columns of the sensor's parameters, which come first.
     """
 
     label: str
@@ -160,7 +167,7 @@ class _MemberShape:
     n_sensor: int
 
     def to_whole_theta(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Convert own hypotheses, (n, n_own), to those of the experiment: draw what is missing, drop the effect's."""
+        """Return the experiment's parameters for own ones, (n, n_own); draw those missing, drop the effect's."""
         if self.number is None:
             return theta[:, : len(self.columns)]
         u = rng.random((len(theta), len(self.whole.names)))
@@ -170,7 +177,7 @@ class _MemberShape:
         return np.asarray(full)
 
     def restrict_model(self, whole: SensorModel) -> SensorModel:
-        """Restrict a model of all parameters, followed by those of an effect, to this shape."""
+        """Restrict a model of all parameters, and perhaps an effect's after these, to the parameters of this shape."""
         if self.number is None:
             return whole
         middle = self.whole.from_unit_cube(np.full((1, len(self.whole.names)), 0.5))[0]
@@ -182,7 +189,7 @@ class _MemberShape:
 
 
 def _member_shapes(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_MemberShape]:
-    """List the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
+    """Return the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
     if not isinstance(shape, AnyOf):
         return [_MemberShape("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
@@ -196,7 +203,7 @@ def _member_shapes(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> li
 
 @dataclass(frozen=True, eq=False)
 class _RestrictedModel:
-    """A model restricted to some parameters; the others, which have no influence, are fixed."""
+    """A model of the parameters `columns` of a larger one; the other columns, without influence, stay at `others`."""
 
     whole: SensorModel
     names: tuple[str, ...]
@@ -204,7 +211,6 @@ class _RestrictedModel:
     others: FloatArray
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Return noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
         full = np.tile(self.others, (len(theta), 1))
         full[:, self.columns] = theta
         return self.whole.predict(full, plan)
@@ -212,24 +218,20 @@ class _RestrictedModel:
 
 @dataclass(frozen=True, eq=False)
 class _PrefixedPrior:
-    """An effect's prior with the parameter names of a chain."""
+    """An effect's prior with parameter names as in a chain, "effect.parameter"."""
 
     effect: str
     own: Prior
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names as "effect.parameter"."""
         return tuple(f"{self.effect}.{name}" for name in self.own.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map unit-cube coordinates to parameters, both (n_samples, n_params)."""
         return self.own.from_unit_cube(u)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map parameters to unit-cube coordinates, both (n_samples, n_params)."""
         return self.own.to_unit_cube(theta)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the natural log of the density, (n_samples, n_params) -> (n_samples,)."""
         return self.own.log_prob(theta)

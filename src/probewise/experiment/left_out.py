@@ -27,10 +27,9 @@ _ALIASES = (
 
 @dataclass(frozen=True)
 class LeftOutEffects:
-    """Probability of each effect by name, most probable first, and a sentence.
+    """Probability of each effect that the sensor model may leave out, most probable first ("clean": none); a sentence.
 
-    `wary` holds the same probabilities with the odds of every effect multiplied by `posterior.WARY`. `leading` is the
-    name of the most probable.
+    `wary` holds the same probabilities with the odds of every effect multiplied by 12 (`posterior.WARY`).
     """
 
     probability: Mapping[str, float]
@@ -44,7 +43,7 @@ class LeftOutEffects:
 
     @property
     def credible_set(self) -> tuple[str, ...]:
-        """Names that hold 95 % of the probability, and every other with 5 % or more in `wary`."""
+        """The most probable names, which together have 95 %, and every other name with 5 % or more in `wary`."""
         held, names = 0.0, []
         for name, p in self.probability.items():
             if held < _CREDIBLE or self.wary[name] >= 1.0 - _CREDIBLE:
@@ -53,7 +52,7 @@ class LeftOutEffects:
         return tuple(names)
 
     def as_json(self) -> dict[str, Any]:
-        """Return its entry in result.json."""
+        """Return the entry "left_out" of result.json."""
         hypotheses = [
             {"effects": [] if name == CLEAN else [name], "probability": p} for name, p in self.probability.items()
         ]
@@ -61,7 +60,7 @@ class LeftOutEffects:
 
 
 def left_out_after_step(last: Step, trust: float) -> LeftOutEffects:
-    """Summarise the probabilities of left-out effects after a step, in a run with this prior trust in its sensor."""
+    """Summarise the probabilities of left-out effects after a step, in a run with this `Experiment.trust`."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     probability = {name: p for p, name in shares}
     wary = {name or CLEAN: p for name, p in last.kinds.with_raised_fault_odds.left_out.items()}
@@ -101,10 +100,10 @@ def _effect_sentence(last: Step, name: str) -> str:
 
 
 def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:
-    """Return the sensor with the effect that a run found, and with its remaining uncertainty.
+    """Return the sensor with the effect that a run found, with samples of its parameters after step `last`.
 
-    If no effect has a probability of one half or more, the sensor is returned as it is. A noise effect, one in the time
-    of the run, or one that the sensor has already, is only mentioned in a note.
+    If no effect has a probability of one half or more, the sensor is returned as it is. A noise effect, an effect in
+    the time of the run, or an effect that the sensor has already, is only mentioned in a note.
     """
     name, p = max(last.left_out.items(), key=lambda item: item[1])
     if not name or p < _NAMED:

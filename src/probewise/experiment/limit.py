@@ -14,11 +14,11 @@ _MET = 5.0  # noise sds from the background at which a reading counts as on the 
 
 
 def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_samples: int = 20_000) -> Bound:
-    """Return the bound: bits needed over bits per reading, for search and refinement separately.
+    """Return a lower bound on the mean number of readings: bits needed over bits per reading, search plus refinement.
 
-    The search ends with the first reading on the shape. The best first place is on the shape with some probability p:
-    its reading carries at most the information of a yes or no with that probability, and a yes leaves a share p of all
-    hypotheses. From there to the target sd, every reading carries at most the sensor's capacity.
+    The search ends with the first reading on the shape. Any reading before is on the shape with probability p at most,
+    that of the best first place, and so carries at most the information of a yes or no with probability p; a yes leaves
+    a share p of all hypotheses. From there to the target sd, a reading carries at most the sensor's capacity.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def step(
     rng
         Random generator of this step.
     max_readings
-        Limit of readings at which the run ends.
+        Number of readings at which the run ends; None: no limit.
 
     Returns
     -------
@@ -204,7 +204,7 @@ def _wary_kinds_and_posterior(
 
 
 def _goal_less_arm_error(experiment: Experiment, arm: ArmError | None) -> Goal | None:
-    """Return the goal for the readings alone: the target variance less the arm's; None: the experiment's own goal."""
+    """Return the goal for the readings alone, the target variance less the arm's; None stands for the usual goal."""
     goal = experiment.goal
     if arm is None or goal is None:
         return None
@@ -216,7 +216,7 @@ def _goal_less_arm_error(experiment: Experiment, arm: ArmError | None) -> Goal |
 def _may_stop_and_chance_off(
     experiment: Experiment, posterior: Weighted, arm: ArmError | None, likely: str, rng: np.random.Generator
 ) -> tuple[bool, float]:
-    """Return whether a posterior meets the stopping rule, arm included, and the probability that a length is off."""
+    """Return whether a posterior with the arm's error meets the stopping rule, and the chance that a length is off."""
     _, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     if arm is not None:
         sd = np.hypot(sd, arm.sd)
@@ -239,9 +239,9 @@ def explore(
     journal: str | Path | Journal | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Generator[Step, None, None]:
-    """Let the robot find the shape: yield one step per reading until the target precision (paper, section 2).
+    """Let the robot find the shape: yield one `Step` per reading until the target precision (paper, section 2).
 
-    A generator that is not exhausted keeps its journal locked until it is closed.
+    A generator that is not exhausted keeps its journal locked until the generator is closed.
 
     Parameters
     ----------
@@ -251,8 +251,8 @@ def explore(
     experiment
         The experiment: shape, sensor model, stopping rule.
     rng
-        Source of the run's seed: a child of its seed sequence, with a child for each reading. So one seed determines
-        the whole run, and a resumed run continues bit for bit as if it had not been interrupted.
+        Generator whose seed sequence gives the run's seed, as a child; each reading's seed is a child of that. So one
+        seed determines the whole run, and a resumed run continues bit for bit as if it had not been interrupted.
     max_readings
         Largest number of readings.
     journal
@@ -271,7 +271,7 @@ def explore(
     FileError
         If the journal is damaged, belongs to a run with other settings, or is written to by another process.
     ParameterError
-        If the journal holds more than `max_readings` readings.
+        If the journal holds more than `max_readings` readings, or no place is more informative than others.
     NotConvergedError
         If no hypothesis could have given the readings.
     LinkError
@@ -312,7 +312,7 @@ def run(
 ) -> Exploration:
     """Run `explore` to its end and collect the steps; `progress` is called with each step.
 
-    `hidden` is the true shape of a simulated field, for reports and the journal; the run does not use it.
+    `hidden` is the true shape of a simulated field, for reports and the journal; the inference does not use that shape.
     """
     if progress is not None:
         require_callable("progress", progress, "a function that is called with every Step, or None")
@@ -336,7 +336,7 @@ def _yield_steps(
     before: Journal | None,
     settings: Mapping[str, Any],
 ) -> Generator[Step, None, None]:
-    """Yield the steps: those of the journal `before`, then those of new readings, written to `path`."""
+    """Yield the steps: those of the journal `before`, then those of new readings, which are written to `path`."""
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
     field = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
     first = _rng_of_reading(seed, 0)
@@ -390,7 +390,7 @@ def _journal_writer(
 
 
 def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
-    """Derive a run's seed: runs that share a generator differ, independent of other draws from it."""
+    """Spawn a run's seed from the generator's seed sequence: another at each call, whatever was drawn in between."""
     seed = rng.bit_generator.seed_seq
     if not isinstance(seed, np.random.SeedSequence):
         seed = np.random.SeedSequence([int(word) for word in rng.integers(2**32, size=4)])
@@ -398,7 +398,7 @@ def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
 
 
 def _seed_of_journal(journal: Journal, seed: np.random.SeedSequence) -> np.random.SeedSequence:
-    """Return the seed of the run in a journal, a child of the same parent as `seed`; raise FileError without one."""
+    """Return the seed of a journal's run, a child of the same parent as `seed`; FileError if the journal has none."""
     key = journal.settings.get("spawn_key")
     if not isinstance(key, list) or not all(isinstance(word, int) and word >= 0 for word in key):
         allowed = "a list of whole numbers, as explore writes it"
@@ -407,7 +407,7 @@ def _seed_of_journal(journal: Journal, seed: np.random.SeedSequence) -> np.rando
 
 
 def _rng_of_reading(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
-    """Return the generator of one reading, from 1 (0: before the first), independent of draws for the others."""
+    """Return the random generator for reading `number`, from 1 (0: before the first)."""
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
 
 

@@ -1,8 +1,8 @@
 """A last check before a run ends: nested sampling on all readings looks for what the samples have lost.
 
-Samples that are carried from reading to reading follow the modes that they have. One that held a percent of the
-posterior after six readings may hold all of it after ten; if its last samples died between, nothing brings it back, and
-the rest is narrow and wrong.
+Samples that are carried from reading to reading keep only the modes that they have. A mode that held a percent of the
+posterior after six readings may hold all of it after ten; if the last samples of that mode died in between, nothing
+brings the mode back, and the posterior is narrow and wrong.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ _LOST = 0.05  # share of a posterior that may lie beyond all of a kind's samples
 def with_lost_modes_found(
     posterior: Posterior, problems: list[SensorProblem], *, rng: np.random.Generator, from_scratch: SolverFromScratch
 ) -> Posterior:
-    """Return the posterior with modes that its samples had lost; as it is if they had lost none.
+    """Return the posterior with modes that its samples had lost; unchanged if none were lost.
 
-    Every probable shape is searched, with the sensor as it is. `problems` are those of the kinds, given all readings.
-    Samples are replaced if a twentieth of what was found lies beyond the range of all of them in some parameter.
+    Kinds without a left-out effect and with 2 % or more are searched, unless a recent search holds. `problems` are
+    those of the kinds, given all readings. A kind's samples are replaced by those of the search if 5 % more of the
+    latter than by chance lie outside the range of the former in some parameter.
     """
     particles, n_readings = list(posterior.particles), len(problems[0].recording)
     for k, (kind, probability) in enumerate(zip(posterior.kinds, posterior.probability.tolist(), strict=True)):
@@ -46,7 +47,7 @@ def with_lost_modes_found(
 
 
 def _share_beyond_own_samples(own: Weighted, found: Weighted) -> float:
-    """Return the share of the samples found beyond the range of a kind's own in some parameter, less chance's part."""
+    """Return the share of `found` outside the range of `own` in some parameter, less the share expected by chance."""
     kept = own.theta[own.weight > 0]
     outside = ((found.theta < kept.min(axis=0)) | (found.theta > kept.max(axis=0))).any(axis=1)
     by_chance: float = 2 * kept.shape[1] / (len(kept) + 1)

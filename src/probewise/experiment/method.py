@@ -26,7 +26,7 @@ _DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value
 
 
 class Method(Protocol):
-    """Inference after every reading. A frozen dataclass, so that a journal can record it."""
+    """A method of inference after every reading; a frozen dataclass, so that a journal can record the method."""
 
     @property
     def label(self) -> str:
@@ -44,18 +44,15 @@ class Method(Protocol):
         ...
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Return the posterior with kinds sampled again whose samples may have lost the truth.
-
-        It is called before a run ends.
-        """
+        """Return the posterior with kinds sampled again whose samples may have lost the truth, before a run ends."""
         ...
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw the few hypotheses that figures show and the paper's utility uses, (n, n_params).
+        """Draw the `n` hypotheses that figures show and the paper's utility uses, (n, n_params).
 
-        `joined` is the posterior over all kinds of hypotheses, given the recording.
+        `posterior` holds the samples of each kind, `joined` the weighted samples of all kinds.
         """
         ...
 
@@ -87,7 +84,7 @@ class SequentialMonteCarlo:
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """Return the posterior with kinds sampled again whose samples may have lost the truth.
 
-        The check for lost modes has a generator of its own, so that a run in which it finds none goes on as without it.
+        The check for lost modes draws from a generator of its own: if no mode was lost, the run goes on as without it.
         """
         own = rng.spawn(1)[0]
         if any(kind.left_out for kind in posterior.kinds):
@@ -111,7 +108,7 @@ class SequentialMonteCarlo:
 def nested_sampling_from_scratch(
     problem: SensorProblem, *, n_live: int, rng: np.random.Generator, quick: bool = False
 ) -> NestedResult:
-    """Infer from all readings at once by nested sampling, when the samples cannot be updated."""
+    """Solve a problem, all readings at once, by nested sampling; with half of `n_live` live points if `quick`."""
     return run(
         problem,
         rng=rng,

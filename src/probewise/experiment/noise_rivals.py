@@ -35,7 +35,7 @@ _FREE = 2  # readings that determine the lattice
 
 
 def _log_mean_over_nodes(nodes: list[FloatArray]) -> FloatArray:
-    """Return the log of the mean over equally weighted nodes of equal shape; called too often for scipy's version."""
+    """Return the log of the mean of exp over a list of arrays, elementwise; faster than scipy's `logsumexp`."""
     stacked = np.stack(nodes)
     most = np.maximum(stacked.max(axis=0), _LEAST)
     stacked -= most
@@ -48,7 +48,7 @@ def _log_mean_over_nodes(nodes: list[FloatArray]) -> FloatArray:
 class OutlierLikelihood:
     """Likelihood with outliers, marginalised over their share and width.
 
-    `shares` and `sizes` (in sds of the declared noise), (n_nodes,), are equally weighted nodes.
+    `shares` of outliers and their `sizes` (sds over the noise's sd), (n_nodes,) each, are equally weighted pairs.
     """
 
     noise: DeclaredNoise
@@ -67,9 +67,10 @@ class OutlierLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class LostReadingLikelihood:
-    """Likelihood with lost readings, independent of the target.
+    """Likelihood with lost readings, independent of the target, marginalised over their share.
 
-    Lost readings are `black`, exactly or within the noise, or anything between `low` and `high`.
+    A lost reading is, with equal probability, exactly `black`, `black` with noise, or uniform over the sensor's range,
+    from `low` to `high` and some sds beyond.
     """
 
     noise: DeclaredNoise
@@ -93,7 +94,7 @@ class LostReadingLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedLikelihood:
-    """Likelihood with AR(1) noise, marginalised over the correlation."""
+    """Likelihood with AR(1) noise from reading to reading, marginalised over the correlation."""
 
     noise: DeclaredNoise
 
@@ -136,7 +137,7 @@ class SignalDependentLikelihood:
 class FlickerLikelihood:
     """Likelihood under a lamp that flickers faster than the readings: each reading has a random phase.
 
-    `amplitudes` are equally weighted nodes. A sine of uniform phase is approximated by a mixture over a few phases.
+    `amplitudes` are equally weighted nodes, in the reading's unit. A mixture over a few phases stands for the sine.
     """
 
     noise: DeclaredNoise
@@ -159,9 +160,9 @@ class FlickerLikelihood:
 class CoarserRoundingLikelihood:
     """Likelihood with coarser rounding than declared; if the readings show none, that of the declared noise.
 
-    A lattice is the set of multiples of the coarser step. Three different values or more determine it. If the declared
-    noise is not rounded, two values that recur determine it too. One value that recurs shows that there is a lattice;
-    its step is then marginalised over.
+    The coarser step is the largest whose lattice holds all readings, from three different values on. If the declared
+    noise is not rounded and values recur, two different values determine the step by their difference; with a single
+    value, the step is marginalised over.
     """
 
     noise: DeclaredNoise
@@ -186,7 +187,7 @@ class CoarserRoundingLikelihood:
         return _log_mean_over_nodes(nodes)
 
     def _rounding_steps_and_n_determining(self, readings: FloatArray) -> tuple[list[float], int]:
-        """Return possible steps of a lattice, equally weighted, and how many readings determine it."""
+        """Return possible rounding steps, equally weighted, and how many readings determine the step (are no test)."""
         values = np.unique(readings)
         recur = not self.noise.step and len(values) < len(readings)
         if recur and len(values) == 1:
@@ -198,7 +199,7 @@ class CoarserRoundingLikelihood:
     def _log_prob_if_rounded_to(
         self, coarse: float, n_free: int, readings: FloatArray, predicted: FloatArray
     ) -> FloatArray:
-        """Return the log likelihood under rounding to `coarse`, (n_samples,)."""
+        """Return the log likelihood under rounding to `coarse`, which `n_free` readings determine, (n_samples,)."""
         step = self.noise.step
         surprise = (len(readings) - n_free) * math.log(coarse / (step or _EXACT * self.noise.sd))
         density = self.noise.log_density(readings, predicted, step=coarse) - math.log(coarse)
@@ -216,7 +217,7 @@ NoiseLikelihood = (
 
 
 def noise_likelihoods(noise: DeclaredNoise, ends: tuple[float, float]) -> dict[str, NoiseLikelihood]:
-    """Return the noise models by their names in the vocabulary.
+    """Return the noise models, {name of the effect in the vocabulary: likelihood}.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""A run's own time ("paced time"), counted in readings: priors of drifts do not depend on the speed of the instrument.
+"""Paced time of a run, counted in readings, so that priors of drifts do not depend on the speed of the instrument.
 
-Priors of effects in time are set before the speed of the instrument is known. So these effects use the run's own time,
-in which each reading takes eight seconds on average.
+Priors of effects in time are set before the speed of the instrument is known. So these effects use paced time, which is
+0 at the first reading and scaled so that each reading takes eight seconds on average.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from probewise.recordings.plan import Plan, Recording
 from probewise.sensor.stages import Effect, Poses
 
 EACH_S = 8.0
-"""Seconds of a run's own time that each reading takes on average."""
+"""Seconds of paced time that each reading takes on average."""
 
 _COLUMN = "paced_s"
 
@@ -39,17 +39,17 @@ class Pace:
         return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
 
     def plan_with_paced_time(self, plan: Plan) -> Plan:
-        """Add a column with the run's own time to a plan."""
+        """Return the plan with a column of paced time."""
         own = (plan.time_s - self.start_s) * (EACH_S / self.each_s)
         return replace(plan, covariates={**plan.covariates, _COLUMN: own})
 
     def recording_with_paced_time(self, recording: Recording) -> Recording:
-        """Add a column with the run's own time to a recording's plan."""
+        """Return the recording with a column of paced time in its plan."""
         return replace(recording, plan=self.plan_with_paced_time(recording.plan))
 
 
 def paced_time_s(plan: Plan) -> FloatArray | None:
-    """Return the run's own time of each reading, (n_points,); None where the plan has no such column."""
+    """Return the paced time of each reading, (n_points,); None if the plan has no such column."""
     return plan.covariates.get(_COLUMN)
 
 
@@ -63,19 +63,19 @@ class DescribedEffect(Effect[Any], Protocol):
 
 @dataclass(frozen=True, eq=False)
 class EffectInPacedTime(WrappedEffect[FloatArray]):
-    """An effect whose times and rates are in paced time; in recorded time if the plan lacks that column."""
+    """An effect whose times and rates are in paced time; in recorded time if the plan has no paced time."""
 
     effect: DescribedEffect
 
     powers: ClassVar[Mapping[str, int]] = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Apply the effect in the run's own time, if the plan has it."""
+        """Apply the effect in paced time, or in recorded time if the plan has no paced time."""
         own = paced_time_s(plan)
         return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
 
     def theta_in_seconds(self, theta: FloatArray, pace: Pace) -> FloatArray:
-        """Convert parameters from the run's own time to seconds, any shape (..., n_params)."""
+        """Convert parameters, any shape (..., n_params), from paced time to seconds."""
         powers = np.array([self.powers.get(name, 0) for name in self.prior.names])
         return np.asarray(theta * (pace.each_s / EACH_S) ** powers)
 
@@ -86,7 +86,7 @@ class EffectInPacedTime(WrappedEffect[FloatArray]):
 
 @dataclass(frozen=True, eq=False)
 class FromRest(WrappedEffect[Any]):
-    """An effect of the direction of motion that spares a run's first reading: before it, the arm may have rested."""
+    """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
 
     effect: DescribedEffect
 

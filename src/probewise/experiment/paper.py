@@ -100,13 +100,13 @@ class NestedSampling:
         return now
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Return the posterior as it is: every reading starts nested sampling anew, so no samples lose the truth."""
+        """Return the posterior as it is: nested sampling starts anew at every reading, so no samples lose a mode."""
         return posterior
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw `n` hypotheses, (n, n_params); each takes steps of its own, since a run's samples may be copies."""
+        """Draw `n` hypotheses, (n, n_params), each moved by `n_steps` steps, since a run's samples may be copies."""
         which = resampled_rows(posterior.probability, n, rng)
         drawn = []
         for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
@@ -137,7 +137,7 @@ class NestedSampling:
 
 
 def _weighted_samples_of(result: NestedResult, n_calls: int) -> Weighted:
-    """Return the weighted samples of a run, with the number of evaluations so far."""
+    """Return the weighted samples of a run, with `n_calls` evaluations so far."""
     return Weighted(
         result.names,
         result.theta,
@@ -184,7 +184,7 @@ def paper_experiment(
     Raises
     ------
     ParameterError
-        If the naive model has no levels, or heights are given for it.
+        If a name is unknown, the naive model has no levels, or an option does not go with the model.
     """
     require_sensor(sensor, "in the order paper_experiment(sensor, shape, field)")
     for name, value, allowed in (("model", model, get_args(Model)), ("nested_stop", nested_stop, tuple(NESTED_STOP))):
@@ -233,7 +233,7 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
     Raises
     ------
     ParameterError
-        If there are fewer than two of either.
+        If there are fewer than two readings over either colour.
     """
     require_recording(recording)
     require_sensor(sensor)

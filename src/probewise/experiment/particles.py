@@ -43,9 +43,9 @@ class UpdateSettings:
     steps_per_sample
         Accepted Metropolis-Hastings steps per sample to aim for.
     n_kernels
-        Number of kernels that propose them.
+        Number of kernels that propose the steps.
     least_share
-        Least effective share of the samples without resampling.
+        Effective share of the samples below which these are resampled and moved.
     most_temperatures
         Largest number of temperatures. Samples that need more are far from the new posterior, and marked as strained.
     """
@@ -74,20 +74,20 @@ class Particles:
     start_variance
         Variance of the log evidence at that start; 0 for draws from the prior.
     n_resampled
-        Number of resampling steps since then.
+        Number of resampling steps since that start.
     strained
-        Whether, since then, no sample predicted some reading, or the samples could not be moved: the evidence may be
-        wrong by more than the genealogy indicates.
+        Whether, since that start, no sample predicted some reading, or the samples could not be moved: the evidence may
+        be wrong by more than the genealogy indicates.
     hurried
-        Whether, since then, a reading needed many temperatures: then few samples were near the new posterior, and the
-        product of mean weights is nearly always too small.
+        Whether, since that start, a reading needed four temperatures or more: then few samples were near the new
+        posterior, and the product of mean weights is nearly always too small.
     refitted
-        Whether the samples were found by fits to all readings or from scratch, and have followed those since with ease.
+        Whether the samples come from fits to all readings or from scratch, and have followed later readings with ease.
     log_z_limit
-        Upper limit of the log evidence of a kind that came nowhere near the best one, by fits or by a search from
-        scratch; infinite for others.
+        Upper limit of the log evidence of a kind far below the best kind, by fits or by a search from scratch; infinite
+        for others.
     limit_is_searched
-        Whether a search from scratch gave that limit. Fits alone may all have missed the best one.
+        Whether a search from scratch gave that limit. Fits alone may all have missed the best fit.
     searched_at
         Number of readings at the last search from scratch; -inf if there was none.
     """
@@ -107,7 +107,7 @@ class Particles:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
 
     def is_search_old(self, n_readings: int) -> bool:
-        """Return whether the last search from scratch, if there was one, no longer holds after `n_readings`."""
+        """Return whether a search from scratch is due: none in five readings, or samples strained or hurried."""
         return self.strained or self.hurried or n_readings >= self.searched_at + _SEARCHED_FOR
 
     @property
@@ -130,7 +130,7 @@ class Particles:
 
 
 def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Particles:
-    """Draw equally weighted samples of the prior, with evidence 1."""
+    """Draw equally weighted samples of the prior, with evidence 1; ParameterError for a prior without mass."""
     theta = prior.from_unit_cube(rng.random((n_particles, len(prior.names))))
     if not np.isfinite(prior.log_prob(theta)).all():
         raise ParameterError(
@@ -162,8 +162,8 @@ def update(
     rng
         Source of randomness.
     fall_back
-        Solves the whole problem from scratch, if no sample predicts the reading or they cannot be moved. Without it,
-        the samples continue and are marked as strained.
+        Function that solves the whole problem from scratch, called if no sample predicts the reading or the samples
+        cannot be moved. None: the samples continue and are marked as strained.
     effort
         How thoroughly samples are moved; by default `THOROUGH`, for a probable kind of hypotheses.
 
@@ -253,7 +253,7 @@ def resample_and_move(
     rng: np.random.Generator,
     effort: UpdateSettings | None = None,
 ) -> Particles:
-    """Resample to another number of samples, and move them apart.
+    """Resample to `n` samples, and move the copies apart; unchanged if there are `n` already or the evidence is 0.
 
     `problem` holds the readings included so far.
     """
@@ -285,7 +285,7 @@ def particles_from_posterior(
 
 
 def _equally_weighted_posterior(cloud: _EvaluatedSamples, of: Weighted) -> Weighted:
-    """Return a posterior with the evidence of `of` and equally weighted samples in place of its own."""
+    """Return `of` with its own samples replaced by those of `cloud`, equally weighted; the evidence stays."""
     n = len(cloud.theta)
     even = np.full(n, -math.log(n))
     return replace(
@@ -295,7 +295,7 @@ def _equally_weighted_posterior(cloud: _EvaluatedSamples, of: Weighted) -> Weigh
 
 @dataclass(frozen=True, eq=False)
 class _EvaluatedSamples:
-    """Samples with their log prior, and log likelihood without and with the last reading."""
+    """Samples with their log prior, and their log likelihood without (`before`) and with (`after`) the last reading."""
 
     theta: FloatArray
     log_prior: FloatArray
@@ -303,14 +303,14 @@ class _EvaluatedSamples:
     after: FloatArray
 
     def log_likelihood_at_power(self, share: float) -> FloatArray:
-        """Return the log likelihood with the last reading's raised to a power `share`."""
+        """Return the log likelihood, (n,), with the last reading's likelihood raised to the power `share`."""
         return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
 
     def take_rows(self, rows: IntArray) -> _EvaluatedSamples:
         return _EvaluatedSamples(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
 
     def with_rows_overwritten(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
-        """Overwrite rows with the samples of `other`, in the same order."""
+        """Return the samples, with those of `other` (as many) in the rows that the mask `rows` marks."""
         return _EvaluatedSamples(
             np.where(rows[:, None], other.theta, self.theta),
             np.where(rows, other.log_prior, self.log_prior),
@@ -321,14 +321,14 @@ class _EvaluatedSamples:
 
 @dataclass(frozen=True, eq=False)
 class _LastReadingEvaluator:
-    """The problem with and without its last reading, from one prediction."""
+    """Evaluator of samples without and with the last reading of a problem, from one prediction of all readings."""
 
     problem: SensorProblem
 
     def least_misfit_nats(self, predicted: FloatArray) -> float:
         """Return by how many nats the best of the predictions falls short of a perfect one at the last reading.
 
-        It is 0 if the reading is missing.
+        If that reading is missing, return 0.
         """
         recording = self.problem.recording
         if not recording.usable[-1]:
@@ -338,7 +338,7 @@ class _LastReadingEvaluator:
 
     @property
     def perfect_log_likelihood(self) -> float:
-        """Log likelihood of the last reading under a perfect prediction; zero if it is missing."""
+        """Log likelihood of the last reading if predicted exactly; 0 if that reading is missing."""
         recording = self.problem.recording
         reading = recording.readings[-1:]
         return (
@@ -346,14 +346,14 @@ class _LastReadingEvaluator:
         )
 
     def log_likelihoods_without_and_with(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
+        """Return log likelihoods without and with the last reading, from predictions, -> (n_samples,) each."""
         usable = self.problem.recording.usable
         earlier = usable.copy()
         earlier[-1] = False
         return self._log_likelihood_of_rows(predicted, earlier), self._log_likelihood_of_rows(predicted, usable)
 
     def _log_likelihood_of_rows(self, predicted: FloatArray, rows: BoolArray) -> FloatArray:
-        """Return the log likelihood of these readings; zero for none."""
+        """Return the log likelihood, (n_samples,), of the readings that the mask `rows` marks; 0 for none."""
         if not rows.any():
             return np.zeros(len(predicted))
         return checked_log_prob(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
@@ -388,9 +388,10 @@ def _move_by_metropolis(
 ) -> tuple[_EvaluatedSamples, _AcceptedStepsAndCalls]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
-    A round is a proposal from kernels fitted to samples, then one along the difference of two of them (ter Braak 2006):
-    the first follows curved shells in few dimensions, the second works in many. Kernels fitted to the moved samples
-    themselves would be biased: each of `parts`, rows of the samples, is moved by kernels fitted to the previous part.
+    That density has the last reading's likelihood to the power `share`. A round is a proposal from kernels fitted to
+    the samples, then one along the difference of two samples (ter Braak 2006): the first follows curved shells in few
+    dimensions, the second works in many. Each of `parts` (rows of the samples) is moved by kernels fitted to the
+    previous part, since kernels fitted to the moved samples themselves would be biased.
     """
     n, n_params = start.theta.shape
     if len(np.unique(start.theta[:, 0])) <= 2 * n_params:  # too few distinct samples to fit kernels
@@ -424,7 +425,7 @@ def _move_by_metropolis(
 def _propose_from_kernels(
     theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Propose from the kernels, independent of the current samples; also return the log ratio of densities."""
+    """Propose from the kernels; also return the log ratio of the kernels' density, current to proposed samples."""
     proposed = kernels.draw(len(theta), rng=rng)
     return proposed, kernels.log_density(theta) - kernels.log_density(proposed)
 
@@ -432,7 +433,7 @@ def _propose_from_kernels(
 def _propose_along_differences(
     theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Propose steps along the difference of two other samples, scaled by a factor over two orders of magnitude."""
+    """Propose steps along differences of two samples, randomly scaled; also return the log ratios of densities, 0."""
     n, n_params = theta.shape
     one, other = rng.integers(n, size=(2, n))
     length = 2.38 / math.sqrt(2 * n_params) * 10.0 ** rng.uniform(-2.0, 0.0, (n, 1))
@@ -442,14 +443,14 @@ def _propose_along_differences(
 def _partition_rows(rows: IntArray) -> list[IntArray]:
     """Split the samples resampled by `rows` into two parts, with copies of a sample in the same part.
 
-    Return the indices of each part's samples; a single part if one of two were too small to fit kernels.
+    Return the indices of each part's samples; a single part if one of the two would be too small to fit kernels.
     """
     parts = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
 def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, share: float, enough: float) -> float:
-    """Return the largest power of the last reading's likelihood with enough effective samples, by bisection."""
+    """Return the largest power above `share` of the last reading's likelihood with `enough` effective samples."""
     low, _ = power_bracket(
         lambda power: _updated_log_weights(log_weight, now.log_likelihood_at_power(power), base),
         share,

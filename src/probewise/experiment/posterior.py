@@ -30,7 +30,7 @@ be right one time in ten, and whatever is concluded of a run that has it would m
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Samples of every kind, in the order of the kinds."""
+    """The kinds of hypotheses and, in the same order, their weighted samples with the evidence."""
 
     kinds: tuple[HypothesisKind, ...]
     particles: tuple[Particles, ...]
@@ -72,11 +72,11 @@ class Posterior:
 
     @property
     def with_raised_fault_odds(self) -> Posterior:
-        """The posterior with the odds of an incomplete model multiplied by `WARY`; itself if no kind has an effect."""
+        """The posterior with the odds of a left-out effect multiplied by 12 (`WARY`); itself if no kind has one."""
         return self.with_fault_odds_times(WARY) if any(kind.left_out for kind in self.kinds) else self
 
     def joined(self, *, rng: np.random.Generator) -> Weighted:
-        """Combine the samples of all kinds to one weighted posterior."""
+        """Return the samples of all kinds as one weighted posterior; parameters that a kind lacks are drawn."""
         if len(self.kinds) == 1:
             return self.particles[0].weighted
         probability = self.probability
@@ -110,7 +110,7 @@ def prior_posterior(kinds: Sequence[HypothesisKind], n_particles: int, *, rng: n
 
 
 def n_samples_of_kind(kind: HypothesisKind, probability: float, n_particles: int) -> int:
-    """Return the number of samples of a kind: fewer the less probable it is, and for rivals at most half."""
+    """Return the number of samples of a kind: fewer if improbable; for rivals at most half, but 100 or more."""
     if kind.left_out:
         return max(n_particles // next(part for least, part in SUSPECTED if probability >= least), 100)
     return n_particles if probability >= IMPROBABLE else n_particles // _FEWER

@@ -43,7 +43,7 @@ def updated(
     rng
         Source of randomness.
     from_scratch
-        Solves a kind's whole problem by nested sampling.
+        Function that solves a kind's whole problem by nested sampling.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def updated(
 def _update_every_kind(
     previous: Posterior, problems: list[SensorProblem], usual: UpdateSettings, rng: np.random.Generator
 ) -> list[Particles]:
-    """Update every kind with the last reading, improbable rivals with less effort."""
+    """Return every kind's samples, updated with the last reading; rivals below 2 % with less effort."""
     return [
         update(particles, problem, rng=rng, effort=BRIEF if kind.left_out and p < SUSPECTED[1][0] else usual)
         for kind, particles, problem, p in zip(
@@ -104,8 +104,8 @@ def with_rivals_sampled_again(
 ) -> Posterior:
     """Return the posterior with rivals sampled again and doubtful evidences re-estimated; called before a run ends.
 
-    Left as they are: rivals that were sampled in this way before and have followed the readings since, and rivals that
-    are hopelessly improbable.
+    Rivals stay as they are if they are hopelessly improbable, or were sampled in this way before and have followed the
+    readings since.
     """
     problems = [kind.problem(recording) for kind in posterior.kinds]
     now = replace(

@@ -1,9 +1,9 @@
 """Samples of a kind of hypotheses from fits to all readings that start at samples of other kinds.
 
 The samples of a rival may have gathered where the earlier readings led them, with none where the truth is; no later
-reading brings them back. Other kinds have samples there. Each of these, with a size of the effect drawn from its prior,
-is fitted to all readings (Levenberg-Marquardt, all starts side by side); a Gaussian about each good fit, with kernels
-about the rival's own samples, is the density of an importance sample.
+reading brings them back. Other kinds may have samples there. Starts are samples of other kinds, with the effect's
+parameters drawn from their prior. Each start is fitted to all readings (Levenberg-Marquardt, all starts side by side).
+Gaussians about the good fits, mixed with kernels about the rival's own samples, propose an importance sample.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class Fits:
     theta
         The fits, (n_starts, n_params).
     score
-        Log likelihood plus log prior of each, (n_starts,); minus infinity if the fit failed.
+        Log likelihood plus log prior of each fit, (n_starts,); minus infinity if the fit failed.
     precision
-        Inverse covariances about them, (n_starts, n_params, n_params).
+        Inverse covariances about the fits, (n_starts, n_params, n_params).
     """
 
     theta: FloatArray
@@ -61,7 +61,7 @@ class Fits:
 
     @cached_property
     def good_fit_rows(self) -> IntArray:
-        """Rows of the fits that are not much worse than the best, best first; empty if every fit failed."""
+        """Rows of the fits at most 8 nats behind the best, best first; empty if every fit failed."""
         order = np.argsort(-self.score)
         return (
             order[self.score[order] > self.score[order[0]] - _WORSE] if math.isfinite(self.score.max()) else order[:0]
@@ -69,7 +69,7 @@ class Fits:
 
     @property
     def n_as_good_as_best(self) -> int:
-        """Number of fits that are about as good as the best: the starts that led there, or to another as good."""
+        """Number of fits within 0.5 nats of the best, the best included."""
         return int(np.count_nonzero(self.score > self.score.max() - _AS_GOOD))
 
     @cached_property
@@ -93,14 +93,14 @@ def fit_kind(
     noise_sd: float,
     rng: np.random.Generator,
 ) -> Fits:
-    """Fit a kind with an effect on the noise-free reading to all readings, starting at samples of other kinds.
+    """Fit a kind with an effect on the noise-free reading to all readings, from 90 starts at samples of other kinds.
 
     Parameters
     ----------
     kind, problem
         The kind and its problem.
     donors
-        Posteriors of other kinds, whose first parameters are the shape's.
+        Posteriors of other kinds, whose samples are the starts of all parameters but the effect's.
     noise_sd
         Sd of a reading's noise.
     rng
@@ -172,7 +172,7 @@ def fit_kind(
 def _prediction_slopes(
     predict: Callable[[FloatArray], FloatArray], theta: FloatArray, at_theta: FloatArray, nudge: FloatArray
 ) -> FloatArray:
-    """Differentiate predictions at theta, (n, n_points), by forward differences: (n, n_points, n_params)."""
+    """Return the slopes of the predictions at theta, (n, n_points, n_params), by forward differences of `nudge`."""
     n_params = theta.shape[1]
     nudged = theta + (np.eye(n_params) * nudge)[:, None]
     there = predict(nudged.reshape(-1, n_params)).reshape(n_params, *at_theta.shape)
@@ -181,7 +181,7 @@ def _prediction_slopes(
 
 @dataclass(frozen=True, eq=False)
 class _ShapePriorAndEffectKernels:
-    """A density over a kind's parameters: the prior for those of the shape, kernels about fits for the effect's.
+    """A density over a kind's parameters: the prior for the shape's parameters, kernels about fits for the effect's.
 
     Where the readings leave the shape open (a step of the light, and no white yet), Gaussians about fits cover little
     of the posterior.
@@ -193,7 +193,7 @@ class _ShapePriorAndEffectKernels:
 
     @classmethod
     def about_fits(cls, kind: HypothesisKind, found: Fits, rows: IntArray) -> _ShapePriorAndEffectKernels | None:
-        """Build from some fits of a kind; None for a kind whose rival is a noise model."""
+        """Build from the fits `rows` of a kind; None for a kind without an effect on the noise-free reading."""
         if kind.effect is None:
             return None
         n = len(kind.effect.prior.names)
@@ -201,7 +201,6 @@ class _ShapePriorAndEffectKernels:
         return cls(kind.prior, kind.effect.prior, LocalKernels.from_moments(found.theta[rows, -n:], covariance))
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw points, (n, n_params)."""
         out = self.prior.from_unit_cube(rng.random((n, len(self.prior.names))))
         out[:, -len(self.effect_prior.names) :] = self.of_effect.draw(n, rng=rng)
         return out
@@ -242,7 +241,7 @@ def sampled_about_fits(
 
     Returns
     -------
-    The samples; None where hardly a draw is possible.
+    The samples; None if fewer than ten draws are possible.
     """
     n_params = found.theta.shape[1]
     best = found.good_fit_rows[np.argsort(-found.log_z_by_fit)][:_KEPT]
@@ -266,14 +265,14 @@ _Density = LocalKernels | _ShapePriorAndEffectKernels
 
 
 def _inverse_precision(precision: FloatArray) -> FloatArray:
-    """Invert (n, n_params, n_params), whose parameters may differ by many powers of ten, positive definite."""
+    """Return the inverses, (n, n_params, n_params), stably if parameters differ by many powers of ten."""
     size = 1.0 / np.sqrt(np.diagonal(precision, axis1=1, axis2=2))
     both = size[:, :, None] * size[:, None, :]
     return np.asarray(np.linalg.inv(precision * both + _JITTER * np.eye(precision.shape[1])) * both)
 
 
 def _resampled_rows_if_distinct(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
-    """Resample rows of a posterior; none where too few are distinct to fit kernels."""
+    """Return resampled rows of a posterior; no rows if too few are distinct to fit kernels."""
     rows = resampled_rows(posterior.weight, len(posterior.theta), rng)
     return rows if len(np.unique(rows)) > 4 * n_params else rows[:0]
 
@@ -281,7 +280,7 @@ def _resampled_rows_if_distinct(posterior: Weighted, n_params: int, rng: np.rand
 def _importance_sampled(
     own: Weighted, problem: SensorProblem, densities: Sequence[_Density], n: int, rng: np.random.Generator
 ) -> Weighted | None:
-    """Sample by importance sampling from an even mixture of densities; None where hardly a draw is possible."""
+    """Sample by importance sampling from an even mixture of densities; None if fewer than ten draws are possible."""
     shares = np.bincount(rng.permutation(n) % len(densities), minlength=len(densities))
     draws = np.concatenate([d.draw(int(k), rng=rng) for d, k in zip(densities, shares, strict=True)])
 

@@ -1,9 +1,9 @@
 """Effects that the sensor model may leave out in a run, as rivals of the calibrated sensor.
 
-The effects and their typical sizes are those of the diagnosis. A run is no recording, though: before its first reading
-nothing is known of places and times. Effects of the pose and of the footprint take their scales from a scan of
-100 mm, as a calibration has it; effects that change with the place, from the whole field; with time, from 150 s. What a
-dozen readings could not show leaves nothing out that matters (`EffectWithRunPrior`).
+The effects and their typical sizes are those of the diagnosis. But before the first reading of a run, nothing is known
+of places and times. So effects of the pose and of the footprint take their scales from a scan of 100 mm, as in a
+calibration; effects that change with the place, from the whole field; with time, from 150 s. Effects too small for a
+dozen readings are excluded (`EffectWithRunPrior`).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
 
 @dataclass(frozen=True, eq=False)
 class SensorModelRival:
-    """One alternative to the sensor model: an effect on the noise-free reading, or another likelihood."""
+    """One alternative to the sensor model: an `effect` on the noise-free reading, or another `likelihood`; not both."""
 
     name: str
     effect: DescribedEffect | None = None
@@ -89,14 +89,14 @@ def rivals_of(
     model
         A chain with known levels.
     likelihood
-        `GaussianKnown` of one sd, or `Rounded`; of any other, no rivals of the noise are returned.
+        `GaussianKnown` with one sd, or `Rounded`; for any other, no noise models are among the rivals.
     field_mm
         Width and height of the field.
 
     Raises
     ------
     ParameterError
-        If the model is of another kind, which does not support effects.
+        If the model is no `Chain` with known levels, and so does not support effects.
     """
     if not isinstance(model, Chain) or not isinstance(model.levels, FixedLevels):
         raise ParameterError(
@@ -121,7 +121,7 @@ def rivals_of(
 
 
 def _forms_of_effect_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[DescribedEffect]:
-    """List the forms in which an effect may act in a run; one that changes with time does so in the run's own time."""
+    """Return the forms in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
     if effect.name in OF_MOTION:
         return [EffectWithRunPrior(effect, field_mm), FromRest(EffectWithRunPrior(effect, field_mm))]
     if effect.name not in _IN_TIME:
@@ -136,7 +136,7 @@ class GainLoss(GainDrift):
 
     @classmethod
     def from_gain_drift(cls, drift: GainDrift) -> Self:
-        """Build with the scales of the priors of `drift`, whose signal ends as calibrated."""
+        """Build with the scales of the priors of `drift`, an effect whose signal ends as calibrated."""
         return cls(drift.typical, drift.shortest_s, drift.longest_s)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -154,7 +154,7 @@ class GainLoss(GainDrift):
 
 
 def _plan_there_and_back(length_mm: float) -> Plan:
-    """Lay out one scan of `length_mm` there and back, over the time that a run may take; it sets effects' scales."""
+    """Return a plan of one scan of `length_mm` there and back over 150 s, from which effects take their scales."""
     n = 2 * int(_DURATION_S / EACH_S / 2) + 1
     zeros = np.zeros(n, dtype=np.int64)
     return Plan(

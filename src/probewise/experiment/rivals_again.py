@@ -36,17 +36,15 @@ def sample_rivals_again(
     *,
     each: bool = False,
 ) -> list[Particles]:
-    """Sample rivals anew, where their own samples may have lost the truth.
+    """Return the samples of every kind; those of rivals are taken anew where the old ones may have lost the truth.
 
-    Return the particles of every kind.
+    A rival (a kind with a left-out effect) is sampled anew if its samples are strained or hurried, or if its evidence
+    is over 6 nats below that of the sensor model alone, which the rival contains as the case of no effect. With `each`,
+    all rivals are, except those with `refitted` samples. A rival with too low a limit of evidence stays as it is.
 
-    That can happen after a reading that few of them predict. And a rival whose effect can be negligible cannot be much
-    less likely than the plain model: if it seems to be, its samples are in the wrong place. With `each`, every rival is
-    sampled anew, except those that do not matter and whose samples were found in this way and have followed the
-    readings since. Fits that start at samples of other kinds come first. Where few of them lead to the best fit, others
-    may be missed: the kind is searched from scratch, one kind after a reading in turn, and with `each` all of them and
-    those that matter. A search is good for some readings, if the samples follow them with ease. A rival that came out
-    far below the best kind is sampled again when the readings since could have made up the difference.
+    Fits that start at samples of other kinds come first. If few of the fits reach the best one, the rival is searched
+    from scratch: one rival per reading in turn; with `each` as many as need it, and all with a probability above 2 %. A
+    search holds for five readings if the samples follow with ease.
     """
     particles, log_odds = list(now.particles), now.log_odds
     probability = now.with_raised_fault_odds.probability
@@ -82,9 +80,9 @@ def sample_rivals_again(
 def _replaced_if_better(
     own: Particles, anew: SamplesAnew, n: int, problem: SensorProblem, hopeless: float, rng: np.random.Generator
 ) -> Particles:
-    """Return `n` of the samples taken anew, if they are better than a kind's own, which otherwise stay.
+    """Return `n` of the samples taken anew if these have enough evidence and effective draws, else the kind's own.
 
-    Where the evidence is below `hopeless`, the kind's own samples are kept with a limit of their evidence.
+    If the largest log evidence found is below `hopeless`, return the kind's own samples with a limit of their evidence.
     """
     found = anew.samples
     if anew.highest_log_z < hopeless:

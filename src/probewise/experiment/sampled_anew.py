@@ -25,7 +25,7 @@ WELL_FOUND = 100.0  # effective draws from which on samples need not be taken an
 
 
 class SolverFromScratch(Protocol):
-    """Solves a kind's whole problem by nested sampling; with fewer live points if `quick`."""
+    """Function that solves a kind's whole problem by nested sampling; with fewer live points if `quick`."""
 
     def __call__(self, problem: SensorProblem, *, quick: bool = False) -> NestedResult:
         """Return the result; raise NotConvergedError if no hypothesis could have given the readings."""
@@ -39,13 +39,13 @@ class SamplesAnew:
     Attributes
     ----------
     samples
-        None if none was found.
+        The weighted samples; None if none were found.
     highest_log_z
-        The largest log evidence by fits or by a search from scratch; infinite without either.
+        The largest log evidence by fits or by a search from scratch; infinite if neither was made.
     is_reproduced
-        Whether several starts led to the best fit, or a search from scratch to the samples.
+        Whether five starts or more led to fits as good as the best; True without fits.
     is_searched
-        Whether a search from scratch led to them.
+        Whether the samples come from a search from scratch.
     """
 
     samples: Weighted | None
@@ -55,7 +55,7 @@ class SamplesAnew:
 
     @property
     def n_eff(self) -> float:
-        """Effective number of the samples; 0 without any."""
+        """Effective number of the samples; 0 if `samples` is None."""
         return 0.0 if self.samples is None else self.samples.n_eff
 
 
@@ -68,9 +68,10 @@ def sample_near_other_kinds(
     hopeless: float,
     rng: np.random.Generator,
 ) -> SamplesAnew:
-    """Sample a kind's posterior from samples of other kinds: by refits or, for a noise model, from these directly.
+    """Sample a kind's posterior starting from `donors`, samples of other kinds.
 
-    No samples are drawn if the largest log evidence by fits is below `hopeless`.
+    A kind with an effect is fitted from these; a noise model is sampled by importance sampling about them. No samples
+    are drawn if the largest log evidence by fits is below `hopeless`.
     """
     noise = DeclaredNoise.from_likelihood(kind.likelihood)
     if kind.effect is not None:
@@ -102,7 +103,7 @@ def sample_from_scratch(
     rng: np.random.Generator,
     from_scratch: SolverFromScratch,
 ) -> SamplesAnew:
-    """Sample a kind's posterior by a quick run of nested sampling."""
+    """Sample a kind's posterior by a quick run of nested sampling, and near `own` unless its evidence is `hopeless`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtfulResultWarning)  # its samples are only where draws are made
@@ -116,10 +117,9 @@ def sample_from_scratch(
 def samples_from_run(
     run: NestedResult, own: Weighted, problem: SensorProblem, n: int, rng: np.random.Generator, *, with_own: bool
 ) -> Weighted:
-    """Return samples of a kind from a run of nested sampling, and from the kind's own samples if `with_own`.
+    """Return a kind's samples by importance sampling about those of a nested sampling run (and its own if `with_own`).
 
-    Importance sampling about both weighs them. Where modes are too many or too bent for it, few draws would hold all of
-    the weight: then the run's samples are returned as they are, with its evidence.
+    If fewer than 100 effective draws result (modes too many or too bent), return the run's samples and evidence.
     """
     points = run.samples(n, rng=rng)
     about = np.concatenate([points, own.samples(n // 2, rng=rng)]) if with_own else points
@@ -136,7 +136,7 @@ def samples_from_run(
 def _importance_sampled_if_possible(
     points: FloatArray, problem: SensorProblem, n_draws: int, rng: np.random.Generator
 ) -> Weighted | None:
-    """Sample by importance sampling about points; None if no draw could have given the readings."""
+    """Return `posterior_sampled_about_points`, or None if no draw could have given the readings."""
     try:
         return posterior_sampled_about_points(points, problem, rng=rng, n_draws=n_draws)
     except NotConvergedError:
@@ -144,7 +144,7 @@ def _importance_sampled_if_possible(
 
 
 def with_new_evidence_and_lineages(particles: Particles, found: BridgedEvidence) -> Particles:
-    """Give the samples a new evidence, and make them an independent start: each is its own ancestor."""
+    """Return the samples with a new evidence and as an independent start: each sample is its own ancestor."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
     return replace(

@@ -47,7 +47,7 @@ class AdjustedMixture:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """log_size_u, log_size_v, shift_u_mm, shift_v_mm."""
+        """Names of the parameters: log_size_u, log_size_v, shift_u_mm, shift_v_mm."""
         return ("log_size_u", "log_size_v", "shift_u_mm", "shift_v_mm")
 
     def footprint(self, theta: FloatArray) -> Footprint:

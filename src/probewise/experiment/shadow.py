@@ -26,9 +26,9 @@ def shadow_run(
     other
         The same experiment with another sensor model. Its own choices of readings are not carried out.
     field
-        Where the arm can go.
+        Reach of the arm, and travel times.
     rng
-        Random generator of the other's inference; the run has its own.
+        Random generator of the other experiment's inference; the run has its own.
     """
     prior_bits = prior_entropy(other.prior, rng=rng)
     state = begin(other, field, rng=rng)

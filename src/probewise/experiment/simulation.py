@@ -53,10 +53,10 @@ _PAINTED_VERTICES = 512  # vertices of a curved outline that is not an ellipse: 
 
 
 class RandomStreams(NamedTuple):
-    """Independent random streams of one simulated run: the robot's inference, the hidden shape, the shadow run, noise.
+    """Independent random streams of a simulated run: for inference (`run`), hidden shape (`truth`), shadow run, noise.
 
-    `noise` is a seed, from which each reading's generator is made; see `arm_over`. `levels` is the stream of readings
-    over black and white before the run, see `naive_levels_from_world`.
+    `noise` is a seed, from which each reading's generator is made; see `arm_over`. `levels` is for the readings over
+    black and white before the run, see `naive_levels_from_world`.
     """
 
     run: np.random.Generator
@@ -67,18 +67,18 @@ class RandomStreams(NamedTuple):
 
     @classmethod
     def spawned_from(cls, rng: np.random.Generator) -> RandomStreams:
-        """Spawn them from one generator, so that one seed gives the whole run."""
+        """Spawn the streams from one generator, so that one seed gives the whole run."""
         run, truth, shadow, noise, levels = rng.spawn(5)
         return cls(run, truth, shadow, int(noise.integers(2**63)), levels)
 
     @classmethod
     def of(cls, rng: np.random.Generator) -> RandomStreams:
-        """Spawn them, under the old name of `spawned_from`."""
+        """Spawn the streams: the old name of `spawned_from`."""
         return cls.spawned_from(rng)
 
 
 def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
-    """Return a journal's entry for the sensor: its fingerprint, and its file if any."""
+    """Return a journal's entries for the sensor: the sha256 of its JSON, and the path of its file if given."""
     require_sensor(sensor)
     named = {} if path is None else {"sensor_file": os.fspath(path)}
     return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
@@ -114,7 +114,7 @@ def as_shape(shape: str | Sequence[str] | Shape, field: Field) -> Shape:
     Raises
     ------
     ParameterError
-        If it is neither a shape nor a name in `SHAPES`.
+        If `shape` is neither a shape nor a name in `SHAPES`, or several.
     """
     if isinstance(shape, str):
         return shape_named((shape,), field)
@@ -146,9 +146,9 @@ def experiment_for(
     ----------
     sensor
         The fitted sensor; if it averages several hypotheses, the most probable one is used. The SSF model takes the
-        mixture with the mean and covariance of its mean field, for closed forms instead of sums over pixels, and
-        effects on the mean at their posterior means; with `trust` below 1 they are inferred along with the shape.
-        Effects on the noise are left out. The naive model takes its two levels.
+        mixture with the mean and covariance of the sensor's mean field, for closed forms instead of sums over pixels,
+        and effects on the mean at their posterior means; with `trust` below 1 these effects are inferred along with the
+        shape. Effects on the noise are left out. The naive model takes the sensor's two levels.
     shape
         The possible shape on the field.
     field
@@ -171,6 +171,11 @@ def experiment_for(
         Prior probability that the sensor model is complete; below 1 only for the SSF model of a known sensor.
     cards
         Cards of known place and albedo on the field; for the SSF model.
+
+    Raises
+    ------
+    ParameterError
+        If an option does not go with the model or the sensor.
     """
     require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
     if model not in get_args(Model):
@@ -215,9 +220,9 @@ def experiment_without_inference(
     repeats: tuple[int, ...],
     heights_mm: tuple[float, ...],
 ) -> partial[Experiment]:
-    """Build the part of an experiment that all methods share: shape, field, scale of readings, designs.
+    """Return a partial `Experiment` with the arguments that all methods share: shape, noise, scale, designs.
 
-    Model, likelihood and what differs between methods are passed to the result, which returns the experiment.
+    Called with the model, the likelihood and the arguments that differ between methods, it returns the experiment.
     """
     scale = scale_of(sensor.instrumentation)
     return partial(
@@ -243,8 +248,8 @@ def mean_levels_of(sensor: FittedSensor) -> FixedLevels:
 def sensor_chain_at_means(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = False) -> Chain:
     """Return the chain of a fitted sensor over a scene: mean field's mixture, mean levels, effects at their means.
 
-    With `estimated`, the effects remember how well they are known, so that a run can infer them along; those of the
-    arm's motion spare a run's first reading, since nobody knows whence the arm came.
+    Effects on the noise are dropped. With `estimated`, the effects carry priors fitted to their samples, so that a run
+    can infer their parameters too; effects of the arm's direction of motion then leave out a run's first reading.
     """
     means = sensor.mean()
     effects: list[AnyEffect] = []
@@ -264,7 +269,7 @@ def sensor_chain_at_means(sensor: FittedSensor, scene: HypothesisScene, *, estim
 
 
 def _marginal_prior_from_samples(samples: FloatArray) -> Marginal:
-    """Fit a marginal prior to samples, (n_samples,), by mean and sd: log-normal if all are positive, else normal."""
+    """Return a prior with mean and sd of samples, (n_samples,): log-normal if all are positive, else normal."""
     if (samples > 0).all():
         log = np.log(samples)
         return LogNormal(float(np.exp(log.mean())), float(log.std()))
@@ -278,8 +283,8 @@ TRUST = 0.9
 def default_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
     """Return the default prior probability that the sensor model is complete (its trust).
 
-    It is `TRUST`, or 1 where no rival is considered: for the naive model, a sensor that is learnt, several shapes, or
-    any utility but `Finishing()`.
+    It is 0.9 (`TRUST`), or 1 where no rival is considered: for the naive model, a sensor that is learnt, several
+    shapes, or any utility but `Finishing()`.
     """
     plain = model == "naive" or learn_sensor or isinstance(shape, AnyOf) or utility != Finishing()
     return 1.0 if plain else TRUST
@@ -288,7 +293,7 @@ def default_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Ut
 def checked_calibrated_height_mm(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:
     """Return the height of the calibration, to which the footprint at other heights is scaled.
 
-    Raises ParameterError for the naive model, and for a sensor that does not state it.
+    Raises ParameterError for the naive model, and for a sensor without a stated height of calibration.
     """
     height_mm = sensor.instrumentation.height_mm
     if model == "naive":
@@ -320,7 +325,7 @@ def world_like(sensor: FittedSensor) -> World:
 
 
 def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
-    """Return the world's surface of a shape; only geometry is shared with the models."""
+    """Return the world's surface of a shape with parameters theta, (n_params,); it shares only geometry with models."""
     return surface_of_region(SHAPES[name](field).region(theta[None, :]), name)
 
 
@@ -330,7 +335,7 @@ def surface_of_region(region: Region, name: str) -> Surface:
     Raises
     ------
     ParameterError
-        If it has no closed outline, or one of several pieces.
+        If the region's outline is not a single closed line.
     """
     if isinstance(region, EllipseRegion):
         center, axes = region.center_mm[0].tolist(), region.semi_axes_mm[0].tolist()
@@ -366,14 +371,14 @@ def arm_over(
     Parameters
     ----------
     world, surface, field
-        World and surface that it reads, and the field.
+        World and surface that the arm's sensor reads, and the field.
     seed
         Seed of the noise. Each reading has its own generator, so that a resumed run has the same noise as an
         uninterrupted one.
     taken
         Readings of the run before it was interrupted: the arm starts at the pose and time of the last one.
     workspace
-        Reach of the arm and orientations of its sensor; by default nearly everywhere, unturned.
+        Reach of the arm and orientations of its sensor; None: the default `Reach` over the field, orientation 0.
     scale
         Rounding and range of readings; by default the LEGO brick's.
     """

@@ -35,6 +35,8 @@ def run_from_place(
     ------
     ReachError
         If the arm cannot reach the first place.
+    ParameterError
+        If `max_readings` is below 1, or no place is more informative than others.
     NotConvergedError
         If no hypothesis could have given the readings.
     """

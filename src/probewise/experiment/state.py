@@ -47,10 +47,10 @@ class Step(ShowsItself):
     number, reading
         Number of the reading from 1, and the reading.
     names, mean, sd
-        The shape's parameters, their posterior means and sds, each (n_params,). For a set of shapes: given the most
-        probable one, with NaN for parameters that it does not have.
+        Names of the shape's parameters, their posterior means and sds, each (n_params,). For a set of shapes: given the
+        most probable shape, with NaN for parameters of other shapes.
     shapes
-        Probability of each shape of a set, by label; empty for a single shape.
+        Probability of each shape of a set, by its name; empty for a single shape.
     samples
         Shapes drawn from the posterior, (n_samples, n_params).
     map
@@ -58,17 +58,17 @@ class Step(ShowsItself):
     next_pose
         Next pose; None when the run is over.
     bits
-        Prior minus posterior differential entropy of the parameters so far.
+        Information gained so far: prior minus posterior differential entropy of all parameters.
     p_value
         p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
     posterior
-        Weighted posterior of all parameters, with the evidence and its error.
+        Weighted posterior of all parameters, with the evidence; the odds of a left-out effect are raised (`WARY`).
     sensor
         Posterior mean and sd of the sensor's parameters by name, if they are inferred too.
     left_out
-        Probability of each effect that the sensor model may leave out, by name; "" is none.
+        Probability of each effect that the sensor model may leave out, by name; "" is none. The odds are not raised.
     kinds
-        The posterior of every kind of hypotheses.
+        The posterior of every kind of hypotheses, with odds as in `left_out`.
     chance_off
         Probability that a length is off by three times the sd of the stopping rule.
     stop_reason
@@ -80,7 +80,7 @@ class Step(ShowsItself):
     pace
         Pace of the run so far.
     arm_error
-        What the arm's own error adds to the sds; None far from the end of a run, or where that error is not known.
+        Effect of the arm's own error; None far from the end of a run, or if that error is not known.
     """
 
     number: int
@@ -125,12 +125,12 @@ class Step(ShowsItself):
 
     @property
     def likely_shape(self) -> str:
-        """Label of the most probable shape of a set; empty for a single shape."""
+        """Name of the most probable shape of a set; "" for a single shape."""
         return max(self.shapes, key=self.shapes.__getitem__, default="")
 
     @property
     def orientation_and_height_text(self) -> str:
-        """Orientation and height of the sensor, if they can be chosen, as text to follow the place; else empty."""
+        """Orientation and height of the sensor, as far as the run can choose them, as text after the place; else ""."""
         pose, designs = self.reading.pose, self.map.designs
         turned = f", turned {math.degrees(pose.orientation_rad):.0f}°" if len(designs.orientations_rad) > 1 else ""
         raised = "" if pose.height_mm is None else f", {pose.height_mm:g} mm up"
@@ -162,7 +162,7 @@ class ArmError:
     Attributes
     ----------
     slopes
-        By how much each independent error of one sd moves the posterior mean, (n_params, n_errors).
+        Shift of the posterior mean by each independent error of one sd, (n_params, n_errors).
     shifts
         Shift of each posterior sample by an error of the arm drawn for it, (n_samples, n_params).
     """
@@ -194,7 +194,7 @@ class Exploration(ShowsItself):
 
     @property
     def arm_error(self) -> ArmError | None:
-        """What the arm's own error adds to the sds after the last reading, if it is known."""
+        """Effect of the arm's own error after the last reading; None if that error is not known."""
         return self.last.arm_error
 
     arm = arm_error
@@ -227,7 +227,7 @@ class Exploration(ShowsItself):
 
     @property
     def stop_reason(self) -> str:
-        """Why the run ended; and what the arm's own error leaves, where that is known and the run did not count it."""
+        """Reason why the run ended, and the largest sd with the arm's error if the stopping rule did not count that."""
         reason = self.last.stop_reason or "the caller ended it"
         if self.arm_error is None or self.experiment.fitted_arm is not None:
             return reason
@@ -252,7 +252,7 @@ class Exploration(ShowsItself):
 
     @property
     def paper_bits_per_reading(self) -> float:
-        """The paper's count: its 25 bits over the number of readings (its 25 / 16 = 1.56)."""
+        """Bits per reading as the paper counts: 25 bits over the number of readings."""
         return PAPER_BITS / len(self.steps)
 
     @property
@@ -297,7 +297,7 @@ class Exploration(ShowsItself):
 
 
 def _n_decimals(name: str) -> int:
-    """Return the number of decimals of a parameter by its unit: as many for 1 mrad as for 0.1 mm."""
+    """Return the number of decimals to show for a parameter: 3 for one in radians, else 1."""
     return 3 if name.endswith("_rad") else 1
 
 

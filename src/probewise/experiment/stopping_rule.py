@@ -28,11 +28,10 @@ def information_nats(posterior: Weighted) -> float:
 def shape_moments_and_probabilities(
     experiment: Experiment, posterior: Weighted
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
-    """Return mean and sd of the shape's parameters, (n_params,) each, and the probability of each shape by label.
+    """Return mean and sd of the shape's parameters, (n_params,) each, and the probability of each shape by name.
 
-    Angles are taken as they are, see `with_aligned_angles`.
-    For a set of shapes, the moments are those given the most probable shape, with NaN for parameters that it does not
-    have. For a single shape the probabilities are empty.
+    Angles are taken as they are, see `with_aligned_angles`. For a set of shapes, mean and sd are those given the most
+    probable shape, with NaN for parameters of other shapes. For a single shape the probabilities are empty.
     """
     theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
     if not isinstance(experiment.shape, AnyOf):
@@ -75,9 +74,9 @@ def sensor_moments(experiment: Experiment, posterior: Weighted) -> dict[str, tup
 
 
 def p_value_and_worst_reading(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
-    """Return the p-value of the best hypothesis (upper tail of chi-square), and the index of its worst reading.
+    """Return the p-value of the most likely hypothesis, and the index of the reading that it predicts worst.
 
-    It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.
+    The p-value is the upper tail of chi-square with one degree of freedom per reading, so that it is conservative.
     """
     recording = problem.recording
     best = posterior.theta[[int(posterior.log_likelihood.argmax())]]
@@ -88,7 +87,7 @@ def p_value_and_worst_reading(experiment: Experiment, posterior: Weighted, probl
 
 
 def doubt_message(p_value: float, worst: int, readings: Sequence[Reading]) -> str:
-    """Return the message that no hypothesis explains the readings, with the worst-fitting one."""
+    """Return the message that no hypothesis explains the readings; it shows the reading predicted worst, `worst`."""
     return (
         f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "
         f"({readings[worst].value:g}); the hypothesis space excludes what lies there, or the sensor model "

@@ -1,9 +1,9 @@
 """Utility of a reading for shape and sensor faults jointly, and near the end for ending the run.
 
 Several kinds of hypotheses may explain all readings and differ in the shape. The utility is the expected information
-about all of them together. If some reading may meet the stopping rule (every length known under the mixture, little
-chance that one is wrong), it is the probability of that: kinds that are aliased but agree on the shape need not be
-distinguished. Of such readings those count more that spare a check afterwards (`checking`).
+about all kinds together. Once some reading has a chance of 25 % or more to meet the stopping rule, the utility is that
+chance: kinds that are aliased but agree on the shape need not be distinguished. Bits about the effect left out are
+added, and readings that leave a side of the shape unread count half (`checking`).
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ def utility_map_and_must_continue(
 ) -> tuple[UtilityMap, bool]:
     """Return the utility map for all kinds near the end of a run, and whether the run has to continue all the same.
 
-    Far from the end, the given map is returned. `known` says whether the posterior meets the stopping rule; the run
-    continues nevertheless for a reading on the far side of the shape, or for one that is expected to tell enough about
-    what the sensor leaves out.
+    Far from the end, or without a goal (a set of shapes), return the given map and False. `known` says whether the
+    posterior meets the stopping rule; even so, the run continues for a reading on the far side of the shape, or for one
+    with 0.05 bits or more expected about the effect that the sensor model leaves out.
 
     Candidates are the designs with the largest information, those at edges and centres of sampled shapes, on the far
-    side, at cards and at earlier places, and some random ones.
+    side, at cards and at earlier places, and some random ones; all others get utility 0.
     """
     goal = utility_input.goal
     if goal is None:
@@ -142,9 +142,9 @@ def _mean_shape_theta(experiment: Experiment, utility_input: UtilityInput) -> Fl
 def _draw_theta_lengths_weights(
     experiment: Experiment, posterior: Posterior, least: int, rng: np.random.Generator
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
-    """Draw hypotheses of each kind; return them kind by kind, then lengths, (n, n_lengths), and weights, (n,), of all.
+    """Draw hypotheses; return a list of theta, one array per kind, and all lengths, (n, n_lengths), and weights, (n,).
 
-    Improbable kinds are over-represented, since they may differ in the shape.
+    Improbable kinds get more samples than their probability, with less weight, since they may differ in the shape.
     """
     probability = posterior.probability
     asked = np.where(probability > _COUNTS, probability**_FAIRNESS, 0.0)
@@ -191,7 +191,7 @@ def _candidate_designs(
 
 
 def _plan_from_arm_to_candidates(utility_input: UtilityInput, rows: IntArray, last: Reading) -> Plan:
-    """Return a plan of two rows per candidate: the arm's current place, then the candidate, as a scan of their own."""
+    """Return a plan with a scan of two rows per candidate: the arm's current place, then the candidate's."""
     n = len(rows)
     at = utility_input.rows[rows]
     taken = utility_input.plan.take(np.repeat(at, 2))
@@ -203,7 +203,7 @@ def _plan_from_arm_to_candidates(utility_input: UtilityInput, rows: IntArray, la
 
 
 def _expected_bits(weight: FloatArray, answers: FloatArray, utility_input: UtilityInput) -> FloatArray:
-    """Return the expected information in bits from predictions (n, n_designs) of hypotheses (n,): (n_designs,)."""
+    """Return the expected information, (n_designs,), in bits, by predictions, (n, n_designs), and weights, (n,)."""
     given = WeightsGivenReading(answers, weight, utility_input.readout)
     middle = np.array([0.5 * float(answers.min() + answers.max())])
     of_noise = float(entropy_bits(utility_input.readout.cell_probability(middle, fine=1.0))[0])
@@ -218,7 +218,7 @@ def _probability_of_meeting_rule(
     goal_sd_mm: float,
     off_mm: float,
 ) -> FloatArray:
-    """Return the probability that a reading at each design meets the stopping rule, (n_designs,)."""
+    """Return the probability, (n_designs,), that the posterior after a reading there meets the stopping rule."""
     away = lengths - weight @ lengths
     given = WeightsGivenReading(answers, weight, utility_input.readout)
     out = np.empty(answers.shape[1])

@@ -1,7 +1,7 @@
 """An emulated LEGO NXT brick with the arm of the paper's test bed (section "Robotic Arm Test Bed").
 
-It answers LEGO's Bluetooth protocol byte for byte, simulates motors that overshoot, and reads a light
-sensor over a `world`. It shares no code with the driver in `arm`, so each tests the other.
+The emulator answers LEGO's Bluetooth protocol byte for byte, simulates motors that overshoot, and reads a light sensor
+over a `world`. It shares no code with the driver in `arm`, so each tests the other.
 """
 
 from probewise.emulator.arm import EmulatedArm, Joint, SensorPose

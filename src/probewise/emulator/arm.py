@@ -45,7 +45,7 @@ class Joint:
 
     @property
     def angle_rad(self) -> float:
-        """Angle of the joint."""
+        """Angle of the joint, which follows its motor with backlash."""
         return math.radians(self.numbers.home_deg + self.motor.driven_deg / self.numbers.gear_ratio)
 
     def set_angle_by_hand(self, angle_deg: float) -> None:
@@ -69,7 +69,7 @@ class EmulatedArm:
     joints
         Base, shoulder, elbow.
     lowest
-        Lowest pose of the sensor so far; a height below 0 means that it went through the table.
+        Lowest pose of the sensor so far; a height below 0 means that the sensor went through the table.
     """
 
     def __init__(self, geometry: Geometry) -> None:

@@ -49,7 +49,7 @@ def set_up_bench(
     geometry
         Dimensions of the arm.
     world
-        Simulates the sensor at the reading height of the geometry.
+        World that simulates the readings of the light sensor at the geometry's reading height.
     surface
         The surface at the start.
     clock
@@ -57,11 +57,11 @@ def set_up_bench(
     seed
         Seed of the sensor's noise and of the link's faults.
     name, sleep_min
-        The brick's name, and minutes until it switches itself off.
+        The brick's name, and minutes until the brick switches itself off; 0: never.
     faults
         Rates of faults; None for none.
     trace
-        Function that records all telegrams.
+        Function that is called with every telegram and fault, see `Trace`.
 
     Raises
     ------

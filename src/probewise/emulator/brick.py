@@ -28,13 +28,13 @@ _LONGEST_POLL = 121  # over Bluetooth; more is an error
 
 @dataclass(frozen=True)
 class Battery:
-    """Voltage at the start, and its loss per minute."""
+    """A battery's voltage at the start, and its loss per minute, in mV."""
 
     full_mv: float = 7412.0
     sag_mv_min: float = 0.0
 
     def millivolts_after(self, seconds: float) -> float:
-        """Return the voltage in mV after some time, at least 5.5 V."""
+        """Return the voltage in mV after some seconds, at least 5500."""
         return max(self.full_mv - self.sag_mv_min * seconds / 60, 5500.0)
 
 
@@ -54,9 +54,9 @@ class Brick:
     battery
         The battery.
     sleep_min
-        Minutes without KEEPALIVE after which it switches itself off.
+        Minutes without KEEPALIVE after which the brick switches itself off; 0: never.
     files
-        Files in flash. Each of them runs as a program that echoes messages.
+        Files in flash, by name; None: echo.rxe, empty. Each file runs as a program that echoes messages.
     watch
         Function called every 10 ms while a motor turns.
 
@@ -122,11 +122,11 @@ class Brick:
 
     @property
     def is_off(self) -> bool:
-        """Whether it has gone to sleep; only its orange button could wake it."""
+        """Whether the brick has gone to sleep; only its orange button could wake it."""
         return self._sleep_s > 0 and self._clock() - self._awake_s >= self._sleep_s
 
     def advance(self) -> None:
-        """Simulate the motors up to the clock's time."""
+        """Simulate the motors up to the clock's time; from the brick's sleep on, they coast."""
         if self.is_off:
             self.outputs.advance(self._awake_s + self._sleep_s, self.battery_mv)
             self.outputs.release()
@@ -135,7 +135,7 @@ class Brick:
     def answer(self, telegram: bytes) -> bytes | None:
         """Execute a telegram and return the reply, or None for no reply.
 
-        A command with the no-reply bit gets none, not even for an error.
+        There is no reply to a command with the no-reply bit, even after an error, nor while the brick is off.
         """
         self.advance()
         request = None if self.is_off else parse_request(telegram)

@@ -14,7 +14,7 @@ Clock: TypeAlias = Callable[[], float]
 class VirtualClock:
     """A clock that advances only by `sleep`, which returns at once: minutes of simulated work take seconds.
 
-    It replaces the module `time` in code that uses only `monotonic` and `sleep`.
+    It replaces Python's module `time` in code that uses only `monotonic` and `sleep`.
     """
 
     def __init__(self) -> None:

@@ -71,8 +71,8 @@ class Faults:
     def parse(cls, texts: Iterable[str]) -> Self:
         """Parse texts NAME, NAME=RATE or late=RATE,SECONDS, one fault each.
 
-        Default rates: every reply fragmented, one byte in 200 dropped, other faults in one request in 20,
-        disconnection in one in 500, and a battery loss of 60 mV per minute.
+        NAME alone means: every reply fragmented, one byte in 200 dropped, disconnection at one request in 500, a
+        battery loss of 60 mV per minute, any other fault at one request in 20.
 
         Raises
         ------

@@ -25,7 +25,7 @@ class _OpenFile:
 
 
 class Files:
-    """The flash file system: the files, the open handles, and the commands on them.
+    """The flash file system: the files, the open handles, and the file commands by opcode (`commands`).
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ class JointParameters:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Dimensions of the arm, in mm and degrees; the TOML file of format "arm/1" explains each."""
+    """Dimensions of the arm, in mm and degrees; the shipped TOML file explains each."""
 
     base_mm: tuple[float, float]
     shoulder_mm: tuple[float, float]  # forward of the base's axis, above the surface
@@ -51,12 +51,12 @@ def shipped_geometry_path() -> Path:
 
 
 def read_geometry(path: Path) -> Geometry:
-    """Read an arm's file.
+    """Read an arm's dimensions from a TOML file of format "arm/1".
 
     Raises
     ------
     FileError
-        If the file is missing or not TOML, or a number is missing or not allowed.
+        If the file is missing or not TOML, or an entry is missing or not allowed.
     """
     text = read_text(path, "an arm's file of format arm/1")
     try:

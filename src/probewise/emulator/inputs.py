@@ -22,7 +22,7 @@ _I2C_BIT_S = 1 / 9600
 
 @dataclass
 class _InputPort:
-    """An input port: its sensor, type and mode, and its last values."""
+    """An input port: its sensor, the type (`kind`) and mode to which it is set, and its last values."""
 
     sensor: Sensor
     kind: int = _NONE
@@ -37,7 +37,7 @@ class _InputPort:
 
 @dataclass
 class InputPorts:
-    """The input ports 1 to 4 with their sensors, and the commands that set and read them.
+    """The input ports 1 to 4 with their sensors, and by opcode the commands that set and read them (`commands`).
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class InputPorts:
         return b""
 
     def _configure_port(self, port: _InputPort, kind: int, mode: int) -> None:
-        """Set type and mode; readings are invalid for a while, and the old values stay."""
+        """Set a port's type and mode; its readings are invalid for some milliseconds, and the old values stay."""
         self._update_reading(port)
         now_s = self.clock()
         if kind != port.kind:
@@ -153,7 +153,7 @@ def _payload_if_ok(status: Status, payload: bytes) -> bytes:
 
 
 def _normalized_value(raw: int, kind: int) -> int:
-    """Scale to 0..1023 in integers as the firmware does; more light or sound gives a larger value."""
+    """Scale counts to 0..1023 in integers, as the firmware does; more light or sound gives a larger value."""
     if kind in (_LIGHT_ON, _LIGHT_OFF):
         zero, percent = _LIGHT_SCALE
     elif kind in _SOUND:
@@ -164,14 +164,14 @@ def _normalized_value(raw: int, kind: int) -> int:
 
 
 def _boolean_value(normalized: int, before: int) -> int:
-    """Return the boolean value with hysteresis at 45 % and 55 %; low is on, as for a pressed touch sensor."""
+    """Return 1 below 45 %, as for a pressed touch sensor, 0 above 55 %, and the value `before` in between."""
     if normalized < AD_MAX * 45 // 100:
         return 1
     return 0 if normalized > AD_MAX * 55 // 100 else before
 
 
 def _scaled_value(normalized: int, mode: int, boolean: int) -> int:
-    """Convert by mode; the counting modes stay at 0, since no emulated sensor makes edges."""
+    """Convert a normalized value by the port's mode; counting modes give 0, since no emulated sensor makes edges."""
     match mode & 0xE0:
         case 0x00:
             return normalized

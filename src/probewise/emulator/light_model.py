@@ -18,19 +18,16 @@ _CUT_OFF = 0.5
 
 
 class LightModel:
-    """Unrounded reading on the scale 0 to 100, with the LED on or off.
+    """Function of the LED's state that returns an unrounded reading on the scale 0 to 100, at the sensor's pose.
 
-    A world's readings are whole steps like the brick's, and the brick truncates: a reading of 40 means
-    light of 40.5 on average.
-
-    Without the LED everything is half as bright, as measured in two rooms (58 and 32 % over white and
-    black with it, 30 and 17 % without). Relative to the world's reading height the LED's light increases
-    towards 8 mm, falls to zero on contact, and vanishes at a few centimetres.
+    A world's readings are whole steps like the brick's, and the brick truncates: a reading of 40 means light of 40.5 on
+    average. At the reading height, half of the light is the LED's. That half increases towards 8 mm, falls to zero on
+    contact, and vanishes at a few centimetres.
 
     Parameters
     ----------
     world
-        Simulates the sensor at `read_height_mm`.
+        World that simulates the sensor's readings at `read_height_mm`, with the LED on.
     table
         The surface, and the sensor's rotation in its mount.
     sensor_pose
@@ -38,7 +35,7 @@ class LightModel:
     read_height_mm
         Height at which the world's readings are taken.
     seed
-        Seed of the noise. All readings at the n-th pose come from the n-th generator, as on the simulated
+        Seed of the noise. All readings within 1 mm of the n-th pose come from the n-th generator, as on the simulated
         arm, so that both give the same first reading.
     clock
         Time in seconds, for drifts.
@@ -74,6 +71,7 @@ class LightModel:
             time_s=self._clock(),
             rng=self._rng,
         )
+        # Half is the LED's, as in two rooms: 58 and 32 % over white and black with the LED, 30 and 17 % without.
         return (
             (bright + _CUT_OFF)
             * (

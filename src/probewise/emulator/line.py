@@ -13,7 +13,7 @@ class VirtualLine:
     Parameters
     ----------
     radio
-        The link; making a line begins a new connection.
+        The link to the brick; a new line begins a new connection.
     clock
         The brick's clock.
     """

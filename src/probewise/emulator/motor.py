@@ -1,8 +1,8 @@
 """Mechanics of a motor, without firmware: inertia, friction, coasting, stops and backlash.
 
-The magnitudes are those measured on the NXT motor: 170 revolutions per minute at full power and 9 V
-without load, speed proportional to power and voltage, no start below about 8 % of power, and an
-overshoot of about 60 degrees after an unregulated limited run at power 75.
+The magnitudes are those measured on the NXT motor: 170 revolutions per minute at full power and 9 V without load, speed
+proportional to power and voltage, no start below about 8 % of power, and an overshoot of about 60 degrees after an
+unregulated limited run at power 75.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class MotorParameters:
     coasting_s
         Time constant of slowing down without current.
     friction_deg_s2
-        Deceleration by dry friction; it also keeps a weakly driven motor from starting.
+        Deceleration by dry friction, which also keeps a weakly driven motor from starting.
     stops_deg
         Angles of the shaft at its mechanical stops.
     play_deg
@@ -59,7 +59,7 @@ class Motor:
         power
             -100 to 100.
         brake
-            Whether the motor is shorted at power 0, instead of without current.
+            Whether the motor brakes at power 0 (shorted), instead of coasting without current.
         battery_mv
             Voltage of the battery.
         """

@@ -1,9 +1,9 @@
 """The firmware's output port, simulated in steps of a millisecond: limits, ramps, regulation, counters.
 
-It reproduces the behaviour of LEGO's firmware 1.28 to 1.31. Important for a host:
+The behaviour is that of LEGO's firmware 1.28 to 1.31. Important for a host:
 
-- The tacho limit is added to a running *goal*, where the last limited run should have ended, not where it
-  did. So the overshoot of one run is subtracted from the next. A run without a limit carries the goal along.
+- The tacho limit is added to a running *goal*, where the last limited run should have ended, not where that run did
+  end. So the overshoot of one run is subtracted from the next. In a run without a limit, the goal follows the motor.
 - At the limit the port becomes idle: power decreases by 1 per millisecond and the motor coasts past the limit.
 - Speed regulation acts every 101 ms; one unit of power is one count per 100 ms, 10 degrees per second.
 """
@@ -47,7 +47,7 @@ class OutputSetting:
 
 @dataclass
 class OutputPort:
-    """One output port: its motor and the firmware's state."""
+    """One output port: its motor and the firmware's state, stepped by the millisecond."""
 
     motor: Motor = field(default_factory=Motor)
     setting: OutputSetting = field(default_factory=OutputSetting)
@@ -125,7 +125,7 @@ class OutputPort:
             self._fade_power()
 
     def regulate_if_due(self) -> bool:
-        """Regulate the speed if it is due; return whether it was."""
+        """Regulate the speed if that is due, every 101 ms; return whether it was due."""
         if self._clock_ms <= _REGULATION_MS:
             return False
         if self._regulation & _SPEED:
@@ -150,16 +150,14 @@ class OutputPort:
 
     @property
     def is_synchronised(self) -> bool:
-        """Whether it is synchronised with another port."""
+        """Whether the port is set to be synchronised with another one."""
         return self._regulation & (_SYNC | _SPEED) == _SYNC
 
     @property
     def _encoder_deg(self) -> int:
-        """Angle that the motor's encoder shows: the nearest whole degree, so that home lies in the middle of count 0.
-
-        A real encoder's count may change at any angle. If it changed at home, a count would mean an angle half a degree
-        larger on average, and every place would be off accordingly.
-        """
+        """Angle that the motor's encoder shows: the nearest whole degree, so that home is in the middle of count 0."""
+        # A real encoder's count may change at any angle. If it changed at home, a count would mean an angle half a
+        # degree larger on average, and every place would be off accordingly.
         return math.floor(self.motor.angle_deg + 0.5)
 
     def _change_run_state(self, run_state: int, power: int) -> None:
@@ -181,7 +179,7 @@ class OutputPort:
         self.run_state = run_state
 
     def _is_ramp_complete(self, ramp: int, power: int) -> bool:
-        """Return whether a ramp to this power, up or down, has already reached it."""
+        """Return whether the port has already reached the power at the end of this ramp, up or down."""
         if ramp == RunState.RAMP_UP:
             return self.set_power != 0 and (self.set_power >= power if power > 0 else self.set_power <= power)
         return self.set_power <= power if self.target_power >= 0 else self.set_power >= power
@@ -221,7 +219,7 @@ class OutputPort:
         self._set_unregulated_power()
 
     def _stop_at_limit(self) -> None:
-        """Become idle at the limit; without one, carry the goal along."""
+        """Become idle at the limit; without a limit, let the goal follow the motor."""
         if self._endless:
             if self.target_power:
                 self._goal = self.tacho_count

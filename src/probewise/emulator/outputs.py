@@ -36,7 +36,7 @@ class _Synchronisation:
 
 
 class OutputPorts:
-    """The output ports A, B and C with their motors, and the commands that drive them.
+    """The output ports A, B and C with their motors, and by opcode the commands that drive them (`commands`).
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class OutputPorts:
         }
 
     def advance(self, now_s: float, battery_mv: float) -> None:
-        """Simulate all milliseconds up to now."""
+        """Simulate all milliseconds from the last call up to `now_s`."""
         n_ticks = int((now_s - self._ticked_s) / _TICK_S + 1e-6)
         self._ticked_s += n_ticks * _TICK_S
         moving = [port for port in self.ports if not port.is_at_rest]

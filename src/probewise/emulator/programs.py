@@ -19,9 +19,9 @@ class Programs:
     Parameters
     ----------
     exists
-        Whether a program of this name exists.
+        Function that returns whether a program of a name exists.
     on_change
-        Called when a program starts or stops, to reset motors and sensors.
+        Function called when a program starts or stops, to reset motors and sensors.
     """
 
     def __init__(self, exists: Callable[[str], bool], on_change: Callable[[], None]) -> None:
@@ -75,7 +75,7 @@ class Programs:
         return padded(self._boxes[box].popleft() if remove else self._boxes[box][0])
 
     def _checked_running_name(self) -> bytes:
-        """Return the running program's name; refuse if none runs."""
+        """Return the running program's name; RefusedError if none runs."""
         if self.running is None:
             raise RefusedError(Status.NO_PROGRAM)
         return self.running

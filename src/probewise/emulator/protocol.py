@@ -1,7 +1,7 @@
 """The brick's side of LEGO's Bluetooth protocol: parsing requests and building replies.
 
-Layouts follow LEGO's direct and system commands; all numbers are little-endian. A frame is the
-length of a telegram in two bytes, then the telegram.
+Layouts follow LEGO's direct and system commands; all numbers are little-endian. A frame is the length of a telegram in
+two bytes, then the telegram.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Status(IntEnum):
 
 
 class RefusedError(Exception):
-    """Raised to refuse a command with a status other than OK; `payload` None: zeros at the full length of its reply."""
+    """Raised to refuse a command; `payload` follows the status (None: as many zeros as the firmware sends)."""
 
     def __init__(self, status: Status, payload: bytes | None = None) -> None:
         self.status, self.payload = status, payload
@@ -59,8 +59,8 @@ class RefusedError(Exception):
 class CommandLayout:
     """Layout of a command's telegram after the opcode, and length of its error reply after the status.
 
-    `layout` is a `struct` format; with `more`, any further bytes are the last field. After the status of an
-    error follow `error_bytes` zeros, as in the firmware.
+    `layout` is in the format of Python's `struct`; with `more`, any further bytes are the last field. After the status
+    of an error follow `error_bytes` zeros, as in the firmware.
     """
 
     name: str
@@ -74,7 +74,7 @@ class CommandLayout:
         Raises
         ------
         RefusedError
-            If there are too few of them.
+            If there are too few bytes.
         """
         size = struct.calcsize("<" + self.layout)
         if len(body) < size:
@@ -132,7 +132,7 @@ COMMANDS: dict[int, CommandLayout] = {
 
 @dataclass(frozen=True)
 class Request:
-    """One telegram from the host; `command` is None for an unknown opcode."""
+    """One telegram from the host; `command` is None for an unknown opcode, `body` the bytes after the opcode."""
 
     opcode: int
     wants_reply: bool
@@ -141,7 +141,7 @@ class Request:
 
 
 def parse_request(telegram: bytes) -> Request | None:
-    """Parse a telegram; None for those the firmware ignores: replies, unknown types, incomplete ones."""
+    """Parse a telegram; None for one that the firmware ignores: a reply, an unknown type, fewer than two bytes."""
     if len(telegram) < 2:
         return None
     kind, opcode = telegram[0] & ~_NO_REPLY, telegram[1]
@@ -167,13 +167,13 @@ _PATIENCE_S = 0.61  # the firmware discards an incomplete frame after this silen
 
 @dataclass
 class FrameAssembler:
-    """Assembles whole telegrams from bytes that come in pieces of any size."""
+    """Assembler of telegrams from bytes in pieces of any size; after 0.61 s of silence it drops an incomplete frame."""
 
     _held: bytearray = field(default_factory=bytearray)
     _last_s: float = 0.0
 
     def feed(self, received: bytes, now_s: float) -> Iterator[bytes]:
-        """Add bytes and yield every telegram that is complete."""
+        """Add bytes and yield every telegram that is complete, without its length."""
         if now_s - self._last_s > _PATIENCE_S:
             self._held.clear()
         if received:  # a call without bytes does not end the silence

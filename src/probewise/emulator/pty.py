@@ -23,7 +23,7 @@ class Terminal:
     Parameters
     ----------
     link
-        A symbolic link to the terminal that survives disconnections, as /dev/rfcomm0 does; None for none.
+        Path of a symbolic link to the terminal that survives disconnections, as /dev/rfcomm0 does; None: no link.
 
     Raises
     ------
@@ -47,7 +47,7 @@ class Terminal:
 
     @property
     def path(self) -> str:
-        """Path at which clients open it."""
+        """Path at which clients open the terminal: the symbolic link, if any, else the device."""
         return self._slave_path if self._link is None else str(self._link)
 
     def hang_up_and_reopen(self) -> None:
@@ -56,12 +56,12 @@ class Terminal:
         self._open_terminal()
 
     def read(self, wait_s: float) -> bytes:
-        """Return what a client has written, waiting at most `wait_s`."""
+        """Return the bytes that a client has written, at most 4096, waiting for them `wait_s` at most."""
         ready, _, _ = select.select([self._master], [], [], wait_s)
         return os.read(self._master, 4096) if ready else b""
 
     def write(self, data: bytes) -> None:
-        """Write bytes in one piece, since a client may take each read for a frame; lost if it never reads."""
+        """Write bytes in one piece, since a client may take each read for a frame; drop them if its buffer is full."""
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
 
@@ -98,9 +98,9 @@ def serve(
     clock
         The brick's clock, which must run in real time.
     on_move
-        Called with the device's new path if a disconnection has changed it.
+        Function called with the terminal's new path if a disconnection has changed that path.
     meanwhile
-        Called repeatedly, at least every 50 ms.
+        Function called repeatedly, at least every 50 ms.
     """
     while not radio.brick.is_off:
         due_s = radio.next_arrival_s

@@ -1,7 +1,7 @@
 """The Bluetooth link as seen by the host: it takes frames, delivers replies at their time, and injects faults.
 
-Nothing here waits: bytes carry the time at which they reach the host, and the caller, a pseudo-terminal or a
-test with a virtual clock, delivers them then.
+Nothing here waits: bytes carry the time at which they reach the host, and the caller, a pseudo-terminal or a test with
+a virtual clock, delivers the bytes at that time.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Radio:
     turnaround_s
         Time from the end of a request to its reply.
     trace
-        Function that records telegrams and faults.
+        Function that is called with every telegram and fault, see `Trace`.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Radio:
         return self._coming[0][0] if self._coming else None
 
     def send(self, data: bytes) -> None:
-        """Take bytes from the host, in pieces of any size; a fault may cut off the end of a piece."""
+        """Take bytes from the host, in pieces of any size, and execute whole telegrams; a fault may cut a piece."""
         if len(data) > 1 and self._fault_occurs("half", self.faults.half / 2):
             data = data[: int(self._rng.integers(1, len(data)))]
         for telegram in self._frames.feed(data, self._clock()):
@@ -145,7 +145,7 @@ class Radio:
         return build_reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
 
     def _with_faults(self, frame: bytes) -> bytes:
-        """Apply faults to a frame on its way to the host."""
+        """Return a frame to the host with a byte changed, the end cut off or bytes dropped, as the rates have it."""
         if self._fault_occurs("corrupt", self.faults.corrupt):
             at, change = int(self._rng.integers(len(frame))), int(self._rng.integers(1, 256))
             frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
@@ -161,7 +161,7 @@ class Radio:
         return [frame[begin:end] for begin, end in pairwise(cuts)]
 
     def _schedule_delivery(self, at_s: float, data: bytes) -> None:
-        """Schedule bytes in order: a late reply delays those after it."""
+        """Schedule bytes for `at_s`, or for the last time scheduled if that is later: no bytes overtake others."""
         self._last_s = max(at_s, self._last_s)
         self._coming.append((self._last_s, data))
 

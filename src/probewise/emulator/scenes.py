@@ -26,7 +26,7 @@ def parse_scene(text: str) -> Surface:
     Raises
     ------
     ParameterError
-        If it has none of the forms.
+        If the text has none of the forms.
     """
     name, _, listed = text.rpartition(":")
     try:
@@ -36,9 +36,9 @@ def parse_scene(text: str) -> Surface:
 
 
 def scene_text(surface: Surface) -> str:
-    """Write a scene as `parse_scene` reads it.
+    """Return the text of a scene for `parse_scene`, its numbers to six digits.
 
-    Raises ParameterError for an ellipse, and for what has none of the forms, such as stripes or black on white.
+    Raises ParameterError for an ellipse, and for a scene with none of the forms, such as stripes or black on white.
     """
     if (getattr(surface, "inside", 1.0), getattr(surface, "outside", 0.0)) == (1.0, 0.0):
         match surface:

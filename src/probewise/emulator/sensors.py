@@ -35,7 +35,7 @@ class LightSensor:
     Parameters
     ----------
     seen
-        Unrounded reading on the firmware's scale 0 to 100, with the LED on or off.
+        Function of whether the LED is on; returns an unrounded reading on the firmware's scale 0 to 100.
     clock
         Time in seconds; the converter takes a new sample every 3 ms.
     """
@@ -45,7 +45,7 @@ class LightSensor:
     _sample: tuple[int, bool, int] = field(default=(-1, False, AD_MAX))
 
     def counts(self, *, lit: bool) -> int:
-        """Return the AD converter's current sample, 0 to 1023; it takes one every 3 ms."""
+        """Return the AD converter's current sample, 0 to 1023, taken every 3 ms."""
         number = int(self.clock() / 0.003)
         if self._sample[:2] != (number, lit):
             self._sample = (number, lit, _counts_of_percent(self.seen(lit)))
@@ -53,13 +53,13 @@ class LightSensor:
 
 
 def _counts_of_percent(percent: float) -> int:
-    """Invert the firmware's conversion: 0 % is 896 counts, 100 % is 200, extrapolated on both sides."""
+    """Invert the firmware's conversion: 0 % is 896 counts, 100 % is 200; beyond, linear within 0 to 1023."""
     return min(max(round(200 + 68 / 100 * (AD_MAX - percent * AD_MAX / 100)), 0), AD_MAX)
 
 
 @dataclass
 class DigitalSensor:
-    """A sensor with registers at one I2C address."""
+    """A sensor at one I2C address; `registers` are bytes by the number of their first register."""
 
     address: int
     registers: dict[int, bytes]

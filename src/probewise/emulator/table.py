@@ -12,7 +12,7 @@ from probewise.world import Surface
 
 @dataclass
 class Tabletop:
-    """The surface under the sensor, and the sensor's rotation from the geometry's mounting."""
+    """The surface under the sensor, and the sensor's rotation by hand, relative to the geometry's mounting."""
 
     surface: Surface
     turned_rad: float = 0.0
@@ -23,7 +23,7 @@ class Tabletop:
         Raises
         ------
         ParameterError
-            If it is neither; nothing changes then.
+            If the line is neither; nothing changes then.
         """
         verb, _, angle = line.strip().partition(" ")
         try:

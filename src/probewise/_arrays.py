@@ -25,7 +25,7 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
         If there is a text, a date, a complex number, a set or a ragged list.
     """
     if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(np.float64), np.nan)
+        values = np.ma.filled(values.astype(np.object_), np.nan)
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values
     allowed = "numbers, in an array or a list"

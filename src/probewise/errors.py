@@ -12,10 +12,12 @@ __all__ = [
     "NotConvergedError",
     "NotSavedWarning",
     "ParameterError",
+    "PipeWarning",
     "ProbewiseError",
     "ReachError",
     "ShapeError",
     "SlowWarning",
+    "UnitWarning",
     "shortened",
     "shown",
 ]

@@ -182,6 +182,19 @@ def test_an_arm_can_be_brought_home_by_hand_or_by_itself(bench):
     assert [motor.position - motor.zero for motor in bench.paper.motors] == pytest.approx([0, 0, 0], abs=1)
 
 
+@pytest.mark.parametrize("let_go", ["set_home", "release"])
+def test_where_the_play_lies_is_unknown_after_hands_have_moved_the_joints(bench, let_go):
+    """At home by the counters, every joint is at its home angle, whatever side it came from before."""
+    with bench.arm as arm:
+        arm.measure(bench.pose(*PLACES[0]))
+        arm.release()
+        getattr(arm, let_go)()
+        counts = arm._machine.limits.last_counts
+        joints = arm.geometry.joints
+        expected = [joint.angle_at(counts[k], 0) for k, joint in enumerate(joints)]
+        np.testing.assert_array_equal(arm.angles_rad, expected)
+
+
 def test_a_rehearsal_of_homing_goes_to_the_stops_first():
     """The links before the base, so that the sensor is up when that turns."""
     stops = {"base": -193.0, "shoulder": 163.0, "elbow": 43.0}

@@ -100,6 +100,9 @@ def test_missing_readings_and_those_out_of_range_are_left_out_and_noted():
     assert recording.notes == ("1 reading missing, left out", "1 reading outside the range up to 5, left out")
     masked = np.ma.masked_greater([0.4, 99.0, 2.9], 50)
     assert np.isnan(made(readings=masked).readings).tolist() == [False, True, False]
+    for wrong in (np.ma.array(["a", "b", "c"]), np.ma.array([1j, 2.0, 3.0])):
+        with pytest.raises(ParameterError, match="readings"):
+            made(readings=wrong)
 
 
 def test_text_columns_of_a_table_are_noted_and_left_out():

@@ -135,6 +135,7 @@ BAD_TABLES = {
     "infinite reading": (HEAD + "0,0,1\n0,0,inf\n", ["row 3", "column reading", "'inf'"]),
     "overflow": (HEAD + "0,0,1e999\n", ["row 2", "column reading", "'1e999'"]),
     "huge coordinate": (HEAD + "1e300,0,1\n", ["row 2", "column x_mm", "'1e300'", "1e+09"]),
+    "radians": ("orientation_rad," + HEAD + "0,0,0,1\n", ["row 1", "orientation_rad", "orientation_deg"]),
     "NaN orientation": ("orientation_deg," + HEAD + "nan,0,0,1\n", ["row 2", "column orientation_deg"]),
     "NaN time": ("time_s," + HEAD + ",0,0,1\n", ["row 2", "column time_s"]),
     "text in a covariate": ("t_c," + HEAD + "1,0,0,1\n2,0,0,1\nx,0,0,1\n", ["row 4", "column t_c", "'x'"]),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from probewise.recordings import Recording, paper_plan, read_recording, shipped
+from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_recording, shipped
 from probewise.report import plots
 from probewise.report.plots.readings import tracks_and_single_rows
 from probewise.sensor import SSFField
@@ -13,6 +13,19 @@ from probewise.sensor import SSFField
 @pytest.fixture(scope="module")
 def recording():
     return read_recording(shipped("paper"))
+
+
+def test_more_runs_than_colours_are_all_drawn():
+    widths = {f"run {k}": np.array([9.0, 4.0]) for k in range(10)}
+    assert len([line for line in plots.posterior_widths(widths).lines if line.get_marker() == "o"]) == 10
+    assert len(plots.information_gained(widths).lines) == 10
+
+
+def test_the_distance_from_an_edge_grows_towards_its_brighter_side():
+    edge = HalfPlane(0.0, 0.0, inside=0.0, outside=1.0)
+    plan = Plan.from_arrays(x_mm=np.arange(-3.0, 4.0), y_mm=np.zeros(7), patterns=edge, unit="V")
+    (track,), _ = tracks_and_single_rows(plan)
+    np.testing.assert_allclose(track.along_mm, -plan.x_mm[track.rows])
 
 
 def blob():

@@ -120,6 +120,12 @@ def test_inside_and_outside_albedo_are_kept():
     assert covered == pytest.approx(np.array([[0.2, 0.9]]))
 
 
+def test_stripes_that_fill_the_field_or_none_of_it_have_no_edge():
+    flat = StripesRegion(normal_rad=0.0, period_mm=10.0, duty=np.array([0.0, 0.5, 1.0]), phase_mm=0.0)
+    away = edge_distance(flat, np.array([2.0]), np.array([0.0]))
+    np.testing.assert_array_equal(away[:, 0], [np.inf, 2.0, np.inf])
+
+
 def test_an_image_has_its_first_row_on_top():
     region = ImageRegion(np.array([[1.0, 0.0], [0.25, 0.5]]), 10.0, (0.0, 0.0))
     points = np.array([[5.0, 15.0], [15.0, 15.0], [5.0, 5.0], [15.0, 5.0], [25.0, 5.0], [-1.0, 5.0]])

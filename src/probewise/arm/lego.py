@@ -261,10 +261,12 @@ class LegoArm:
     def set_home(self) -> None:
         """Define the current position, set by hand, as home: set all counters to 0."""
         self._machine.reset((BASE, SHOULDER, ELBOW))
+        self._arrived = [0, 0, 0]
 
     def release(self) -> None:
         """Let all joints move freely."""
         self._machine.release()
+        self._arrived = [0, 0, 0]
 
     def read_here(self) -> float:
         """Read the sensor at its current place, in LEGO units, as in recordings."""

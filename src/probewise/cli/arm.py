@@ -259,21 +259,23 @@ def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry
         write_bytes_atomically(drawing, png(draw_arm_lengths(geometry)))
         print_result(f"drawn        {drawing}", quiet=arguments.quiet)
     if port is not None:
-        _report_brick_state(port, geometry)
+        _report_brick_state(port, geometry, quiet=arguments.quiet)
 
 
-def _report_brick_state(port: str, geometry: Geometry) -> None:
+def _report_brick_state(port: str, geometry: Geometry, *, quiet: bool) -> None:
     """Print the brick's name, firmware, battery and light; raise LinkError if a program runs on it. Nothing moves."""
     from probewise.arm import percent_to_lego_units
 
     with open_brick(port) as brick:
         version = brick.version()
         firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
-        print_result(f"brick        {brick.name()}, firmware {firmware}, battery {brick.battery_mv() / 1000:.2f} V")
+        battery_v = brick.battery_mv() / 1000
+        print_result(f"brick        {brick.name()}, firmware {firmware}, battery {battery_v:.2f} V", quiet=quiet)
         light = brick.light_sensor(geometry.sensor_port).read()
         value = percent_to_lego_units(light.fine_percent, geometry)
         print_result(
-            f"light        {value:g} {UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts"
+            f"light        {value:g} {UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts",
+            quiet=quiet,
         )
         program = brick.running_program()
         if program is not None:

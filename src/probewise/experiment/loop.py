@@ -317,7 +317,7 @@ def run(
     if progress is not None:
         require_callable("progress", progress, "a function that is called with every Step, or None")
     if hidden is not None:
-        require_kind("hidden", hidden, HiddenShape, "a Hidden: what a simulated field holds; or None")
+        require_kind("hidden", hidden, HiddenShape, "a HiddenShape: what a simulated field holds; or None")
         about = {**(about or {}), "hidden": hidden.journal_entry}
     steps = []
     for info in explore(instrument, experiment, rng=rng, max_readings=max_readings, journal=journal, about=about):

@@ -224,6 +224,8 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
         notes.append(f"time_s runs backwards at row {table.row_number(int(back[0]) + 1)}")
+    if "orientation_rad" in table.columns:
+        raise FileError(path, "it is in radians", "orientation_deg, in degrees", row=1, column="orientation_rad")
     orientation_deg = (
         table.column_of_numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
 import numpy as np
@@ -26,7 +27,7 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
         Axes to draw on; a new figure without.
     """
     ax = axes_or_new(ax, size_in=(6.4, 3.6))
-    for (name, sd), colour in zip(widths_mm.items(), CYCLE, strict=False):
+    for (name, sd), colour in zip(widths_mm.items(), itertools.cycle(CYCLE), strict=False):
         number = np.arange(1, len(sd) + 1)
         ax.plot(
             number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {count_with_noun(len(sd), 'reading')}"
@@ -66,7 +67,7 @@ def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None
         Axes to draw on; a new figure without.
     """
     ax = axes_or_new(ax, size_in=(6.4, 3.6))
-    for (name, gained), colour in zip(bits.items(), CYCLE, strict=False):
+    for (name, gained), colour in zip(bits.items(), itertools.cycle(CYCLE), strict=False):
         per_reading = gained[-1] / len(gained) if len(gained) else 0.0
         ax.plot(
             np.arange(len(gained) + 1),

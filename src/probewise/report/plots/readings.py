@@ -23,8 +23,8 @@ MAX_NAMED = 8  # tracks in the legend; with more there is none
 class Track:
     """Rows of one scan over one pattern, which a curve may join: `rows`, (n_rows,), are row numbers of the plan.
 
-    `along_mm`, (n_rows,), is the signed distance from a half-plane's edge, positive inside (`from_edge` True); over
-    another pattern, the position along the scan from its mean.
+    `along_mm`, (n_rows,), is the signed distance from a half-plane's edge, positive on its brighter side (`from_edge`
+    True); over another pattern, the position along the scan from its mean.
     """
 
     label: str
@@ -63,7 +63,8 @@ def tracks_and_single_rows(plan: Plan) -> tuple[list[Track], IntArray]:
 def _signed_position_mm(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
     x, y = plan.x_mm[rows], plan.y_mm[rows]
     if isinstance(pattern, HalfPlane):
-        return np.asarray(x * np.cos(pattern.normal_rad) + y * np.sin(pattern.normal_rad) - pattern.offset_mm)
+        inwards = x * np.cos(pattern.normal_rad) + y * np.sin(pattern.normal_rad) - pattern.offset_mm
+        return np.asarray(inwards if pattern.inside >= pattern.outside else -inwards)
     dx, dy = x - x.mean(), y - y.mean()
     angle = 0.5 * np.arctan2(2 * (dx @ dy), dx @ dx - dy @ dy)  # principal direction of the places
     return np.asarray(dx * np.cos(angle) + dy * np.sin(angle))

@@ -91,11 +91,11 @@ def readings_before_and_after_repair(
         If no three of the readings lie along a line.
     """
     require_recording(recording)
-    axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
-    above, below = axes[:, 0]
     found, _ = tracks_and_single_rows(recording.plan.take(rows))
     if not found:
         raise ParameterError("rows", rows.tolist(), "readings at three places or more along one line")
+    axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
+    above, below = axes[:, 0]
     for k, track in enumerate(found):
         order = np.argsort(track.along_mm, kind="stable")
         at, along = rows[track.rows[order]], track.along_mm[order]

@@ -64,4 +64,5 @@ def _edge_distance_of_stripes(region: StripesRegion, x_mm: FloatArray, y_mm: Flo
     along = np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.phase_mm[:, None]
     edges = (along, along - region.duty[:, None] * period)
     from_rise, from_fall = (np.abs(edge - period * np.round(edge / period)) for edge in edges)
-    return np.asarray(np.minimum(from_rise, from_fall))
+    has_edges = (region.duty > 0) & (region.duty < 1)
+    return np.where(has_edges[:, None], np.minimum(from_rise, from_fall), np.inf)

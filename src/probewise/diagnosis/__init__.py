@@ -1,4 +1,4 @@
-"""Diagnosis of what physics a model leaves out: from recordings to verdict, repaired model and next measurement.
+"""Diagnosis of physics that a model leaves out: from recordings to verdict, repaired model and next measurement.
 
 The paper, section "Efficacy of Sensor Model", shows that a better likelihood makes better inferences; this package
 finds a poor likelihood: it tests and locates residuals, explains them by named effects, repairs the model, and measures

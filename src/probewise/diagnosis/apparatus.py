@@ -24,11 +24,12 @@ from probewise.recordings.plan import Plan, Recording
 
 @dataclass(frozen=True)
 class Words:
-    """Words for sentences about an apparatus: the name of the calibrated model, and how to obtain a signal.
+    """Words for sentences about an apparatus.
 
-    `settles_nothing`: no reading separates two aliased effects; `run`: name of a group of rows; `next_plan`, `model`:
-    files of the next readings and of the repaired model; `no_cure`: no further rows would make an effect detectable;
-    `covariates`: names of covariates other than a table's own columns and states, which keep theirs; None: no table.
+    `null`: the calibrated model; `find_signal`: how to obtain a signal; `settles_nothing`: no reading separates two
+    aliased effects; `run`: name of a group of rows; `next_plan`, `model`: files of the next readings and of the
+    repaired model; `no_cure`: no further rows would make an effect detectable; `covariates`: words for a table's time,
+    row, level and previous row; None: not a table.
     """
 
     null: str
@@ -41,18 +42,18 @@ class Words:
     covariates: Mapping[str, str] | None = None
 
     def covariate_in_words(self, name: str) -> str:
-        """Return the name of a covariate in words."""
+        """Return the name of a covariate in words: of a table as `covariates` has it, else without underscores."""
         if self.covariates is None:
             return name.replace("_", " ")
         return self.covariates.get(name, name.replace("state:", "state ").replace("column:", "column "))
 
 
 class Apparatus(Protocol):
-    """The interface of an apparatus."""
+    """What the engine asks of an apparatus: its effects, priors, covariates, parts to hold out, next measurements."""
 
     @property
     def words(self) -> Words:
-        """Words for sentences about it."""
+        """Words for sentences about the apparatus."""
         ...
 
     def effects(self, recording: Recording, null: Null | None) -> Mapping[str, NamedEffect[Any]]:
@@ -60,7 +61,7 @@ class Apparatus(Protocol):
         ...
 
     def proposed_formulas(self) -> Mapping[str, NamedEffect[Any]]:
-        """Return proposed formulas for effects out of vocabulary; names begin with `effects.PROPOSAL`."""
+        """Return formulas for effects out of vocabulary, by name, which begins with `effects.PROPOSAL`."""
         ...
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
@@ -72,24 +73,24 @@ class Apparatus(Protocol):
         ...
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:
-        """Return whether this share of the budget of costly predictions is spent.
-
-        With all of it spent, no further combination is refitted.
-        """
+        """Return whether at least this share of the budget of costly predictions is spent."""
         ...
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
-        """Return the prior odds of these effects, of an unknown effect, and of none."""
+        """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
         ...
 
     def null_forms(self, recording: Recording) -> SsfForms:
-        """Return the forms of the null to calibrate from the recording, if no null is given."""
+        """Return the forms that a sensor's SSF may take when the null is calibrated from the recording."""
         ...
 
     def covariates_and_predicted_slope(
         self, found: Fit, recording: Recording
     ) -> tuple[Sequence[Covariate], FloatArray]:
-        """Return the covariates of a residual, and the slope of the prediction along the motion, (n_usable,)."""
+        """Return the covariates of the usable readings, and the slope of the prediction there, (n_usable,).
+
+        The slope is along the motion, per mm, or, of a table, the change since the previous row.
+        """
         ...
 
     def covariate_of_effect(
@@ -100,21 +101,24 @@ class Apparatus(Protocol):
         plan: Plan,
         known: Sequence[Covariate],
     ) -> Covariate | None:
-        """Choose the covariate in which an effect is located, from its change of the readings `without` it."""
+        """Choose, from those `known`, the covariate in which an effect is located; None if there is none.
+
+        `change` are the effect's changes of the readings, `without` the predictions without it, (n_points,) both.
+        """
         ...
 
     def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Return slopes by structure that no form of the null fits and that is not physics: (n_usable, n_columns)."""
+        """Return slopes of the readings by structure too fine for any form of the null: (n_usable, n_columns)."""
         ...
 
     def held_out_parts(self, recording: Recording) -> Parts:
-        """Partition usable readings into parts to hold out in turn."""
+        """Return the part of each usable reading, (n_usable,), and the names of the parts, to hold out in turn."""
         ...
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> Sequence[Command]:
-        """Return the possible next measurements.
+        """List the possible next measurements after a plan.
 
         With stride k, only every k-th reading is taken; `level` (n_points,) are the expected readings of the plan.
         """

@@ -69,12 +69,13 @@ def diagnose(
         Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape, or `OwnModel` for any
         simulator.
     effects
-        The vocabulary of effects, by name. Effects out of vocabulary count as unknown, even those with a formula
-        (`UNNAMED`).
+        The vocabulary of effects, by name. Library effects outside it (`UNNAMED`) are tried too, but count as unknown.
     thorough
-        Computes the evidence of the leading hypotheses a second time: `weigh_thoroughly`, by nested sampling.
+        Function that computes the evidence of the leading hypotheses a second time, such as
+        `partial(weigh_thoroughly, rng=rng)`, by nested sampling.
     hands
-        Whether a person can exchange or turn sheets for the next readings; if not, they are over the sheet in place.
+        Whether a person can exchange or turn sheets for the next readings; if not, the next scans are over the sheet in
+        place.
     rng
         Random generator, for the null distributions of the tests and the posterior samples.
     progress
@@ -83,7 +84,8 @@ def diagnose(
     Returns
     -------
     Diagnosis
-        Verdict, probabilities, places, gain, aliases, the repaired model and the next measurement.
+        Verdict, probabilities, places (where each effect or residual shows: ranges of covariates), gain, aliases, the
+        repaired model and the next measurement.
 
     Raises
     ------
@@ -108,7 +110,7 @@ def diagnose(
 def diagnose_prepared(
     prepared: Prepared, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
 ) -> Diagnosis:
-    """Run the pipeline of `diagnose` for any apparatus; see there for returns and raises."""
+    """Run the pipeline of `diagnose` on the input of any apparatus, with the same returns and errors."""
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
     searched = search_with_formulas(searched, progress=progress)
     prepared = searched.prepared
@@ -158,7 +160,6 @@ def _facts_for_reason(
     where: Sequence[Place],
     asked: NextMeasurement | None,
 ) -> Grounds:
-    """Collect the facts for the reason."""
     prepared, shares = searched.prepared, searched.evidences.unknown_shares
     orders = searched.posterior.order_probabilities
     beside = searched.likeliest_fit_beside_unknown(test.noise)

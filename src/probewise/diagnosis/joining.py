@@ -27,7 +27,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
     Raises
     ------
     ParameterError
-        If there is none, their readings are in different units, or two of them are the same.
+        If there is no recording, readings are in different units, or two recordings are the same.
     """
     if isinstance(recordings, str) or not isinstance(recordings, Sequence):
         require_recording(recordings)
@@ -60,8 +60,8 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
     """Concatenate plans, with the covariates of the first and commanded columns (LED, height) of all.
 
     Commanded columns are NaN (as at calibration) where a plan lacks them, unless it declares another height than the
-    first; other covariates keep their last known value. With `own_sessions`, or if a plan has sessions, each plan
-    without is a session of its own.
+    first; other covariates keep their last known value. With `own_sessions`, or if any plan has sessions (numbers of the
+    recordings joined in it), they are numbered on, and a plan without sessions is one.
     """
     first = plans[0]
     plans = [with_declared_height_commanded(plan, first.instrumentation.height_mm) for plan in plans]
@@ -102,7 +102,7 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
 
 
 def _joined_sessions(plans: Sequence[Plan]) -> tuple[int, ...]:
-    """Return the number of the recording that each of the joined scans is from."""
+    """Return, for each of the joined scans, the number of the recording that it is from."""
     found: list[int] = []
     for plan in plans:
         before = max(found, default=-1) + 1
@@ -130,7 +130,7 @@ def _joined_covariate(plans: Sequence[Plan], name: str) -> FloatArray:
 
 
 def _notes_on_missing_covariates(recordings: Sequence[Recording]) -> list[str]:
-    """Describe the treatment of covariates that some recordings lack."""
+    """List notes on covariates that some recordings lack."""
     first, out = recordings[0], []
     for k, other in enumerate(recordings[1:], 1):
         for name in sorted({*first.plan.covariates} - {*other.plan.covariates, *COMMANDED}):
@@ -141,7 +141,7 @@ def _notes_on_missing_covariates(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str]:
-    """List what later recordings declare of their readings in another way than the first, whose values are taken."""
+    """List notes on each range, step or height that a later recording declares otherwise than the first."""
     first, out = recordings[0], []
     for k, other in enumerate(recordings[1:], 1):
         for name in ("min", "max", "step", "height_mm"):

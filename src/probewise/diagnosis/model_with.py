@@ -20,26 +20,27 @@ from probewise.sensor import Stage
 
 
 def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:
-    """Fit the sensor with exactly these effects, at the SSF order with the largest evidence.
+    """Fit the sensor with these effects, at the SSF order (number of Gaussians) with the largest evidence.
 
     Parameters
     ----------
     recording
         What was read.
     names
-        Names of effects of the vocabulary; empty for the calibrated sensor alone.
+        Names of `EFFECTS`, in the vocabulary or out of it; empty for the calibrated sensor alone.
     rng
         Source of randomness, for the posterior samples.
 
     Returns
     -------
     ModelSamples
-        The samples; without any effect on the mean if the search kept no refit with all of them.
+        The samples; without any effect on the mean if the search kept no refit with all of them, and without the noise
+        effects (but those beyond doubt) if it kept no noise model of just these.
 
     Raises
     ------
     ParameterError
-        If a name is not in the vocabulary, or its effect cannot act in this recording.
+        If there is no effect of a name, or it cannot act in this recording.
     """
     require_recording(recording)
     require_rng(rng)

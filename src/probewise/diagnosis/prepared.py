@@ -105,7 +105,7 @@ def prepare(
     null: Null | None = None,
     apparatus: Apparatus,
 ) -> Prepared:
-    """Join recordings, thin out long ones, build the effects; parameters and errors as in `diagnose`."""
+    """Join recordings, thin out long ones, and let the apparatus build the effects; errors as in `diagnose`."""
     if sensor is not None and null is not None:
         raise ParameterError("sensor, null", "both", "one of them: a null contains the prior of its sensor")
     if sensor is not None:

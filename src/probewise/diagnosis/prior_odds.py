@@ -14,17 +14,18 @@ from probewise.sensor import Stage
 
 @dataclass(frozen=True)
 class PriorOdds:
-    """Prior odds of effects on the mean and on the noise.
+    """Prior probabilities of sets of effects on the mean and, separately, on the noise.
 
-    Mean: `clean_mean`, `unknown`, and the rest divided among combinations by size, then equally; `unknown_beside` is
-    the share of those with an additional unknown effect. The share `out_of_vocabulary` of the unknown is divided among
-    the effects of `UNNAMED`; the rest has no formula. Noise: `white`, and the rest divided among noise models by size,
-    then equally; beside a complete mean they have together the probability `not_white_alone`, by default the same as
-    beside an effect. `complexity_penalty` (nats) is the prior penalty of an effect per Gaussian of the SSF that it
-    makes superfluous, since physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is the same for an
-    unknown effect, which can imitate any shape. `twofold` are the effects that may occur twice; `twice` is the
-    probability that one of them does, given that it occurs. A second cycle beside a first is more plausible than any
-    other second effect. None: a second copy has the prior of any other second effect.
+    Mean: `clean_mean` for no effect, `unknown` for one out of vocabulary, and the rest divided among combinations by
+    size (`by_size`), then equally; `unknown_beside` is the share of those with an additional unknown effect. The share
+    `out_of_vocabulary` of the unknown is divided among the effects of `UNNAMED`; the rest has no formula.
+    Noise: `white`, and the rest divided among noise models by size, then equally; with no effect on the mean, the rest
+    has together the probability `not_white_alone`, by default the same.
+    `complexity_penalty` (nats) is the penalty of an effect per Gaussian of the SSF that it makes superfluous, since
+    physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is that of an unknown effect.
+    `unknown_explains_most`: an unknown effect is the verdict only if it has more evidence than each named one alone.
+    `twofold` are the effects that may occur twice; `twice` is the probability that one does, given that it occurs;
+    None: that of any second effect.
     """
 
     n_named: int = 24
@@ -46,7 +47,7 @@ class PriorOdds:
 
     @classmethod
     def for_effects(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
-        """Divide the odds among these effects."""
+        """Divide the default probabilities among these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
         unnamed = sum(is_out_of_vocabulary(name) for name in effects)
         twofold = frozenset(first for name in effects if (first := name_of_first_copy(name)) is not None)
@@ -74,20 +75,20 @@ class PriorOdds:
         return math.log(self.by_size[n - 1] / math.comb(self.n_named, n) if n else self.clean_mean)
 
     def log_prior_with_unknown(self, names: Names) -> float:
-        """Return the log prior of an unknown effect in addition to a combination of effects on the mean."""
+        """Return the log prior of an unknown effect without a formula, together with effects on the mean."""
         if names:
             return self.log_prior_on_mean(names) + math.log(self.unknown_beside)
         return math.log(self.unknown * (1 - self.out_of_vocabulary if self.n_unnamed else 1.0))
 
     def single_effect_priors(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
-        """Return the prior probabilities of clean, unknown and single effects, for readings without information.
+        """Return the probabilities of clean, unknown and single effects alone, by names on the mean and on the noise.
 
         Parameters
         ----------
         names
             Names of the effects on the mean in the vocabulary.
         noise
-            Names of the certain noise effects.
+            Names of the certain noise effects, the same for all.
         """
         each = self.by_size[0] / self.n_named
         believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}
@@ -96,10 +97,7 @@ class PriorOdds:
         return {(mean, noise): p / total for mean, p in believed.items()}
 
     def log_prior_on_noise(self, names: Names, *, alone: bool = False) -> float:
-        """Return the log prior of a noise model; `names` are those of its effects that are not certain.
-
-        `alone`: beside a complete mean.
-        """
+        """Return the log prior of a noise model by its uncertain effects `names`; `alone`: none is on the mean."""
         not_white = 1 - self.white
         if alone and self.not_white_alone is not None:
             not_white = self.not_white_alone

@@ -28,7 +28,7 @@ class Command(Protocol):
 
     @property
     def plan(self) -> Plan:
-        """Its rows."""
+        """Rows of the measurement."""
         ...
 
     @property

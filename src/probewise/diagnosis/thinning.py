@@ -17,8 +17,8 @@ _STRETCH = 6  # readings
 def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArray:
     """Choose rows spread over the recording with about `most` usable readings; all rows if there are no more.
 
-    Whole scans are chosen, to preserve correlations between readings; if they would be fewer than eight, stretches of
-    six successive rows, evenly spaced.
+    Whole scans are chosen, to preserve correlations between readings; or, if these would be fewer than eight, stretches
+    of six successive rows, evenly spaced.
 
     Returns
     -------

@@ -26,9 +26,9 @@ _N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
 
 @dataclass(frozen=True, eq=False)
 class SensorAndShape:
-    """A calibrated sensor over an unknown shape of known prior, which stands for every pattern not described.
+    """A null model: a calibrated sensor over an unknown shape of known prior, which is every pattern not described.
 
-    A `Null`. `starts` (n_starts, n_params) are coordinates from which it is fitted; `of` finds them.
+    `starts` (n_starts, n_params) are coordinates from which it is fitted; `of` finds them.
     """
 
     sensor: CalibratedSensor
@@ -49,11 +49,16 @@ class SensorAndShape:
         sensor
             The sensor as calibrated.
         shape
-            The shape with its prior, or a set of shapes.
+            The shape with its prior, or a set of shapes (`AnyOf`).
         recording
             The readings over it.
         rng
             Source of randomness, for the search.
+
+        Raises
+        ------
+        ParameterError
+            If no reading is usable.
         """
         known = sensor_from_samples(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
@@ -78,7 +83,7 @@ class SensorAndShape:
 
     @property
     def form(self) -> str:
-        """Description of the sensor's SSF."""
+        """Description of the sensor's SSF, in words."""
         return self.sensor.form
 
     @property
@@ -103,11 +108,11 @@ class SensorAndShape:
 
     @property
     def least_readings(self) -> int:
-        """Fewest readings for a diagnosis: three per parameter of the shape, and three more; the sensor is known."""
+        """Fewest usable readings for a verdict: three per parameter of the shape, and three more."""
         return 3 * len(self.shape.prior.names) + 3
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Return whether the sensor's model can have the effect."""
+        """Return True: every effect can act on the sensor."""
         return self.sensor.admits(effect)
 
     def theta(self, z: FloatArray) -> FloatArray:
@@ -120,9 +125,9 @@ class SensorAndShape:
         return self.sensor.chain_over(_ShapeAmongPatterns(self.shape, plan), effects, n_nodes=n_nodes)
 
     def with_shape_in_next_plan(self, diagnosis: Diagnosis) -> Diagnosis:
-        """Return the diagnosis with the shape, at its posterior mean, as the unknown patterns of its next plan.
+        """Return the diagnosis with undescribed patterns of its next plan described, so that the plan can be written.
 
-        Only then can that plan be written to a file.
+        They become the shape at its posterior mean, as a polygon.
         """
         asked, names = diagnosis.next_measurement, list(diagnosis.repaired.chain.names)
         if asked is None:
@@ -148,12 +153,10 @@ class _ShapeAmongPatterns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The shape's parameters."""
         return self.shape.prior.names
 
     @property
     def prior(self) -> Prior:
-        """The shape's prior."""
         return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
@@ -172,7 +175,7 @@ def _search_for_shapes(
 
     Returns
     -------
-    Sum of squared residuals of the best shape, and coordinates of the four best, (4, n_params).
+    Sum of squared residuals of the best shape, and coordinates of sensor and shape for the four best, (4, n_params).
     """
     usable = recording.usable
     if not usable.any():

@@ -25,10 +25,10 @@ _LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # least nats per reading; less is rou
 
 @dataclass(frozen=True)
 class Alias:
-    """Two effects with nearly collinear projected templates under this plan, and what would separate them.
+    """Two effects that a recording hardly tells apart, and the measurement that would.
 
-    `cosine`: of the projected templates; `settle_by`: the separating scan in words, and `readings`: how many of its
-    readings are needed. If none separates them, `settle_by` says so and `readings` is 0.
+    `cosine`: largest principal cosine of their templates, with the null's parameters projected out; `settle_by`: the
+    separating scan in words, or that there is none; `readings`: how many of its readings are needed, or 0.
     """
 
     effects: tuple[str, str]
@@ -38,7 +38,7 @@ class Alias:
 
 
 def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
-    """Project a fit out of two templates (n_points, k); return their largest principal cosine, 0 if one vanishes."""
+    """Return the largest principal cosine of two templates (n_points, k), a fit projected out; 0 if it absorbs one."""
     bases = []
     for columns in (first, second):
         raw = np.linalg.norm(problem.law(columns)) / problem.sd
@@ -57,11 +57,11 @@ def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *,
     Parameters
     ----------
     problem
-        The null fit.
+        The linearised null fit, whose parameters are projected out of the templates.
     templates
         For each effect, its best-fitting template columns (n_points, k).
     otherwise
-        Text for `settle_by`, until a separating plan is found.
+        The `settle_by` of each pair; its `readings` are 0.
     """
     out = []
     for pair in itertools.combinations(sorted(templates), 2):
@@ -72,9 +72,9 @@ def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *,
 
 
 def aliases_with_separating_plans(searched: Searched, problem: Linearised, found: Fit) -> list[Alias]:
-    """List the aliased pairs of named effects on the mean, with the plans that separate them.
+    """List the aliased pairs of effects of the vocabulary on the mean, each with the scan that separates it best.
 
-    Each effect is taken by its best-fitting bank entry.
+    An effect's template is the best-fitting entry of its bank (its changes of readings, at a grid of its parameters).
 
     Parameters
     ----------
@@ -106,10 +106,11 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
 def pairs_with_separating_scans(
     pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float, apparatus: Apparatus
 ) -> list[Alias]:
-    """Return the pairs, each with the candidate plan that separates it best and the number of readings needed.
+    """Return the pairs with `settle_by` and `readings` of the best scan that the apparatus could take.
 
-    Each effect has the size at which 400 readings give lambda 8; the advised plan has the most expected nats per
-    reading, with as many readings as three nats need.
+    Both effects have the size that changes the plan's readings by 0.4 noise sds rms. The best scan has the most nats
+    between the two per reading, and as many readings as three nats need, at most 102. A pair that no scan separates is
+    unchanged.
     """
     names = sorted({name for pair in pairs for name in pair.effects})
     null = found.model.predict(found.z[None, :])[0]

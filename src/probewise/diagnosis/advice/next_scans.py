@@ -32,10 +32,10 @@ _LEAST_WEIGHT = 0.05  # least weight of a rival, since its probability may be wr
 
 @dataclass(frozen=True, eq=False)
 class NextMeasurement:
-    """A plan to take next, with its expected information.
+    """Scans to take next, as one plan, with the information that they are expected to give.
 
     `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
-    true. `between`: the hypotheses, in words.
+    true. `between`: each of the hypotheses, in words. `minutes`: duration with breaks.
     """
 
     plan: Plan
@@ -47,9 +47,9 @@ class NextMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A hypothesis on the mean: label, model with its best point z (n_params,), and probability.
+    """A hypothesis about the mean readings (not their noise): label, model with best point z (n_params,), probability.
 
-    `root` (n_params, n_params): a square root of the covariance there, root root^T.
+    `label` is its name in words; `root` (n_params, n_params) a square root of the covariance of z: root root^T.
     """
 
     label: str
@@ -66,13 +66,13 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class PredictiveNormal:
-    """Normal predictive distribution in noise sds: mean (n_points,), covariance of the readings 1 + factor factor^T."""
+    """Normal predictive distribution in noise sds: mean (n_points,), covariance of the readings I + factor factor^T."""
 
     mean: FloatArray
     factor: FloatArray
 
     def take_readings(self, rows: IntArray) -> PredictiveNormal:
-        """Return the predictive distribution of the readings in these rows."""
+        """Return the predictive distribution of the readings with these row numbers."""
         return PredictiveNormal(self.mean[rows], self.factor[rows])
 
     @property
@@ -91,7 +91,7 @@ def measurement_separating_rivals(
     rivals
         Two or more hypotheses.
     sd
-        Noise sd of a reading.
+        Noise sd of a reading, in the unit of the readings.
     plan
         The plan already measured.
     apparatus
@@ -165,7 +165,7 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
 def _shortlisted_command_indices(
     rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
 ) -> list[int]:
-    """Return the indices of the few scans, for each pair of rivals, in which predictions differ most per minute."""
+    """Return the indices of the four scans, for each pair of rivals, that separate it most per minute."""
     if not offered:
         return []
     everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
@@ -181,7 +181,7 @@ def _shortlisted_command_indices(
 
 
 def _expected_log_bayes_factor_over_closest(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
-    """Return the expected log Bayes factor of the truth over its closest rival, in nats, averaged over the truth."""
+    """Return the expected log Bayes factor of the truth over its closest rival, in nats, averaged by `weights`."""
     covariances = [predictive.covariance for predictive in predictives]
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]

@@ -25,7 +25,7 @@ _SIZES = 4  # sizes tried, each a quarter of the last
 
 
 def choose_next_measurement(searched: Searched, null: WeighedFit) -> NextMeasurement | None:
-    """Choose the readings that separate the leading refitted hypotheses on the mean.
+    """Choose the scans that separate the most probable hypotheses about the mean readings, of those refitted.
 
     If only one is left, its rival is an effect too weak to be detected so far. None if no scan is informative, or only
     one is left and the budget of costly predictions is spent.
@@ -52,7 +52,7 @@ def choose_next_measurement(searched: Searched, null: WeighedFit) -> NextMeasure
 
 
 def _leading_fits(searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]) -> list[WeighedFit]:
-    """Return the fits of the leading hypotheses on the mean, by their probabilities, the most probable first."""
+    """Return the refits of the most probable hypotheses on the mean, at most five, the most probable first."""
     found: list[WeighedFit] = []
     for names, probability in ranked.items():
         candidate = searched.best_refit_of(names, searched.certain) if names else null
@@ -71,7 +71,7 @@ def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> 
 
 
 def _rival_with_undetected_effect(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
-    """Return a rival with an effect of lambda 3 here, too weak to be detected; None if it changes readings too much."""
+    """Return a rival with an effect of lambda 3, undetected so far; None if it changes readings by much more."""
     effect, found = searched.prepared.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.likeliest_law)

@@ -1,4 +1,4 @@
-"""The fewest extra readings that make effects fine (detected, not aliased): scans chosen greedily."""
+"""Cures of a plan: the fewest extra scans, chosen greedily, with which it detects effects and tells them apart."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ def choose_cure_scans(
     ailing: Sequence[str],
     progress: Progress = silent,
 ) -> list[Scan]:
-    """Choose scans to add one at a time, each with the largest reduction of the effects' deficit per reading.
+    """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
+
+    They are timed one after another, in the order chosen. The deficit of an effect is 0 if it is detected and told from
+    others, up to 1 if aliased, 1 to 2 if invisible.
 
     Parameters
     ----------
@@ -52,7 +55,7 @@ def choose_cure_scans(
     ailing
         Names of the effects that are aliased or invisible under the plan.
     progress
-        Called for every chosen scan.
+        Called before every choice.
     """
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Scan] = []
@@ -82,7 +85,7 @@ def choose_cure_scans(
 
 
 def _total_detectability_deficit(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
-    """Return the summed deficit of effects: 0 fine, up to 1 aliased, 1 to 2 invisible."""
+    """Return the summed deficit of the ailing effects on these rows: 0 fine, up to 1 aliased, 1 to 2 invisible."""
     detectability = ProjectedTemplates.of(laid, rows).detectable_shares_and_cosines(ailing)
     total = 0.0
     for name in ailing:

@@ -36,7 +36,7 @@ def nats_from_cosine(cosine: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ExpectedSensor:
-    """The expected sensor: prior `null`, point `z` (n_params,) of linearisation, low and high level, noise sd."""
+    """The expected sensor: `null` with its prior, point `z` (n_params,) of linearisation, low and high level, sd."""
 
     null: Null
     z: FloatArray
@@ -46,11 +46,11 @@ class ExpectedSensor:
 
 @dataclass(frozen=True, eq=False)
 class PlanTemplates:
-    """The templates of one plan, in units of the noise sd.
+    """The templates of all effects under one plan: changes of its readings, in noise sds.
 
-    `columns` (n_points, n_columns) are grouped in entries, the settings of an effect's bank; `entry` (n_columns,)
-    numbers them, `owner` (n_entries,) is the index of the effect in `names`, `settings` its parameters. `slopes`
-    (n_points, n_params) are those of the sensor. Effects that cannot act here are not in `built`.
+    `columns` (n_points, n_columns) are grouped in entries: one for each setting (parameter values) of an effect's
+    bank. `entry` (n_columns,) is the entry of each column, `owner` (n_entries,) the index of its effect in `names`,
+    `settings` its parameter values. `slopes` (n_points, n_params) are those of the sensor. `built`: effects by name.
     """
 
     slopes: FloatArray
@@ -70,9 +70,9 @@ class PlanTemplates:
         *,
         most: int | None = None,
     ) -> Self:
-        """Build the templates of every effect on the mean, with at most `most` settings each, evenly spread.
+        """Scale the effects to a plan and build their templates, without effects on the noise or that cannot act there.
 
-        Without `most`, all settings are used, except for plans of thousands of readings.
+        Each has at most `most` settings, evenly spread; by default as many as hold two million numbers, but 64 or more.
         """
         extent = Extent(*expected.levels, plan)
         maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
@@ -84,7 +84,7 @@ class PlanTemplates:
     def of_scaled_effects(
         cls, expected: ExpectedSensor, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
     ) -> Self:
-        """Build the templates of effects that are already scaled."""
+        """Build the templates of effects that are already scaled to the plan, as `of` does."""
         most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
         model = Model(expected.null, (), plan)
         predicted, slopes = model.predict_and_differentiate(expected.z)
@@ -111,7 +111,7 @@ class PlanTemplates:
         )
 
     def norms_of_entries(self, columns: FloatArray) -> FloatArray:
-        """Return the joint norm of each entry's columns, (n_entries,)."""
+        """Return the root of the sum of squares of each entry's columns, (n_points, n_columns) -> (n_entries,)."""
         return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
 
 
@@ -119,8 +119,8 @@ class PlanTemplates:
 class ProjectedTemplates:
     """Templates on some rows with the sensor's parameters projected out, in noise sds: `left` (n_rows, n_columns).
 
-    `basis` holds each entry's columns orthonormalised; `raw` and `kept` (n_entries,) are the norms before and after the
-    projection.
+    Rows are `n_points` readings, then one for each parameter's prior. `basis` holds each entry's columns
+    orthonormalised; `raw` and `kept` (n_entries,) are the norms before and after the projection.
     """
 
     laid: PlanTemplates
@@ -132,7 +132,7 @@ class ProjectedTemplates:
 
     @classmethod
     def of(cls, laid: PlanTemplates, rows: IntArray) -> Self:
-        """Project the sensor's parameters, with their prior, out of the templates of these rows."""
+        """Project the sensor's parameters, with their prior, out of the templates on these row numbers."""
         slopes, columns = laid.slopes[rows], laid.columns[rows]
         n_points, n_params = slopes.shape
         own, _ = np.linalg.qr(np.concatenate([slopes, np.eye(n_params)]))
@@ -150,10 +150,10 @@ class ProjectedTemplates:
     def detectable_shares_and_cosines(
         self, asked: Sequence[str] | None = None
     ) -> dict[str, tuple[float, dict[str, float]]]:
-        """Return, by effect, its detectable share, and its cosine to every other detectable effect, by name.
+        """Return, by effect, its detectable share (of the norm), and its cosine to every other effect, by name.
 
         Both are medians over the effect's settings; the cosine is to the best-imitating setting of the other effect.
-        Only effects in `asked` have cosines, by default all that are detectable.
+        Only effects in `asked` have cosines, by default all, and only between shares of 0.05 or more.
         """
         laid = self.laid
         present = {name: self._active_entry_indices(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
@@ -189,7 +189,7 @@ class ProjectedTemplates:
         return mine[self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)]
 
     def smallest_detectable_amplitudes(self, effect: NamedEffect[Any]) -> tuple[float | None, ...]:
-        """Return the size of each amplitude that gives lambda 8, median over settings; None if undetectable."""
+        """Return each amplitude's value at which an effect has lambda 8, median over settings; None if it has none."""
         at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
         columns = np.flatnonzero(np.isin(self.laid.entry, at))
         settings = np.concatenate([self.laid.settings[k] for k in at])
@@ -203,15 +203,11 @@ class ProjectedTemplates:
 
 
 def _run_start_indices(codes: IntArray) -> IntArray:
-    """Return the first index of each run of equal codes."""
     return np.flatnonzero(np.diff(codes, prepend=-1))
 
 
 def _orthonormalise_entries(columns: FloatArray, entry: IntArray) -> FloatArray:
-    """Orthonormalise each entry's columns.
-
-    Directions shorter than a thousandth of the longest become zero columns.
-    """
+    """Orthonormalise each entry's columns; directions below a thousandth of the longest become zero."""
     out = np.zeros_like(columns)
     widths = np.bincount(entry)
     for width in np.unique(widths):  # all entries of one width at a time

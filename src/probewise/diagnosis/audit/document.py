@@ -13,8 +13,8 @@ CURE_PLAN = "cure_plan.csv"
 def audit_json(audit: PlanAudit) -> dict[str, Any]:
     """Convert an audit to the content of audit.json.
 
-    An `amount` is null if none suffices, a `cure` if there is none; `rows` and alias classes that were not computed are
-    left out.
+    The `amount` of a smallest size is null if no size is detectable, `cure` if there is none; `rows` and alias classes
+    that were not computed are left out.
     """
     plan = audit.cure_plan
     return {

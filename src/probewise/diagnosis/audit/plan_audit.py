@@ -63,7 +63,10 @@ _TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.
 
 @dataclass(frozen=True)
 class DetectableSize:
-    """The value of one parameter at which an effect has lambda 8; None if it never has."""
+    """The value of one amplitude (`amount` in `unit`) that gives an effect lambda 8; None if no value does.
+
+    Lambda is the norm of the effect's change of the readings in noise sds, after a refit of the sensor.
+    """
 
     parameter: str
     unit: str
@@ -82,11 +85,12 @@ class EffectAudit:
     name, detectability
         The effect, and whether it is invisible, aliased or fine.
     share
-        Detectable share, median over its settings; 0 if it cannot act here.
+        Share of its change of the readings that the model's parameters do not absorb, median over its settings; 0 if it
+        cannot act here. Of a noise effect: 1 if fine, 0 if invisible.
     alike
         Effects that imitate a typical setting of this one, with cosines, largest first.
     smallest
-        The value of each amplitude at which it has lambda 8.
+        The value of each amplitude at which it has lambda 8 (norm in noise sds, after a refit).
     reason
         Why it is invisible, or "".
     rows
@@ -103,14 +107,14 @@ class EffectAudit:
 
     @property
     def sight(self) -> Detectability:
-        """`detectability`, by its name of the last release."""
+        """Old name of `detectability`, deprecated."""
         warnings.warn("EffectAudit.sight is EffectAudit.detectability now", DeprecationWarning, stacklevel=2)
         return self.detectability
 
 
 @dataclass(frozen=True, eq=False)
 class Cure:
-    """One scan to add: its kind (`Scan`), description, plan, minutes, and the effects that become fine."""
+    """One scan to add: kind (of `Scan`), description, plan, duration in minutes, and the effects it makes fine."""
 
     kind: str
     description: str
@@ -121,7 +125,7 @@ class Cure:
 
 @dataclass(frozen=True, eq=False)
 class PlanAudit(ShowsItself):
-    """The audit of a plan.
+    """Audit of a plan: which effects its readings detect and tell apart, and scans to add for the others.
 
     Attributes
     ----------
@@ -135,11 +139,11 @@ class PlanAudit(ShowsItself):
         Cosine of each effect (row) with its best imitation by each other (column), (n_effects, n_effects), in the order
         of `effects`; on the diagonal, the detectable share.
     cures
-        Scans to add, the most useful first.
+        Scans to add, in the order chosen.
     words
         Words for the apparatus.
     classes
-        Classes of aliased effects; None if not requested.
+        Groups of effects aliased with one another; None if not requested.
     """
 
     plan: Plan
@@ -157,12 +161,12 @@ class PlanAudit(ShowsItself):
     def effects_with_detectability(
         self, detectability: Detectability, *, after: bool = False
     ) -> tuple[EffectAudit, ...]:
-        """Return the effects with this detectability, under the plan or the plan with its cures.
+        """Return the effects that are "fine", "aliased" or "invisible" under the plan, or `after` all cures.
 
         Raises
         ------
         ParameterError
-            If there is no such detectability.
+            If `detectability` is none of the three.
         """
         require_one_of("detectability", detectability, get_args(Detectability))
         return tuple(
@@ -215,7 +219,7 @@ class PlanAudit(ShowsItself):
 
 
 def count_with_noun(names: Sequence[str], noun: str) -> str:
-    """Write the number of names with a noun, in the plural if need be."""
+    """Write the number of names with a noun, in the plural unless it is one; "scan" is always in the plural."""
     return f"{len(names)} {noun}{'' if len(names) == 1 and noun != 'scan' else 's'}"
 
 
@@ -224,7 +228,7 @@ def _name_with_alias(effect: EffectAudit) -> str:
 
 
 def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:
-    """Return the lines of a list of names after a label; none without names."""
+    """Write a list of names after a label, in lines of up to 100 characters; no lines without names."""
     lines, line = [], f"{label:<10} "
     for k, name in enumerate(names):
         piece = name + (", " if k + 1 < len(names) else "")
@@ -257,13 +261,17 @@ def audit_plan(
     effects
         The vocabulary, by name.
     progress
-        Called for the plan, then for each scan considered as a cure.
+        Called for the plan, before each choice of a cure, and for the plan with each cure.
+
+    Returns
+    -------
+    PlanAudit
+        Detectability of every effect, and up to five scans to add.
 
     Raises
     ------
     ParameterError
-        If the plan has no row, or a pattern that its description lacks, or another unit than the sensor, or the noise
-        is not above 0.
+        If the plan has no row, or an undescribed pattern, or another unit than the sensor, or the noise is not above 0.
     """
     if isinstance(plan, Recording):
         plan = plan.plan
@@ -298,9 +306,9 @@ def audit_plan(
 
 
 def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
-    """Return, for each effect cured by the steps, the step from which it remains fine.
+    """Return, for each effect that added scans make fine to the end, the number of scans (1, 2, ...) from which it is.
 
-    An effect may be fine at some step and not after a later one.
+    `steps` are the audits with 0, 1, 2, ... scans added; scans after the last one that cures do not count.
     """
     fine = [{effect.name for effect in step if effect.detectability == "fine"} for step in steps]
 
@@ -322,9 +330,9 @@ def audit_plan_of_diagnosis(
     Parameters
     ----------
     diagnosis
-        Diagnosis of a light sensor over known patterns.
+        Diagnosis of a light sensor over known patterns; of more than 4,000 usable readings, every second (third, ...).
     sensor
-        The earlier sensor used as its prior, if any.
+        The earlier sensor that was the prior of the diagnosis, if any.
     effects
         The vocabulary, by name.
     """
@@ -353,7 +361,7 @@ def audit_plan_of_diagnosis(
 def _expected_sensor_and_description(
     plan: Plan, sensor: SensorPrior | None, noise_sd: float | None
 ) -> tuple[ExpectedSensor, str]:
-    """Return the expected sensor, and its description."""
+    """Return the expected sensor, and its description in words with its noise sd."""
     if sensor is not None:
         mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
         null = sensor_from_samples(sensor)
@@ -378,7 +386,7 @@ def _expected_sensor_and_description(
 def audits_and_cosines(
     laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
-    """Return the audit of every effect, and the matrix of cosines (row imitated by column)."""
+    """Return the audit of every effect, and the matrix of cosines (row imitated by column; shares on the diagonal)."""
     seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
     detectability = seen.detectable_shares_and_cosines()
     names = list(effects)

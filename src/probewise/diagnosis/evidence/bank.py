@@ -31,7 +31,7 @@ class TemplateBank:
     widths
         Number of columns of each template, (n_templates,).
     labels
-        Label of each template.
+        Label of each template; several may have the same, such as the name of their effect.
     """
 
     columns: FloatArray
@@ -41,18 +41,17 @@ class TemplateBank:
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> TemplateBank:
-        """Concatenate templates, each (n_points, k)."""
+        """Concatenate templates, each (n_points, k), with one label each."""
         widths = np.array([t.shape[1] for t in templates], dtype=np.int64)
         return cls(np.concatenate([np.zeros((n_points, 0)), *templates], axis=1), widths, tuple(labels))
 
     def __getitem__(self, at: int) -> FloatArray:
-        """Return one template, (n_points, k)."""
+        """Return template number `at`, (n_points, k)."""
         first = int(self._first_columns[at])
         return self.columns[:, first : first + int(self.widths[at])]
 
     @cached_property
     def _first_columns(self) -> IntArray:
-        """First column of each template, (n_templates,)."""
         return np.cumsum(self.widths) - self.widths
 
     @cached_property
@@ -62,18 +61,18 @@ class TemplateBank:
         return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
 
     def take_templates(self, members: IntArray) -> TemplateBank:
-        """Return the bank of these templates."""
+        """Return a bank of the templates with these indices, in this order."""
         at = [self._first_columns[k] + np.arange(self.widths[k]) for k in members]
         columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
         return TemplateBank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
 
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
-        """Return the log Bayes factor of each template against a fit, as `block_log_bayes_factors` does.
+        """Return the log Bayes factor of adding each template to a fit, as `block_log_bayes_factors` does.
 
         Parameters
         ----------
         problem
-            The fit.
+            The fit, linearised.
         residuals
             Projected residuals, (n_rows, n_draws); the fit's own by default.
 
@@ -112,7 +111,7 @@ class TemplateBank:
         return members, self._first_columns[members, None] + np.arange(width)
 
     def _whitened_under(self, law: NoiseLaw) -> _WhitenedTemplatesAndGrams:
-        """Whiten all templates and scale each to unit rms; cached for the last few noise models."""
+        """Whiten all templates, scaled to unit rms each, with Gram matrices; cached for the last few noise models."""
         key = law.whitening_key
         if key in self._whitened:
             self._whitened[key] = self._whitened.pop(key)
@@ -133,16 +132,14 @@ class TemplateBank:
 
 
 def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return eigenvalues (n, width) and eigenvectors (n, width, width) of Gram matrices (n, width, width).
-
-    One or two columns, nearly all templates, have them in closed form (Jacobi's rotation).
-    """
+    """Return eigenvalues (n, width) and eigenvectors (n, width, width) of Gram matrices (n, width, width)."""
     width = squares.shape[-1]
     if width == 1:
         return squares[:, 0], np.ones_like(squares)
     if width > 2:
         values, axes = np.linalg.eigh(squares)
         return values, axes
+    # Two columns, or one as above, are the rule and have a closed form (Jacobi's rotation).
     first, second, both = squares[:, 0, 0], squares[:, 1, 1], squares[:, 0, 1]
     angle = 0.5 * np.arctan2(2 * both, first - second)
     c, s = np.cos(angle), np.sin(angle)

@@ -26,7 +26,7 @@ def checked_finite_fit(found: Fit) -> Fit:
 
 
 def require_converged_fit(found: Fit, problem: Linearised) -> None:
-    """Refuse a fit that one more step would still improve much, unless it is at the bounds of its prior.
+    """Refuse a fit that one more step would improve by over ten nats, unless it is at the bounds of its prior.
 
     Raises
     ------

@@ -12,11 +12,11 @@ from probewise.diagnosis.noise.law import NoiseLaw
 
 
 def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
-    """Return the log probability that every effect of a fit has a detectable size (lambda).
+    """Return the log probability that every effect of a fit has a detectable size (lambda 4 or more).
 
-    The size is the norm of the effect's change after a (linearised) refit of all other parameters; its posterior is
-    normal with unit sd. Multiplied with the evidence, it removes the part of a hypothesis that is indistinguishable
-    from the hypothesis without the effect.
+    The size is the norm, in noise sds, of the effect's change after a (linearised) refit of all other parameters; its
+    posterior is normal with unit sd. This probability, multiplied with the evidence, removes the part of a hypothesis
+    that readings cannot tell from the hypothesis without the effect.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArr
     law
         Its noise model.
     usable
-        Rows with usable readings, (n_usable,).
+        Row numbers of the usable readings, (n_usable,).
     """
     sd = found.sd / np.sqrt(law.fisher_information)
     slopes, out = law(found.slopes) / sd, 0.0

@@ -2,8 +2,7 @@
 
 The likelihood of exchangeable Gaussians has every mode N! times. (The prior of three or more shares, given by their
 ratios to the first, is not quite the same for all orders.) Folded onto the order nearest to a point, with the prior
-density of all orders summed, the posterior has each mode once. Then sampling need not hop between modes. For three
-Gaussians, of which one was hardly needed, and 200 live points, the error of log Z fell from five nats to one.
+density of all orders summed, the posterior has each mode once, and sampling need not hop between modes.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from probewise.diagnosis.fitting.coordinates import GaussianMixtureSensor
 class FoldedNormal(StandardNormal):
     """A standard normal prior, folded onto the order of a sensor's Gaussians that is nearest to a point.
 
-    The density of a point is the sum of the normal's densities over all orders.
+    The density of a point is the sum of the normal's densities over all orders (permutations of the Gaussians).
 
     Parameters
     ----------
@@ -44,14 +43,14 @@ class FoldedNormal(StandardNormal):
 
     @cached_property
     def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:
-        """Every other order's coordinates as z @ turn + shift: (n_others, n_own, n_own), (n_others, 1, n_own)."""
+        """Maps z @ turn + shift to every other order: turn (n_others, n_own, n_own), shift (n_others, 1, n_own)."""
         n_own = self.sensor.n_params
         orders = list(itertools.permutations(range(self.sensor.n_gaussians)))[1:]
         shift = np.stack([self.sensor.permuted(np.zeros((1, n_own)), order) for order in orders])
         return np.stack([self.sensor.permuted(np.eye(n_own), order) for order in orders]) - shift, shift
 
     def _reordered_with_distances(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return every order's coordinates, (n_orders, n_samples, n_params), and their distances from the point."""
+        """Return z in every order, (n_orders, n_samples, n_params), and distances from the point; as given is first."""
         turn, shift = self._reordering_maps
         images = np.repeat(z[None], len(turn) + 1, axis=0)
         n_own = self.sensor.n_params
@@ -59,7 +58,7 @@ class FoldedNormal(StandardNormal):
         return images, np.linalg.norm(images - self.near, axis=2)
 
     def fold(self, z: FloatArray) -> FloatArray:
-        """Reorder the Gaussians to be nearest to the point, (n_samples, n_params) both ways."""
+        """Reorder each sample's Gaussians to be nearest to the point, (n_samples, n_params) both ways."""
         images, far = self._reordered_with_distances(z)
         return np.asarray(images[np.argmin(far, axis=0), np.arange(len(z))])
 
@@ -76,7 +75,7 @@ class FoldedNormal(StandardNormal):
 
 @dataclass(frozen=True, eq=False)
 class FoldedProblem:
-    """A problem with the folded prior; predictions do not depend on the order of the Gaussians."""
+    """A `HypothesisProblem` with the folded prior; predictions do not depend on the order of the Gaussians."""
 
     problem: HypothesisProblem
     prior: FoldedNormal
@@ -92,7 +91,7 @@ def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProb
     Parameters
     ----------
     problem
-        The problem.
+        A hypothesis with its recording.
     near
         The point, (n_params,).
 

@@ -27,7 +27,10 @@ _BLOCKS = 5
 
 @dataclass(frozen=True)
 class HeldOutGain:
-    """Gain of a model over the null on held-out readings, nats per reading, and the sd of that mean."""
+    """Gain of a model over the null on held-out readings: mean in nats per reading, and the sd of that mean.
+
+    `by_scan`: name and mean gain of each held-out part, such as a scan.
+    """
 
     per_reading: float
     sd: float
@@ -36,11 +39,11 @@ class HeldOutGain:
 
 
 def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts) -> HeldOutGain:
-    """Refit both models without one part at a time and compare their predictions of it, reading by reading.
+    """Refit both models without one part of the readings at a time, and compare their log densities of that part.
 
-    Each reading is predicted by itself under the noise model. If the part has parameters of its own, which other parts
+    A held-out reading is predicted from the other parts alone. If the part has parameters of its own, which other parts
     do not determine, its readings are predicted sequentially, each given those before it. Parts of fewer than eight
-    readings are not held out.
+    readings are not held out, and of more than ten parts only ten.
     """
     plan, usable = recording.plan, recording.usable
     parts, names = held_out
@@ -57,8 +60,8 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
 def partition_into_blocks(recording: Recording) -> Parts:
     """Partition usable readings into five parts: every fifth block of eight successive readings.
 
-    An effect local in time cannot be predicted for another scan, but it can between known readings; a block is long
-    enough that its middle is not adjacent to them.
+    Returns numbers (n_usable,) and names of the parts. An effect local in time cannot be predicted for another scan,
+    but it can between known readings; a block is long enough that its middle is not adjacent to known readings.
     """
     block = np.arange(int(recording.usable.sum())) // LEAST_ROWS
     return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
@@ -99,10 +102,10 @@ def mean_gain_over_parts(
 def _refit_log_densities(
     found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray
 ) -> FloatArray:
-    """Return the log predictive density of each held-out reading, from a refit to the others.
+    """Return the log predictive density of each held-out reading, from a refit to the others; 0 for lost readings.
 
-    `rows` (n_points,) and `out` (n_usable,) are the same readings. The contribution of lost readings, the same for
-    every model of the mean, is left out.
+    `rows` (n_points,) and `out` (n_usable,) are masks of the held-out readings. Lost readings (dropouts at one value)
+    add the same to every model of the mean.
     """
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
     rest, own = law.take_readings(~out), law.take_readings(out)

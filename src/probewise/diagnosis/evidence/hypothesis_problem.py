@@ -27,12 +27,12 @@ class StandardNormal:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """z_1, z_2, ..."""
+        """Names of the coordinates: z_1, z_2, ..."""
         return tuple(f"z_{k + 1}" for k in range(self.n_params))
 
     @property
     def coordinates(self) -> StandardNormal:
-        """The coordinates themselves."""
+        """The prior itself: chains step in the parameters as they are."""
         return self
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
@@ -48,24 +48,24 @@ class StandardNormal:
         return np.asarray(-0.5 * np.sum(theta**2 + math.log(2 * math.pi), axis=1))
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        """Leave parameters as they are."""
+        """Return parameters unchanged, as coordinates."""
         return theta
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Leave coordinates as they are, and give their log density."""
+        """Return coordinates unchanged, as parameters, and their log prior density (n_samples,)."""
         return x, self.log_prob(x)
 
 
 @dataclass(frozen=True, eq=False)
 class HypothesisProblem:
-    """A model in its coordinates with a recording; noise sd and noise nodes are marginalised.
+    """A model in its coordinates with a recording; noise sd and parameters of the noise model are marginalised.
 
     Parameters
     ----------
     model, recording
         Model and data.
     noise
-        Evidence of a fit under the noise model, whose important nodes are kept.
+        Evidence of a fit by node of the noise model (a set of its parameters); the probable nodes are averaged over.
     """
 
     model: Model

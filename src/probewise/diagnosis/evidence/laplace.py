@@ -30,7 +30,7 @@ _MOST_NUMBERS = 4_000_000  # numbers in memory, for the slopes under several noi
 
 @dataclass(frozen=True, eq=False)
 class NoiseEvidence:
-    """Log evidence of a fit under one noise model, in total and by node.
+    """Log evidence of a fit under one noise model, in total and by node (a setting of the model's parameters).
 
     An impossible model (none of its nodes fits these readings) has no nodes and log evidence minus infinity.
     """
@@ -42,13 +42,13 @@ class NoiseEvidence:
 
     @property
     def weights(self) -> FloatArray:
-        """Posterior weight of each node."""
+        """Posterior probability of each node, (n_nodes,)."""
         return np.exp(self.log_z_nodes - logsumexp(self.log_z_nodes))
 
     def likeliest_nodes_of_effect(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """Return the (up to) four likeliest nodes of one effect, (n_nodes, n_params), and their log prior weights.
+        """Return the (up to) four likeliest settings of one noise effect, (n_nodes, n_params), and log prior weights.
 
-        These are raised by a constant, so that the evidence of the returned nodes alone is that of all.
+        These weights are raised by a constant, so that the evidence of the returned settings alone is that of all.
         """
         own = self.nodes.settings[:, self.noise.columns_of_effect(name)]
         settings, node_of = np.unique(own, axis=0, return_inverse=True)
@@ -66,7 +66,7 @@ class NoiseEvidence:
 
     @property
     def with_likeliest_node_alone(self) -> NoiseEvidence:
-        """The evidence with the most probable node alone; `log_z` remains that of all nodes."""
+        """A copy with the most probable node alone; `log_z` remains that of all nodes."""
         at = [int(np.argmax(self.log_z_nodes))]
         own = NoiseNodes(self.nodes.settings[at], (self.likeliest_law,), self.nodes.log_weights[at])
         return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], own)
@@ -76,7 +76,7 @@ def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     """Integrate a fit's likelihood over its parameters and the noise sd (Laplace) and the nodes of the noise model.
 
     At each node the linearised model moves the fit to its new optimum, which avoids the bias of residuals fitted as if
-    white. If the floor of the sd exceeds the residuals, the integral over the sd is given its usual width.
+    white. If the floor of the sd exceeds the residuals, the integral over the sd is taken as wide as without a floor.
     """
     every = noise.nodes_for_predictions(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
@@ -106,7 +106,7 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
 
 
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
-    """Return the log evidence under Gaussian noise models, (n_laws,); `joined`: slopes and residual."""
+    """Return the log evidence under Gaussian noise, (n_laws,); `joined` (n_points, n_params + 1): slopes, residual."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_kept for law in laws])
     if any(law.walk.size or law.before.size for law in laws):
         turned = np.stack([law(joined) for law in laws])
@@ -135,7 +135,7 @@ def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
 
 
 def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
-    """Return the log evidence under noise models of one whitening with different tails or rounding, (n_laws,)."""
+    """Return the log evidence, (n_laws,), under noise models that whiten alike but differ in tail or rounding."""
     turned = laws[0](joined)
     p, n_points = turned.shape[1] - 1, laws[0].n_kept
     slopes, residual = turned[:, :p], turned[:, p:]
@@ -157,7 +157,7 @@ def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
 
 
 def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Return the Newton steps to the modes, (n_laws, n_params), for curvatures (n_laws, n_params, n_params)."""
+    """Return the Newton steps to the modes, (n_laws, n_params); `downhill` are minus the gradients."""
     try:
         return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
     except np.linalg.LinAlgError:  # readings fitted exactly: the prior is lost in rounding
@@ -167,7 +167,7 @@ def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
 
 
 def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
-    """Return Laplace's approximation for modes at z (n_laws, n_params), with the constant of the densities."""
+    """Return the log evidence without the misfit, (n_laws,), for modes z (n_laws, n_params) and their curvatures."""
     widths = -0.5 * np.linalg.slogdet(curvature)[1]
     return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))
 
@@ -176,8 +176,8 @@ def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArra
 class Linearised:
     """A fit linearised to a Gaussian problem with its parameters, including their prior, projected out.
 
-    Rows are the whitened readings in units of the noise sd, then one row for each parameter's prior.
-    Under the null every row is standard normal, so that residuals are drawn by projection alone, without refits.
+    Rows are the whitened readings in units of the noise sd, then one row for each parameter's prior, and one more if
+    the sd is known. Under the null every row is standard normal, so that residuals are drawn by projection alone.
     """
 
     basis: FloatArray  # Q of the augmented slopes, (n_rows, n_params)
@@ -188,7 +188,7 @@ class Linearised:
 
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, beside: FloatArray | None = None) -> Linearised:
-        """Linearise about a fit; `beside` are slopes (n_points, k) by additional coordinates, which are 0."""
+        """Linearise a fit under noise `law`; `beside` are slopes (n_points, k) by additional coordinates of 0."""
         slopes, z = found.slopes, found.z
         if beside is not None:
             slopes, z = np.concatenate([slopes, beside], axis=1), np.concatenate([z, np.zeros(beside.shape[1])])
@@ -211,7 +211,7 @@ class Linearised:
 
     @property
     def n_rows(self) -> int:
-        """Number of rows: readings and priors."""
+        """Number of rows."""
         return len(self.basis)
 
     def project(self, columns: FloatArray) -> FloatArray:
@@ -225,7 +225,7 @@ class Linearised:
         return out
 
     def absorbing_shift(self, found: Fit, change: FloatArray) -> FloatArray:
-        """Return the shift of a fit's coordinates, (n_params,), that absorbs a change of predictions (n_points,)."""
+        """Return the shift of coordinates, (n_params,), at which predictions plus `change` (n_points,) fit best."""
         slopes = self.law(found.slopes) / self.sd
         left = self.law(found.residuals - change)[:, None]
         normal = self.law.normal_pseudo_residuals(left, np.array([self.sd * math.sqrt(self.law.fisher_information)]))[
@@ -247,10 +247,10 @@ class Linearised:
 
 @dataclass(frozen=True, eq=False)
 class OrthonormalBlocks:
-    """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, with squared lengths `gain`.
+    """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, one for each template.
 
-    `gain` (n_columns,) is the squared length of the projection of a template of unit rms (times n_points); `starts`
-    (n_blocks,) is the first column of each block.
+    Rows are those of `Linearised`. `gain` (n_columns,): squared lengths before normalisation, of templates scaled to
+    unit rms; their sum in a block is n_points if the fit absorbs nothing. `starts` (n_blocks,): first columns.
     """
 
     u: FloatArray
@@ -286,10 +286,10 @@ def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> F
 def orthonormalise_groups(
     columns: FloatArray, width: int, *, least: float = 1e-12, share: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Orthonormalise groups of `width` adjacent columns: (n_rows, n_columns) and squared lengths (n_columns,).
+    """Orthonormalise groups of `width` adjacent columns, (n_rows, n_columns); return also squared lengths (n_columns,).
 
-    It uses the eigenvectors of the Gram matrices. Directions with squared length up to `least`, or up to a `share` of
-    the longest in the block, become zero columns.
+    It uses the eigenvectors of the Gram matrices. Directions with squared length up to `least`, or up to `share` times
+    the greatest in the group, become zero columns.
     """
     blocks = columns.reshape(len(columns), -1, width)
     squares, axes = np.linalg.eigh(np.einsum("ibj,ibk->bjk", blocks, blocks, optimize=True))

@@ -30,7 +30,7 @@ def log_mean_exp(scores: FloatArray) -> float:
 
 
 def log_bayes_factors_by_label(problem: Linearised, bank: TemplateBank) -> dict[str, FloatArray]:
-    """Return the log Bayes factors of the entries of each effect's bank, by name, (n_entries,)."""
+    """Return, by label of a bank (an effect's name), the log Bayes factors of its templates, (n_entries,)."""
     scores = bank.log_bayes_factors(problem)[:, 0]
     return {name: scores[members] for name, members in bank.indices_by_label.items()}
 
@@ -38,7 +38,10 @@ def log_bayes_factors_by_label(problem: Linearised, bank: TemplateBank) -> dict[
 def log_bayes_factors_of_pairs(
     problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
 ) -> dict[Names, float]:
-    """Return the log Bayes factors of pairs: the sum of singles, corrected by the joint score of their best entries."""
+    """Return the log Bayes factor of each pair of effects, by their sorted names.
+
+    It is the sum of both effects' own (`singles`), corrected by the joint score of the best two entries of each bank.
+    """
     best = {name: np.argsort(-scores)[:_BEST_ENTRIES] for name, scores in singles.items()}
     entries = [(name, int(i)) for name in templates for i in best[name]]
     pairs = list(combinations(sorted(templates), 2))

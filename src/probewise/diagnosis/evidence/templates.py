@@ -27,7 +27,10 @@ _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 
 @dataclass(frozen=True, eq=False)
 class EffectTemplates:
-    """An effect's template bank about a fit, for all its variants: columns, setting and variant of each entry."""
+    """An effect's template bank about a fit: columns, setting and variant of each entry.
+
+    Variants are the discrete choices of an effect, such as which scans it acts on; `choice` numbers them by entry.
+    """
 
     columns: tuple[FloatArray, ...]  # each (n_usable, n_columns)
     settings: tuple[FloatArray, ...]  # each (n_columns, n_params)
@@ -35,26 +38,26 @@ class EffectTemplates:
     choice: IntArray  # number of each entry's variant, (n_entries,)
 
     def variant_of_entry(self, at: int) -> NamedEffect[Any]:
-        """Return the variant of one entry."""
+        """Return the variant (discrete choice, such as of scans) of entry number `at`."""
         variant: NamedEffect[Any] = self.variants[self.choice[at]]
         return variant
 
     def variant_probabilities(self, scores: FloatArray) -> FloatArray:
-        """Return the posterior probability of each variant, (n_variants,), from the entries' log Bayes factors."""
+        """Return the posterior probability of each variant, (n_variants,), from log Bayes factors (n_entries,)."""
         shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants))
         return np.asarray(shares / shares.sum())
 
 
 @dataclass(eq=False)
 class TemplateCache:
-    """Cache of the templates of effects about fits."""
+    """Cache of the templates of effects about fits, on the rows `usable`."""
 
     usable: IntArray
     known: dict[tuple[Fit, NamedEffect[Any]], EffectTemplates] = field(default_factory=dict)
     banks: dict[tuple[Fit, tuple[str, ...]], TemplateBank] = field(default_factory=dict)
 
     def coarse_bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> TemplateBank:
-        """Return the bank of coarse templates of several effects about one fit, labelled by name."""
+        """Return one bank of the templates of several effects about a fit, of fewer variants, labelled by name."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
             own = [
@@ -76,9 +79,9 @@ class TemplateCache:
 def templates_of_effect(
     found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
 ) -> EffectTemplates:
-    """Predict the change of the readings by each bank entry of all variants of an effect, or by `most` of them.
+    """Predict the change of the readings by each bank entry of all variants of an effect, about a fit.
 
-    Those are evenly spread.
+    Variants are its discrete choices, such as of scans. With `most`, so many entries are predicted, evenly spread.
     """
     variants = effect.variants()
     banks = [variant.bank() for variant in variants]
@@ -107,9 +110,9 @@ def _scans_and_patterns_of(variant: NamedEffect[Any]) -> tuple[object, object]:
 
 
 def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
-    """Return the change of readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans.
+    """Return the change of the readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans.
 
-    A column is 0 too where its model diverges, or the change is no more than rounding.
+    A column is 0 too if the model with the effect diverges, or the change is no more than rounding.
     """
     plain, plan = found.model, found.model.plan
     model = plain.with_effect(effect)

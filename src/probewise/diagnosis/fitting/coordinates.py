@@ -1,9 +1,9 @@
 """Coordinates in which every prior is a standard normal, so that fits and evidences need no special case.
 
-The sensor's natural coordinates are the logits of the Gaussians' shares, their means, the logs of their
-widths, the inverse hyperbolic tangents of their correlations, and the two levels: all unbounded, all of
-order one. (They are not the natural parameters of an exponential family.) An effect's coordinates are the
-standard-normal transforms of its own prior.
+The sensor's natural coordinates are the logits of the Gaussians' shares, their means, the logs of their widths, the
+inverse hyperbolic tangents of their correlations, and the two levels: all unbounded, with a normal prior. (They are not
+the natural parameters of an exponential family.) An effect's coordinates are the standard-normal transforms of its own
+prior.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class CalibratedSensor(ABC):
     @property
     @abstractmethod
     def form(self) -> str:
-        """Description of its SSF."""
+        """Description of its SSF, in words."""
 
     @property
     def predicts_in_bulk(self) -> bool:
@@ -77,7 +77,7 @@ class CalibratedSensor(ABC):
 
     @property
     def predicts_cheaply_nearby(self) -> bool:
-        """False: a prediction costs as much near another one."""
+        """False: a prediction costs as much near another one as elsewhere."""
         return False
 
     @property
@@ -87,11 +87,11 @@ class CalibratedSensor(ABC):
 
     @abstractmethod
     def theta_from_natural(self, natural: FloatArray) -> FloatArray:
-        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
 
     @abstractmethod
     def natural_from_theta(self, theta: FloatArray) -> FloatArray:
-        """Invert `theta_from_natural`."""
+        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
 
     @property
     def starts(self) -> FloatArray:
@@ -105,7 +105,7 @@ class CalibratedSensor(ABC):
 
     @property
     def least_readings(self) -> int:
-        """Fewest readings that determine its parameters."""
+        """Fewest usable readings for a verdict."""
         return LEAST_READINGS
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
@@ -113,26 +113,25 @@ class CalibratedSensor(ABC):
         return True
 
     def theta(self, z: FloatArray) -> FloatArray:
-        """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
+        """Map coordinates z, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
         return self.theta_from_natural(self._natural_from_z(z))
 
     def z(self, theta: FloatArray) -> FloatArray:
-        """Invert `theta`."""
+        """Map a_1 .. C_N, I_min, I_max to coordinates z: the inverse of `theta`."""
         return self._z_from_natural(self.natural_from_theta(theta))
 
     def _natural_from_z(self, z: FloatArray) -> FloatArray:
         return self.center + z @ self.factor.T
 
     def _z_from_natural(self, natural: FloatArray) -> FloatArray:
-        """Return coordinates z of natural parameters, (n_samples, n_params): the inverse of `_natural_from_z`."""
         return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
-        """Build the chain over the plan's patterns."""
+        """Build the chain (sensor, effects, scene) over the plan's patterns; `n_nodes` for curved edges."""
         return self.chain_over(cached_known_scene(plan), effects, n_nodes=n_nodes)
 
     def chain_over(self, scene: Scene, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
-        """Build the chain over any scene."""
+        """Build the chain (sensor, effects, scene) over any scene; `n_nodes` for curved edges."""
         return Chain(
             FreeMixture(self.n_gaussians),
             FreeLevels(),
@@ -163,24 +162,24 @@ class GaussianMixtureSensor(CalibratedSensor):
 
     @property
     def effective_n_gaussians(self) -> int:
-        """Its number of Gaussians."""
+        """Number of Gaussians."""
         return self.n_gaussians
 
     @property
     def form(self) -> str:
-        """Its number of Gaussians, in words."""
+        """Number of Gaussians of the SSF, in words."""
         return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
 
     def theta_from_natural(self, natural: FloatArray) -> FloatArray:
-        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max: one column more."""
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, n_params + 1)."""
         return natural_to_theta(natural, self.n_gaussians)
 
     def natural_from_theta(self, theta: FloatArray) -> FloatArray:
-        """Invert `theta_from_natural`."""
+        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
         return theta_to_natural(theta, self.n_gaussians)
 
     def permuted(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
-        """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians permuted."""
+        """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians in another order."""
         n, natural = self.n_gaussians, self._natural_from_z(z)
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
         blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
@@ -226,7 +225,7 @@ def theta_to_natural(theta: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 def default_sensor(extent: Extent, n_gaussians: int) -> GaussianMixtureSensor:
-    """Return a sensor with the default prior: a footprint of a fourteenth of the longest scan, to a factor of two."""
+    """Return `n_gaussians` with the default prior: sds a fourteenth of the longest scan, to a factor of two."""
     length = extent.length_mm
     one_center = [0.0, 0.0, math.log(length / 14), math.log(length / 14), 0.0]
     one_sd = [length / 10, length / 10, 0.8, 0.8, 0.7]
@@ -236,10 +235,10 @@ def default_sensor(extent: Extent, n_gaussians: int) -> GaussianMixtureSensor:
 
 
 def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:
-    """Map standard-normal coordinates, (n_samples, n_params), to the effect's own parameters."""
+    """Map standard-normal coordinates to values of the effect's own parameters, (n_samples, n_params) both."""
     return effect.prior.from_unit_cube(ndtr(z))
 
 
 def effect_coordinates(effect: NamedEffect[Any], values: FloatArray) -> FloatArray:
-    """Invert `effect_values`, within the bounds."""
+    """Invert `effect_values`, with coordinates clipped to 5.5 on either side of 0."""
     return np.clip(ndtri(effect.prior.to_unit_cube(values)), -FARTHEST + 0.5, FARTHEST - 0.5)

@@ -26,14 +26,14 @@ _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
 def _difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return z (n_params,) and points one step along each coordinate, (n_params + 1, n_params), and the steps."""
+    """Return z and points one small step along each coordinate, (n_params + 1, n_params), and the signed steps."""
     # Steps point inwards, to stay within the bounds.
     steps = np.where(z > 0, -_STEP, _STEP)
     return np.concatenate([z[None, :], z + np.diag(steps)]), steps
 
 
 def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Convert predictions at these points (n_params + 1, n_points) to the one at z and slopes (n_points, n_params)."""
+    """Convert predictions at these points, (n_params + 1, n_points), to that at z and slopes (n_points, n_params)."""
     with np.errstate(invalid="ignore"):  # of a start from which the model diverges: not finite, and not taken
         return batch[0], (batch[1:] - batch[0]).T / steps
 
@@ -42,7 +42,7 @@ def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatA
 class Model:
     """A null with effects over a plan, in coordinates with a standard normal prior.
 
-    Noise effects are not part of it; they are in the noise model.
+    Effects on the noise are not part of the model; they are in the noise model.
     """
 
     sensor: Null
@@ -51,7 +51,7 @@ class Model:
 
     @cached_property
     def chain(self) -> Predictor:
-        """The null's chain with the effects."""
+        """The predictor of readings: the null with the effects."""
         return self.sensor.chain(self.plan, self.effects, n_nodes=FAST_NODES)
 
     @property
@@ -74,7 +74,7 @@ class Model:
         return self.joined_theta(self.sensor.theta(z[:, : self.sensor.n_params]), own)
 
     def joined_theta(self, sensor: FloatArray, own: Mapping[str, FloatArray]) -> FloatArray:
-        """Join the sensor's columns with each effect's, in the order of the chain: that of the stages."""
+        """Join the null's columns with each effect's, in the order in which the chain applies the effects."""
         return np.concatenate([sensor, *(own[effect.name] for effect in self.chain.effects)], axis=1)
 
     def predict(self, z: FloatArray, plan: Plan | None = None) -> FloatArray:
@@ -97,7 +97,7 @@ class Model:
         return Model(self.sensor, tuple(e for e in self.effects if e.name != name), self.plan), stay
 
     def z_of_last_effect(self, values: FloatArray) -> FloatArray:
-        """Return the last effect's coordinates z of values of its parameters, (n_samples, n_params) both."""
+        """Convert values of the last effect's parameters to its coordinates z, (n_samples, n_params) both."""
         return effect_coordinates(self.effects[-1], values)
 
 
@@ -107,7 +107,8 @@ class Fit:
 
     `predicted`, `residuals` (n_usable,), reading minus prediction, `slopes` (n_usable, n_params); `sd` is the most
     likely sigma of its noise model; `objective` is minus the log posterior there, up to a constant; `settled`: the last
-    step gained less than the tolerance. Where the start is not finite, it is returned with both infinite.
+    step gained less than the tolerance. If predictions at the start are not finite, `z` is the start, and `sd` and
+    `objective` are infinite.
     """
 
     model: Model
@@ -167,7 +168,7 @@ def fit_each_start(
 ) -> list[Fit]:
     """Fit as `fit` does from each of several starts; return the fits in that order.
 
-    If predictions broadcast, the fits run in parallel, in batches that fit a processor's cache.
+    If many predictions cost little more than one, the fits advance together, in batches that fit a processor's cache.
     """
     walks = [_fit_coroutine(model, recording, start, law, max_steps, tolerance) for start in starts]
     at_once = 1
@@ -191,7 +192,7 @@ def fit_each_start(
 def _fit_coroutine(
     model: Model, recording: Recording, start: FloatArray, law: NoiseLaw, max_steps: int, tolerance: float
 ) -> Generator[FloatArray, FloatArray, Fit]:
-    """Minimise from one start: yields points to predict, (n, n_params), and is sent predictions, (n, n_points)."""
+    """Fit from one start: yields points (n, n_params), is sent their predictions (n, n_points), returns the fit."""
     usable = recording.usable
     readings = recording.readings[usable]
     nearby = model.sensor.predicts_cheaply_nearby
@@ -253,10 +254,9 @@ def _fit_coroutine(
 
 
 def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Return the step for each damping, (n_solved, n_params).
+    """Return the Levenberg-Marquardt step for each damping, (n_solved, n_params).
 
-    If readings are fitted exactly, the prior is lost in rounding and weakly damped systems may be singular; these are
-    left out.
+    If readings are fitted exactly, the prior is lost in rounding; weakly damped systems that are singular are left out.
     """
     scale, solved = np.diag(curvature), []
     for damping in _DAMPINGS:
@@ -280,7 +280,7 @@ def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
 
 
 def starts_of_one_gaussian(sensor: GaussianMixtureSensor) -> FloatArray:
-    """Return starting points for one Gaussian: typical, narrow and wide, shape (3, n_params)."""
+    """Return coordinates to start from for one Gaussian: typical, narrow and wide, (3, n_params)."""
     return np.stack([_with_widths(np.zeros(sensor.n_params), step) for step in (0.0, -1.5, 1.5)])
 
 
@@ -291,7 +291,7 @@ def _with_widths(z: FloatArray, step: float) -> FloatArray:
 
 
 def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: GaussianMixtureSensor) -> FloatArray:
-    """Return starting points with the heaviest Gaussian split in several ways, shape (n_starts, wanted.n_params)."""
+    """Split the heaviest Gaussian of a fit in three ways, as starts: coordinates of `wanted`, (3, wanted.n_params)."""
     theta = found.theta(z[None, : found.n_params])[0]
     n = found.n_gaussians
     blocks = theta[: 6 * n].reshape(n, 6)

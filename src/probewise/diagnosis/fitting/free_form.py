@@ -28,7 +28,7 @@ _SHARE = 0.1  # prior sd of each weight, as a share of the mass
 class FreeFormSensor(CalibratedSensor):
     """A sensor with a free-form SSF.
 
-    Its natural coordinates are those of one Gaussian and the two levels, then the bends: 7 + N_BENDS.
+    Its natural coordinates are those of one Gaussian and the two levels, then N_BENDS weights of the free form.
     """
 
     center: FloatArray
@@ -38,13 +38,13 @@ class FreeFormSensor(CalibratedSensor):
 
     @classmethod
     def from_one_gaussian(cls, one: GaussianMixtureSensor) -> Self:
-        """Build the prior from place and size of one Gaussian, with small weights of the free form."""
+        """Build the prior from that of one Gaussian's place and size, with weights of sd 0.1 of the mass about 0."""
         factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
         factor[: one.n_params, : one.n_params] = one.factor
         return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
 
     def start_from_one_gaussian(self, one: FloatArray) -> FloatArray:
-        """Return a start of a fit: one Gaussian's coordinates, (7,), the free form's bends zero: (1, n_params)."""
+        """Return one start of a fit, (1, n_params): coordinates of one Gaussian, (7,), with weights of 0."""
         return np.pad(one, (0, N_BENDS))[None, :]
 
     @property
@@ -59,16 +59,16 @@ class FreeFormSensor(CalibratedSensor):
 
     @property
     def form(self) -> str:
-        """The words for a free form."""
+        """Description of its SSF: "an SSF of free form"."""
         return "an SSF of free form"
 
     def theta_from_natural(self, natural: FloatArray) -> FloatArray:
-        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
         one = natural_to_theta(natural[:, :-N_BENDS], 1)
         return np.concatenate([free_form_theta(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
 
     def natural_from_theta(self, theta: FloatArray) -> FloatArray:
-        """Invert `theta_from_natural`."""
+        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
         return theta_to_free_form_natural(theta)
 
 

@@ -25,7 +25,7 @@ class Predictor(Protocol):
 
     @property
     def effects(self) -> tuple[AnyEffect, ...]:
-        """Its effects, in the order in which they act."""
+        """The model's effects, in the order in which they act."""
         ...
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -33,7 +33,7 @@ class Predictor(Protocol):
         ...
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> Any:
-        """Simulate the view: the result of the stages before `Stage.SEEN`, for one sample or for all.
+        """Simulate the stages before `Stage.SEEN`: a sensor's view of the scene, for theta (1 or n_samples, n_params).
 
         For a simulator, these are its own readings, with the effects on inputs, parameters and rates.
         """
@@ -68,7 +68,7 @@ class Null(Protocol):
 
     @property
     def form(self) -> str:
-        """Description of its SSF; by default empty."""
+        """Description of its SSF, in words; by default empty."""
         return ""
 
     @property
@@ -105,11 +105,11 @@ class Null(Protocol):
         ...
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Return whether an effect acts at a stage of this model."""
+        """Return whether this model has the stage at which an effect acts."""
         ...
 
     def theta(self, z: FloatArray) -> FloatArray:
-        """Map coordinates, (n_samples, n_params), to the columns that precede the effects'."""
+        """Map coordinates z, (n_samples, n_params), to the model's own parameters: theta without the effects'."""
         ...
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Predictor:
@@ -118,5 +118,5 @@ class Null(Protocol):
 
 
 def log_multiplicity(null: Null) -> float:
-    """Return the log of the number of equivalent posterior modes (permutations), taken to have equal height."""
+    """Return log N! for N exchangeable Gaussians, whose permutations are modes of equal height; otherwise 0."""
     return math.lgamma(null.n_gaussians + 1) if null.exchangeable else 0.0

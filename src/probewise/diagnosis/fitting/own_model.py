@@ -42,9 +42,9 @@ class OwnModel(Null):
     Parameters
     ----------
     simulate
-        Predicts the readings of a plan.
+        Function of parameters by name, each (n_samples, 1), and a plan; returns readings, (n_samples, n_points).
     prior
-        Prior of its parameters.
+        Prior of the parameters.
     """
 
     simulate: Simulate
@@ -70,16 +70,16 @@ class OwnModel(Null):
 
     @property
     def least_readings(self) -> int:
-        """Three readings per parameter, at least 24."""
+        """Fewest usable readings for a verdict: three per parameter, at least 24."""
         return max(LEAST_READINGS, 3 * self.n_params)
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Return whether an effect acts on the readings or is the user's own: there is no footprint or light."""
+        """Return whether an effect acts on the readings, or is the user's own at `Stage.SCENE`."""
         own = effect.stage is Stage.SCENE and effect.name not in VOCABULARY
         return own or effect.stage in _ON_READINGS
 
     def theta(self, z: FloatArray) -> FloatArray:
-        """Map standard-normal coordinates, (n_samples, n_params), to parameters."""
+        """Map standard-normal coordinates to parameters, (n_samples, n_params) both."""
         return self.prior.from_unit_cube(ndtr(z))
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> _OwnChain:
@@ -109,7 +109,6 @@ class _OwnChain:
         return (*self.model.prior.names, *parameter_names_of_effects(self.effects))
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Return noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         return self.readings_from_simulated_view(self.simulated_view(theta, plan), theta, plan)
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -138,5 +137,4 @@ class _OwnChain:
 
     @cached_property
     def _effects_and_columns(self) -> list[tuple[AnyEffect, slice]]:
-        """Each effect with its columns of theta."""
         return effects_with_columns(self.effects, self.model.n_params)

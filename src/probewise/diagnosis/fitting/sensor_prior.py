@@ -21,7 +21,7 @@ from probewise.sensor import is_free_form
 def sensor_from_posterior(
     names: Sequence[str], mean: FloatArray, cov: FloatArray, *, height_mm: float | None = None
 ) -> CalibratedSensor:
-    """Build a prior from an earlier sensor's posterior mean and covariance, at its height if that is known.
+    """Build a prior from an earlier sensor's posterior mean and covariance, calibrated at `height_mm`.
 
     Only the SSF's and the levels' columns are used; effects of the earlier model are dropped.
 

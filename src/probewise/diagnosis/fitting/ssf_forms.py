@@ -17,23 +17,23 @@ Start = tuple[Null, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class SsfForms:
-    """The forms as sensors, with priors scaled to a recording; each with coordinates to fit it from."""
+    """Forms of a sensor's SSF with priors scaled to a recording, each as a null with coordinates to fit it from."""
 
     extent: Extent
 
     def one_gaussian_and_starts(self) -> Start:
-        """Return one Gaussian, starting typical, narrow and wide."""
+        """Return a sensor of one Gaussian, and three starts: typical, narrow and wide."""
         one = default_sensor(self.extent, 1)
         return one, starts_of_one_gaussian(one)
 
     def free_form_and_starts(self, found: Fit) -> Start:
-        """Return the free form, starting from the fit of one Gaussian."""
+        """Return a sensor of free form, and one start: the fit of one Gaussian."""
         one = found.model.sensor
         assert isinstance(one, GaussianMixtureSensor)
         free = FreeFormSensor.from_one_gaussian(one)
         return free, free.start_from_one_gaussian(found.z)
 
     def more_gaussians_and_starts(self, found: Fit, order: int) -> Start:
-        """Return `order` Gaussians, one more than the fit has, starting from splits of its heaviest."""
+        """Return a sensor of `order` Gaussians, one more than the fit has, and starts: splits of the fit's heaviest."""
         wanted = default_sensor(self.extent, order)
         return wanted, starts_with_more_gaussians(found.model.sensor, found.z, wanted)

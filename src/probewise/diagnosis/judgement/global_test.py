@@ -22,7 +22,10 @@ _NO_ALARM = 0.05  # p-value above which no alarm is possible, so that other form
 
 @dataclass(frozen=True, eq=False)
 class GlobalTest:
-    """The null under its most probable noise model, linearised, with residual draws and the p-value."""
+    """Result of the global test of the null: p-value, and the most probable noise, names of its effects.
+
+    `problem` is the fit linearised under that noise; `draws` (n_rows, 999) are projected residuals under the null.
+    """
 
     null: WeighedFit
     noise: Names
@@ -32,7 +35,7 @@ class GlobalTest:
 
 
 def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTest:
-    """Test whether the mean of the null is complete; the p-value is 1 where all readings are equal.
+    """Test whether effects are missing in the mean of the null; the p-value is 1 where all readings are equal.
 
     Raises
     ------
@@ -53,7 +56,7 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
 def _max_p_value_over_orders(
     searched: Searched, null: WeighedFit, noise: Names, p_value: float, *, rng: np.random.Generator
 ) -> float:
-    """Return the largest p-value over SSFs of the null's order, of higher orders, and with fine structure.
+    """Return the largest p-value over the SSF's order (number of Gaussians) and higher ones, and with fine structure.
 
     The evidence accepts another Gaussian only if it gains ten nats or more; a smaller misfit of an SSF that is no
     mixture is not physics. So an alarm must hold at every order, and with fine structure about the freest form. Once a

@@ -29,7 +29,7 @@ class Hypothesis:
 
     @property
     def label(self) -> str:
-        """Label in a credible set."""
+        """Name in a credible set: effects joined by "+", or "clean"."""
         return "+".join(sorted(map(name_without_copy_suffix, self.effects))) or "clean"
 
 
@@ -40,9 +40,9 @@ class Judged:
     Parameters
     ----------
     verdict
-        The verdict.
+        "clean", "named", "noise" (named, but all effects are on the noise), "unknown" or "cannot_tell".
     combination
-        Most probable set of effects, sorted; () if clean, ("unknown",) if unknown.
+        Most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown.
     p_value
         p-value of the global test of the mean, under the noise model found.
     hypotheses
@@ -50,9 +50,9 @@ class Judged:
     aliases
         Pairs of aliased effects.
     order_probabilities
-        Probability of each number of Gaussians of a clean sensor's SSF.
+        Probability of each number of Gaussians of the SSF.
     unknown_shares
-        Probability of each family given that there is an unknown effect.
+        Probability of each form, such as "place", that an unknown effect could have, given that there is one.
     too_little
         Whether there are too few readings for a verdict, or all are equal.
     withdrawn
@@ -70,29 +70,29 @@ class Judged:
     withdrawn: bool = False
 
     def with_verdict_withdrawn(self) -> Judged:
-        """Return the verdict `cannot_tell` in place of the effects it named."""
+        """Return a copy whose verdict is `cannot_tell`, names no effect and is marked as `withdrawn`."""
         return replace(self, verdict="cannot_tell", combination=(), withdrawn=True)
 
     withdraw = with_verdict_withdrawn  # its old name
 
     @property
     def unknown_probability(self) -> float:
-        """Probability of an unknown effect."""
+        """Probability of an effect on the mean that is out of vocabulary."""
         return next((h.probability for h in self.hypotheses if h.effects == ("unknown",)), 0.0)
 
     @property
     def clean_probability(self) -> float:
-        """Probability that the model is complete."""
+        """Probability that no effect is missing, neither on the mean nor on the noise."""
         return next((h.probability for h in self.hypotheses if not h.effects), 0.0)
 
     @property
     def credible(self) -> tuple[str, ...]:
-        """Labels of the 95 % credible set."""
+        """Labels of the hypotheses in the 95 % credible set, most probable first."""
         return credible_labels(self.hypotheses)
 
     @property
     def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
-        """Families of the unknown effect with their probabilities, largest first; empty if there hardly is one."""
+        """Forms that an unknown effect could have, with probabilities, largest first; empty if there hardly is one."""
         if self.unknown_probability < 1e-3:
             return ()
         shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
@@ -100,13 +100,13 @@ class Judged:
 
 
 def judge(searched: Searched, test: GlobalTest) -> Judged:
-    """Return the verdict on a search and its test."""
+    """Return the verdict, with probabilities and aliases, from a search and the global test."""
     prepared, posterior = searched.prepared, searched.posterior
     hypotheses = ranked_hypotheses(posterior.probabilities, searched.evidences.reported_names)
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
-        """Return the combinations with the same noise whose effects on the mean are aliased with these."""
+        """Return the combinations with the same noise effects, and effects on the mean aliased with these."""
         noise = prepared.noise_effect_names & {*combination}
         others = searched.combinations_aliased_with(tuple(name for name in combination if name not in noise))
         return frozenset(tuple(sorted({*names, *noise})) for names in others)
@@ -154,7 +154,8 @@ def ranked_hypotheses(
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 
-    `reported_as` maps a combination on the mean to the name under which it counts.
+    `probabilities` are by the effects on the mean and those on the noise; `reported_as` maps the former to the
+    combination under which they count.
     """
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
@@ -175,7 +176,7 @@ def verdict_and_combination(
     aliased_with: Callable[[Names], frozenset[Names]],
     certain: frozenset[str] = frozenset(),
 ) -> tuple[Verdict, Names]:
-    """Return the verdict and the combination it names; effects on the mean also need a significant global test.
+    """Return the verdict and the combination it names; effects on the mean also need a global test with p up to .01.
 
     Effects in `certain`, which the readings show beyond doubt, need no significant test.
     """
@@ -204,11 +205,11 @@ def verdict_from_probabilities(
     """Return the verdict by probabilities and aliases alone, and the combination it names.
 
     Clean or unknown is the verdict if it has half the probability. Otherwise the most probable combination of effects
-    is named, even with less than half (`noise` if all its effects are on the noise), with three exceptions, which are
-    `cannot_tell`. With half or more: a credible rival is aliased with it (`aliased_with`), so that the prior, not the
-    data, would decide. With less: it has half together with the combinations that differ from it by one effect swapped
-    for its alias (`aliases`), or clean or unknown is more probable; this last case names no combination, nor does a
-    search without any.
+    is `named` (`noise` if all its effects are on the noise). The verdict is `cannot_tell` instead,
+
+    - with half the probability or more, if one aliased with it (`aliased_with`) has over a fifth of its probability;
+    - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
+    - with less, if clean or unknown is more probable, or if there is no combination: then none is named.
     """
     probability = {h.effects: h.probability for h in hypotheses}
     if probability.get(("unknown",), 0.0) >= 0.5:
@@ -232,6 +233,6 @@ def verdict_from_probabilities(
 
 
 def _combination_and_alias_swaps(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
-    """Return a combination and those that differ from it by one effect swapped for its alias."""
+    """Return the combination and all that differ from it by one effect swapped for its alias."""
     both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
     return {names} | {tuple(sorted({*names} - {name} | {other})) for name, other in both_ways if name in names}

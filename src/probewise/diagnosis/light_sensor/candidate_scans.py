@@ -28,7 +28,10 @@ _WORDS = {1: "", 2: " (every second reading, twice as fast)"}
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
-    """Rows of a scan with a stride, with a suffix for its name and words for its description."""
+    """Part of a scan, as row numbers: every `stride`-th row, or those where readings change most.
+
+    `suffix` is for the name of the new scan, `words` for its description.
+    """
 
     suffix: str
     words: str
@@ -39,7 +42,7 @@ class Excerpt:
 def excerpts_of_scan(
     scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
 ) -> list[Excerpt]:
-    """Return the parts of a scan that could be scans of their own.
+    """Return the parts of a scan that could be scans of their own, of 8 to 102 readings.
 
     Parameters
     ----------
@@ -122,7 +125,7 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
 
 
 def rows_repeatable_without_hands(plan: Plan) -> IntArray:
-    """Return the rows that can be repeated with the sheet in place and the sensor as mounted."""
+    """Return the rows over the last reading's pattern and, unless the arm turns the sensor, in its orientation."""
     last = int(np.argmax(plan.time_s))
     same_sheet = plan.pattern == plan.pattern[last]
     turned_rad = np.abs(np.angle(np.exp(1j * (plan.orientation_rad - plan.orientation_rad[last]))))
@@ -131,7 +134,7 @@ def rows_repeatable_without_hands(plan: Plan) -> IntArray:
 
 
 def rows_as_new_scan(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
-    """Return rows of a plan as one new scan, in order, from `start_s` on, with their commanded values."""
+    """Return rows of a plan, in order, as one new scan from `start_s` on, one every `gap_s`; commanded values stay."""
     taken = plan.take(rows)
     controls = plan.instrumentation.controls
     return replace(
@@ -160,10 +163,7 @@ def _with_commanded_value(plan: Plan, name: str, value: float) -> Plan:
 
 
 def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
-    """Return the rows of the first few moving scans; a scan that repeats or reverses an earlier one is left out.
-
-    Scans with few rows are left out too.
-    """
+    """Return the row numbers of the first six moving scans of eight rows or more, without repeats and reversals."""
     seen: dict[tuple[object, ...], IntArray] = {}
     turned_deg = orientation_deg(plan)
     for rows in plan.rows_by_scan():

@@ -18,7 +18,7 @@ _MOST_SCANS = 24  # number of scans above which residuals are not located in sin
 
 
 def slope_along_motion(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
-    """Differentiate predictions of a plan's rows along each one's direction of motion, per mm, shape (n_points,)."""
+    """Differentiate predictions of a plan along each row's direction of motion, in readings per mm, (n_points,)."""
     step = 0.25
     ahead, behind = (
         replace(
@@ -72,7 +72,7 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
 
 
 def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariate]:
-    """List the places along all scans in the longer direction, and along each long scan."""
+    """List the places (x or y, mm) along all scans in the longer direction, and along each longer scan alone."""
     x_mm, y_mm, scan = plan.x_mm[usable], plan.y_mm[usable], plan.scan[usable]
     by_scan = [np.flatnonzero(scan == k) for k in range(len(plan.scan_names))]
     along_x = np.ptp(x_mm) >= np.ptp(y_mm)

@@ -35,11 +35,11 @@ def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> Floa
     z
         Its coordinates, (n_params,).
     usable
-        Rows of the plan to use.
+        Numbers of the plan's rows to use.
 
     Returns
     -------
-    Slopes, (n_usable, n_places), in reading units; no columns if the model has no free SSF.
+    Slopes, (n_usable, n_places), in reading units; no columns if the model is no `CalibratedSensor`.
     """
     sensor = model.sensor
     if not isinstance(sensor, CalibratedSensor):

@@ -10,10 +10,10 @@ from probewise.recordings.plan import Recording
 
 
 def held_out_parts(recording: Recording) -> Parts:
-    """Divide usable readings into scans or, if more than ten are long enough, into groups of scans.
+    """Return the part of each usable reading, (n_usable,), and the names of the parts: scans.
 
-    Neighbouring scans would leak information: all scans over one pattern in one orientation are held out together, if
-    there are several such groups.
+    If more than ten scans have eight readings or more, all scans over one pattern in one orientation are one part,
+    since neighbouring scans would leak information; unless there is only one such part.
     """
     plan, usable = recording.plan, recording.usable
     scan = plan.scan[usable]

@@ -18,7 +18,10 @@ LAY_S = 60.0  # additional seconds to lay a new sheet
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One scan that the arm could take: its kind (one of the six R's, "across" or "lay"), description, plan."""
+    """One scan that the arm could take: kind, description as an instruction, and plan.
+
+    `kind`: "repeat", "reverse", "respeed", "rotate", "relight", "raise", "across" or, with another sheet, "lay".
+    """
 
     kind: str
     description: str
@@ -48,7 +51,7 @@ def duration_minutes(plan: Plan) -> float:
 def plan_of_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate alternative scans, each timed as if directly after a plan, to predict all of them at once.
 
-    Covariates that they lack, such as battery voltage, keep their last value of that plan.
+    Covariates that the scans lack, such as battery voltage, keep their last value of that plan.
     """
     return _with_last_known_covariates(_joined_plan(scans), after)
 
@@ -56,7 +59,7 @@ def plan_of_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
 def plan_in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
 
-    Covariates that they lack are filled as in `plan_of_alternatives`, to be replaced by measured values.
+    Covariates that the scans lack are filled as in `plan_of_alternatives`, to be replaced by measured values.
     """
     out: list[Scan] = []
     for scan in scans:
@@ -65,7 +68,7 @@ def plan_in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
 
 
 def _with_last_known_covariates(plan: Plan, after: Plan) -> Plan:
-    """Fill covariates that cannot be commanded with their last values of the plan before."""
+    """Fill covariates that cannot be commanded with their last known values of the preceding plan."""
     read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
     kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
     return replace(plan, covariates={**kept, **plan.covariates})

@@ -29,8 +29,7 @@ from probewise.recordings.plan import Plan, Recording
 class LightSensorApparatus:
     """A light sensor that an arm moves over patterns; `vocabulary` holds its possible effects, by name.
 
-    The vocabulary is a plain dict, which can be pickled. `hands`: a person can exchange or turn sheets; otherwise the
-    next scans are over the pattern of the last reading.
+    `hands`: a person can exchange or turn sheets; otherwise the next scans are over the pattern of the last reading.
     """
 
     vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: dict(VOCABULARY))
@@ -42,7 +41,7 @@ class LightSensorApparatus:
     )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
-        """Scale all effects to a recording: the vocabulary, those with a formula, and nuisances, by name.
+        """Scale effects to a recording, by name: the vocabulary, effects out of it with a formula, and drifting noise.
 
         Left out are effects that cannot act there or on the given null. Without a given null the SSF is free and
         absorbs effects on the SSF, so these are left out.
@@ -57,7 +56,7 @@ class LightSensorApparatus:
         }
 
     def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
-        """Return the effects with a formula that are proposed for what has no name: none here."""
+        """Return an empty mapping: no formulas are proposed for a light sensor."""
         return {}
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
@@ -73,11 +72,11 @@ class LightSensorApparatus:
         return False
 
     def null_forms(self, recording: Recording) -> SsfForms:
-        """Return the forms of its SSF."""
+        """Return the forms that the SSF may take when it is calibrated from the recording."""
         return SsfForms(Extent.of(recording))
 
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        """Return the covariates that vary, and the slope of the readings along the direction of motion."""
+        """Return the covariates that vary, and the predicted slope along the motion, per mm, (n_usable,)."""
         usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
         slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
@@ -89,7 +88,7 @@ class LightSensorApparatus:
     plan_in_sequence = staticmethod(plan_in_sequence)
 
     def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Return the slopes by fine structure of the SSF."""
+        """Return the slopes of the readings by fine structure of the SSF, (n_usable, n_columns)."""
         return fine_structure_slopes(found.model, found.z, usable)
 
     def candidate_measurements(

@@ -32,9 +32,10 @@ _STRIDE = 4
 
 
 def target_swaps(plan: Plan) -> list[Scan]:
-    """List scans over uniform surfaces, along the other axis, and over a moved or turned edge of the plan.
+    """List scans over a white and a black sheet, along the other axis, and over moved or turned edges and stripes.
 
-    They start like the plan's first moving scan, or its first over a `HalfPlane`, with the same orientation.
+    Sheets and the other axis take the places of the plan's first moving scan; edges and stripes those of its first scan
+    across a `HalfPlane`, if there is one.
     """
     scans = rows_of_distinct_scans(plan)
     if not scans:
@@ -103,12 +104,11 @@ def _pattern_under(plan: Plan, scan: IntArray) -> Pattern | None:
 
 
 def _rows_as_next_scan(plan: Plan, rows: IntArray, name: str) -> Plan:
-    """Return these rows as a new scan after the plan."""
     return rows_as_new_scan(plan, rows, earliest_start_s(plan), median_reading_interval_s(plan), name)
 
 
 def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:
-    """Set the pattern of a scan, under a new name if this one is that of another pattern."""
+    """Set the pattern of a scan; if another pattern has this name, the name is extended by "_new"."""
     while name in scan.pattern_names and scan.patterns.get(name) != pattern:
         name += "_new"
     names = tuple(dict.fromkeys((*scan.pattern_names, name)))
@@ -134,5 +134,5 @@ def _rotated_scan_and_edge(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane
 
 
 def _distance_inside_edge_mm(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
-    """Return the signed distance of places inside an edge, in mm."""
+    """Return the signed distance of rows from an edge, along its normal, in mm."""
     return plan.x_mm[rows] * math.cos(edge.normal_rad) + plan.y_mm[rows] * math.sin(edge.normal_rad) - edge.offset_mm

@@ -77,8 +77,8 @@ class NoiseLaw:
         Increments in variance of a random walk of the offset from row to row, also between runs, relative to the
         overall variance, (n_points,); empty without one. Then there is no other correlation.
     before
-        Number of the reading with which each has the correlation `carry`, (n_points,); of any use where that is not 0.
-        Empty where it is the one above, as it is unless the rows of scans are interleaved.
+        Number of the reading with which each has the correlation `carry`, (n_points,), arbitrary where that is 0.
+        Empty: the reading above, as always unless the rows of scans are interleaved.
     """
 
     sd: FloatArray
@@ -104,12 +104,12 @@ class NoiseLaw:
 
     @property
     def whitening_key(self) -> tuple[bytes, ...]:
-        """Key of the whitening: distributions with the same key differ only in their tails."""
+        """Key of the whitening: distributions with the same key differ only in tails or rounding."""
         arrays = self.sd, self.carry, self.lost, self.walk, self.before
         return tuple(values.tobytes() for values in arrays)
 
     def is_practically_equal(self, other: NoiseLaw) -> bool:
-        """Return whether another distribution is practically the same."""
+        """Return whether another distribution is equal, to 3 % of sd, 0.03 of correlation, and 6 % of the walk."""
         return (
             (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
             and np.array_equal(self.lost, other.lost)
@@ -131,10 +131,9 @@ class NoiseLaw:
         return float(self.whitened_density.fisher_information)
 
     def take_readings(self, rows: BoolArray) -> NoiseLaw:
-        """Return the distribution of some readings: exact for whole scans, else as if those left out between were not.
+        """Return the distribution of the readings in a mask, (n_points,): exact for whole scans, else an approximation.
 
-        A reading then has its correlation with the one taken before it, and none where all of those before it with
-        which it was correlated, back to the first of its scan, are left out.
+        Each keeps its correlation, with the nearest one taken before it that a chain of correlations reaches, if any.
         """
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
         above = self._nearest_taken_before(rows)
@@ -145,7 +144,7 @@ class NoiseLaw:
     def _nearest_taken_before(self, rows: BoolArray) -> IntArray:
         """Return for each reading taken the nearest one taken before it with which it is correlated, -1 for none.
 
-        Numbers are those of the readings taken, (n_taken,).
+        The result (n_taken,) numbers the readings taken.
         """
         number, linked = np.cumsum(rows) - 1, self.carry != 0
         if not self.before.size:  # those above it, as long as each has a correlation with the one above
@@ -225,7 +224,7 @@ class NoiseLaw:
         return float(np.min((self.sd * np.sqrt(1 - self.carry**2))[~self.lost]))
 
     def with_least_sigma(self, sigma: float) -> NoiseLaw:
-        """Return the distribution with a lower bound on sigma."""
+        """Return the distribution with this lower bound on sigma."""
         return replace(self, least=sigma * self._smallest_conditional_sd)
 
     @property
@@ -238,17 +237,11 @@ class NoiseLaw:
         return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
 
     def likeliest_sigma(self, whitened: FloatArray) -> FloatArray:
-        """Return the most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,).
-
-        For rounded noise it is the known one.
-        """
+        """Return the known or most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
         return self.whitened_density.likeliest_sigma(whitened, self.n_kept, floor=self.sigma_floor)
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Return minus the log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
-
-        Without n/2 log 2 pi.
-        """
+        """Return minus the log likelihood, without n/2 log 2 pi, of whitened residuals (n_points, k) at sigma (k,)."""
         return self.whitened_density.minus_log_likelihood(whitened, sigma, self.n_kept)
 
     def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -265,7 +258,7 @@ class NoiseLaw:
         return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
 
     def draw_pseudo_residuals(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw pseudo-residuals as from `bounded_pseudo_residuals`, in units of their sd, (n_points, n_draws)."""
+        """Draw pseudo-residuals of noise alone, in units of their sd, (n_points, n_draws); 0 for lost readings."""
         eps = rng.standard_normal((len(self.sd), n_draws))
         if not self.whitened_density.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
@@ -277,7 +270,7 @@ class NoiseLaw:
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """A scale mixture of two normals, `times` as wide with probability `share`; scalars, or k of both (k,).
+    """A scale mixture of two normals: sd sigma, or with probability `share` `times` sigma; scalars, or k of both (k,).
 
     All methods take whitened residuals, (n_points, k) or (n_points, 1).
     """
@@ -298,7 +291,7 @@ class Tail:
     def likeliest_sigma(
         self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
     ) -> FloatArray:
-        """Return the most likely sigma, (k,), by EM; rows beyond `n_points` are 0 and do not count."""
+        """Return the most likely sigma, (k,), by EM; `n_points` rows count, the others (lost readings) are 0."""
         if self.is_normal:
             return np.asarray(
                 np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), max(floor, _LEAST))
@@ -315,7 +308,7 @@ class Tail:
         return np.asarray(sigma)
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
+        """Return minus the log likelihood of `n_points` readings at sigma (k,), without n/2 log 2 pi: (k,)."""
         if self.is_normal:
             return np.asarray(n_points * np.log(sigma) + 0.5 * np.einsum("ij,ij->j", whitened, whitened) / sigma**2)
         squares = (whitened / sigma) ** 2
@@ -335,7 +328,7 @@ class Tail:
         return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.fisher_information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the second derivative of the log likelihood by log sigma, (k,)."""
+        """Return minus the second derivative of the log likelihood by log sigma, at least 0.2 per reading, (k,)."""
         squares = (whitened / sigma) ** 2
         wide = self.wide_probability(squares)
         less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
@@ -356,7 +349,7 @@ class Tail:
 
 
 def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
-    """Stack the densities of several distributions, all with a tail or all rounded."""
+    """Return one density for the k distributions, all with a tail or all rounded; its parameters are (k,)."""
     one = len(laws) == 1
     if laws[0].flat:
         if one:
@@ -392,7 +385,7 @@ def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> Noi
 def noise_statistics(
     residuals: FloatArray, steps: IntArray, level: FloatArray, *, before: IntArray | None = None
 ) -> FloatArray:
-    """Return statistics that vanish for white normal noise, shape (3, n_draws).
+    """Return statistics that vanish for white normal noise.
 
     Parameters
     ----------
@@ -407,7 +400,7 @@ def noise_statistics(
 
     Returns
     -------
-    Lag-1 autocorrelation, excess kurtosis, and projection of the squares on the level.
+    Lag-1 autocorrelation, excess kurtosis, and projection of the squares on the level, (3, n_draws).
     """
     r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
     neighbours = np.flatnonzero(steps == 1)

@@ -29,7 +29,7 @@ _FINE = 0.01  # noise sds: tolerance of a lost reading's value without rounding
 
 @dataclass(frozen=True, eq=False)
 class NoiseNodes:
-    """The nodes of a noise model about a fit: distributions, settings (n_nodes, n_params) and log weights."""
+    """The nodes of a noise model about a fit: parameters (n_nodes, n_params), distributions and log prior weights."""
 
     settings: FloatArray
     laws: tuple[NoiseLaw, ...]
@@ -47,7 +47,7 @@ class NoiseModel:
     recording
         What was read.
     likely
-        For some effects by name, the important nodes (n_nodes, n_params) and their log prior weights.
+        For some effects by name, the nodes to use, (n_nodes, n_params), and their log prior weights.
     rounding
         Rounding step of all readings, if there is no other noise effect, or 0.
     least_sd
@@ -66,11 +66,11 @@ class NoiseModel:
         return tuple(effect.name for effect in self.effects)
 
     def columns_of_effect(self, name: str) -> slice:
-        """Return the columns of one effect's settings."""
+        """Return the slice of one effect's parameters in the settings of nodes."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
     def coarse_nodes_by_effect(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return every third node and its log weight, of each effect with one parameter and over twelve nodes."""
+        """Return, for each effect with one parameter and over twelve nodes, every third node and its log weight."""
         out = {}
         for effect in self.effects:
             nodes = effect.bank()[:, 0, :]
@@ -81,7 +81,7 @@ class NoiseModel:
     def nodes_for_predictions(self, predicted: FloatArray) -> NoiseNodes:
         """Return the product grid of the effects' nodes, with the noise law and log weight at each.
 
-        `predicted` are predictions of the usable rows, (n_usable,).
+        `predicted` are predictions of the usable rows, (n_usable,). With `rounding`, each node is a noise sd.
         """
         residuals = (self._usable_readings - predicted) / self._relative_sd
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
@@ -116,9 +116,9 @@ class NoiseModel:
         return effect.weighed_nodes(residuals, rows)
 
     def _noise_parameters_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
-        """Return the noise at all nodes at once: relative sds and correlations with every noise effect applied.
+        """Return the relative sds, correlations, ... of the noise at all nodes, with every noise effect applied.
 
-        `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) are the predictions.
+        `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) predictions from 0 to 1.
         """
         plan, usable = self.recording.plan, self.recording.usable
         everywhere = np.zeros((1, len(plan)))
@@ -174,7 +174,6 @@ class NoiseModel:
 
     @cached_property
     def _previous_in_scan(self) -> IntArray:
-        """Number of the usable reading before each in its scan, -1 for its first, (n_usable,)."""
         return previous_usable(self.recording)
 
     @cached_property
@@ -188,12 +187,11 @@ class NoiseModel:
 
     @cached_property
     def _n_rows_since_previous_in_scan(self) -> IntArray:
-        """Number of rows since the previous usable one of the scan, 0 for its first, (n_usable,)."""
         return n_rows_since_previous_usable(self.recording)
 
     @cached_property
     def _n_rows_since_previous_in_table(self) -> FloatArray:
-        """Number of rows since the previous usable one, even of another run; for the first, since the table's start."""
+        """Number of rows back to the previous usable reading, even of another run; at first, to before the table."""
         return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
 
     @cached_property
@@ -202,7 +200,7 @@ class NoiseModel:
 
     @cached_property
     def _lost_value_resolution(self) -> float:
-        """Resolution of a lost reading's value, in reading units."""
+        """Width of a cell, in reading units: lost readings have one value to within it."""
         return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
@@ -212,9 +210,9 @@ class NoiseModel:
 
 
 def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
-    """Return the log prior probability of the value of lost readings.
+    """Return the log prior probability of the one value that lost readings have.
 
-    Half is for the ends of the declared range, and half for any of the cells; without ends, all is for the cells.
+    Half is for the ends of the declared range, and half for any of `cells` possible values; without ends, all of it.
     """
     if not ends:
         return -math.log(cells)
@@ -223,9 +221,9 @@ def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -
 
 
 def _sd_nodes_with_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Return nodes and log weights, (n,), for the noise sd with rounding, as half steps per sd.
+    """Return nodes for the noise sd of rounded readings, as half steps per sd, and log weights, (n,) both.
 
-    They are coarse, and refined about the best down to the accuracy of log sigma without rounding; they extend to the
+    Nodes are coarse, and refined about the best to the accuracy of log sigma without rounding. They extend to the
     residual rms, in case the mean is incomplete.
     """
 
@@ -249,7 +247,7 @@ def _sd_nodes_with_rounding(residuals: FloatArray, half_step: float, n_points: i
 
 
 def rounding_hides_noise(step: float, recording: Recording) -> bool:
-    """Return whether rounding is too coarse for a normal density of the readings.
+    """Return whether the noise sd is below 0.6 rounding steps: too coarse for a normal density of the readings.
 
     False if no three readings are successive, which are needed to tell.
     """
@@ -257,11 +255,8 @@ def rounding_hides_noise(step: float, recording: Recording) -> bool:
 
 
 def least_sd_given_rounding(recording: Recording) -> float:
-    """Return the least sd of a normal density of the readings, given their rounding.
-
-    On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice, by a nat in ten readings at
-    0.4 of a step.
-    """
+    """Return the least sd of a normal density of the readings: the usual floor, and at least 0.6 of a rounding step."""
+    # On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice.
     return max(sd_floor(recording), _HIDDEN * lattice_step(recording.readings[recording.usable]))
 
 

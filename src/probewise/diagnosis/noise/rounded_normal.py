@@ -23,7 +23,7 @@ _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 class RoundedNormal:
     """Normal noise of known sd `sigma` plus a uniform part of half width `half` sigma; scalars, or k of both (k,).
 
-    The methods are those of `Tail`, with residuals (n_points, k) or (n_points, 1); their `sigma` is this one.
+    The methods are those of `Tail`, with residuals (n_points, k) or (n_points, 1); pass this `sigma` to each.
     """
 
     half: float | FloatArray
@@ -44,7 +44,7 @@ class RoundedNormal:
         return np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (k,)).copy()
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
+        """Return minus the log likelihood of `n_points` readings at sigma (k,), without n/2 log 2 pi: (k,)."""
         density = self._log_density(whitened / sigma) + _LOG_ROOT_2_PI
         at_zero = self._log_density(np.zeros((1, 1)))[0] + _LOG_ROOT_2_PI
         of_kept = density.sum(axis=0) - (len(whitened) - n_points) * at_zero
@@ -55,7 +55,7 @@ class RoundedNormal:
         return np.asarray(sigma * self._score(whitened / sigma) / self.fisher_information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return the curvature for which the integral over log sigma is 1, (k,), since sigma is known."""
+        """Return 2 pi, (k,): Laplace's integral over log sigma is then 1, since sigma is known."""
         return np.full(sigma.shape, 2 * math.pi)
 
     def _log_density(self, x: FloatArray) -> FloatArray:
@@ -63,7 +63,6 @@ class RoundedNormal:
         return np.asarray(log_gaussian_mass_between(-half - away, half - away) - np.log(2 * half))
 
     def _score(self, x: FloatArray) -> FloatArray:
-        """Return minus the derivative of the log density."""
         half = np.asarray(self.half)
         log_mass = self._log_density(x) + np.log(2 * half) + _LOG_ROOT_2_PI
         return np.asarray(np.exp(-0.5 * (x - half) ** 2 - log_mass) - np.exp(-0.5 * (x + half) ** 2 - log_mass))

@@ -69,7 +69,7 @@ def importance_resample(
 
 
 def _n_distinct_effective(log_weight: FloatArray, samples: FloatArray) -> float:
-    """Return Kish's effective sample size, with the weights of equal samples added up."""
+    """Return Kish's effective sample size; samples with an equal first coordinate count as one."""
     _, which = np.unique(samples[:, 0], return_inverse=True)
     if not np.isfinite(log_weight).any():
         return 0.0
@@ -98,11 +98,11 @@ def draw_by_annealing(
     n_moves
         Moves of each sample after a step of beta, and between collections of samples.
     progress
-        Called with beta, and then with the number of collected samples.
+        Called at each step of beta, and then with the number of collected samples.
 
     Returns
     -------
-    Samples, (n_wanted, n_params), collected from the walkers some moves apart.
+    Samples in random order, (n_wanted, n_params), collected from the walkers every `n_moves` moves.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def draw_by_annealing(
 
 
 def _next_beta(gain: FloatArray, beta: float) -> float:
-    """Find the largest beta, by bisection, with enough effective samples."""
+    """Find the largest beta, by bisection, at which half of the finite weights are effective samples."""
     enough = _EFFECTIVE * np.count_nonzero(np.isfinite(gain))
     if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0

@@ -1,4 +1,4 @@
-"""Bayesian model averaging: samples of several SSF orders, or of several hypotheses, in one model.
+"""Bayesian model averaging: samples of several numbers of Gaussians, or of several hypotheses, in one model.
 
 Predictions must include the uncertainty between hypotheses: for readings unlike the recorded ones, the most probable
 explanation alone would be overconfident.
@@ -21,7 +21,7 @@ from probewise.sensor import ACCURATE_NODES, footprint_of
 
 
 def mix_over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
-    """Mix samples of one hypothesis at several SSF orders by their probability.
+    """Mix samples of one hypothesis at several SSF orders (numbers of Gaussians) by their probability.
 
     All are converted to the largest order, by splitting Gaussians into two equal halves.
 
@@ -49,7 +49,7 @@ def mix_over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: 
 def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
     """Return whether hypotheses of these effects can be combined in one model.
 
-    Shared effects must be bound to the same scans; an effect that one lacks must have a null setting.
+    Shared effects must be equal, bound to the same scans; all others need parameters at which they change nothing.
     """
     known = {effect.name: effect for effect in first}
     shared = {effect.name for effect in second if effect.name in known}
@@ -60,7 +60,9 @@ def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[Name
 def mix_over_hypotheses(
     parts: Sequence[ModelSamples], shares: FloatArray, null: Null, plan: Plan, *, rng: np.random.Generator
 ) -> ModelSamples:
-    """Mix samples of several hypotheses by their probability; effects that one lacks have their null setting.
+    """Mix samples of several hypotheses by their probability, in one model with the effects of all.
+
+    In samples of a hypothesis without an effect, the effect's parameters change nothing and `absent` marks it.
 
     Parameters
     ----------

@@ -19,9 +19,9 @@ _RUIN = -1.0  # nats per held-out reading below which named effects are withdraw
 
 @dataclass(frozen=True, eq=False)
 class BestRepair:
-    """The best fit: the repaired model, or the null if nothing was found, with noise, linearisation and gain.
+    """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null.
 
-    `out_of_vocabulary` is its combination with a formula if the verdict is `unknown`, otherwise ().
+    `out_of_vocabulary`: if the verdict is `unknown`, its effects with a formula but no name in the vocabulary.
     """
 
     fit: WeighedFit
@@ -41,14 +41,14 @@ class BestRepair:
         out_of_vocabulary: Names = (),
         rng: np.random.Generator,
     ) -> BestRepair:
-        """Build it from a fit, and measure its gain over the null."""
+        """Build from a fit and its noise effects, and measure the fit's gain over the null."""
         after = Linearised.of(fit.found, fit.evidence[noise].likeliest_law)
         gain = improvement_of(searched, test, fit, noise, after, rng=rng)
         return cls(fit, noise, after, gain, out_of_vocabulary)
 
 
 def predicts_far_worse(gain: Improvement) -> bool:
-    """Return whether a repair predicts held-out readings far worse than the null."""
+    """Return whether a repair predicts held-out readings worse than the null by over one nat per reading."""
     return gain.heldout_log_density_per_reading < _RUIN
 
 
@@ -59,7 +59,7 @@ def judged_and_best_repair(
 
     Returns
     -------
-    The verdict, withdrawn if the named effects fail on held-out readings; and the fit.
+    The verdict, withdrawn if the named effects predict held-out readings far worse; and the fit.
     """
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":

@@ -1,8 +1,8 @@
-"""Correct a model for residuals that no effect explains, by basis functions orthogonal to its own parameters.
+"""Correct a model for residuals that no effect explains, by basis functions.
 
-The correction is a Gaussian process of finite rank: amplitudes have normal priors, and everything that the sensor model
-could absorb is projected out of each basis. It applies to the recording's rows and covariates only, and names no
-physics, so sensor.json does not contain it.
+The correction is a Gaussian process of finite rank: amplitudes have normal priors, and the model's own parameters are
+refitted along with the amplitudes. It applies to the recording's rows and covariates only, and names no physics, so
+sensor.json does not contain it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MOST_BASES = 6
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """A correction: `change` of the readings (n_usable,), the basis `columns`, and the gain on held-out parts."""
+    """A correction: `change` of the readings (n_usable,), by basis `columns` (n_usable, k), and gain when held out."""
 
     change: FloatArray
     columns: FloatArray
@@ -37,21 +37,19 @@ class Correction:
 
     @property
     def gains_nothing(self) -> bool:
-        """Whether it fails to improve the prediction of held-out readings, if there are any."""
+        """Whether the correction fails to improve predictions of held-out readings, where there are any."""
         return bool(self.held_out.by_scan) and self.held_out.per_reading <= 0
 
 
 def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, scan: IntArray) -> Correction:
-    """Return the correction of a fit by one basis: of those within 5 nats of the largest evidence, the narrowest.
-
-    The narrowest has the fewest columns.
+    """Return the correction of a fit by one basis: of those within 5 nats of the best, that of the fewest columns.
 
     Parameters
     ----------
     found, problem
         The fit, and its linearisation under the noise model found.
     bases
-        The candidate bases.
+        The candidate bases, as templates of several columns.
     scan
         Number of the part of each usable row, to hold parts out in turn, (n_usable,).
     """
@@ -79,9 +77,9 @@ def improvement_and_correction(
 ) -> tuple[Improvement, FloatArray]:
     """Correct the residuals of the best fit by basis functions, if this improves held-out predictions.
 
-    Bases are added one at a time, at most six, until the test passes or the next one gains less than its sd. If the
-    first gains nothing on other scans, blocks within scans are held out instead, for residuals that are local in time.
-    Where nothing can be held out, one basis is added without that check.
+    Bases are added one at a time, at most six, until the global test finds nothing or the next one gains less than the
+    gain's sd. If the first gains nothing on other scans, blocks within scans are held out instead, for residuals that
+    are local in time. Where nothing can be held out, one basis is added without that check.
 
     Returns
     -------
@@ -139,7 +137,7 @@ def improvement_and_correction(
 def _predictive_residuals_and_variances(
     found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray, asked: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit parameters and amplitudes to the `kept` rows; return residuals and variances of the mean for `asked` rows."""
+    """Fit parameters and amplitudes to the `kept` rows; return residuals and variances of the mean, `asked` rows."""
     sd, p = problem.sd, found.slopes.shape[1]
     design = np.concatenate([found.slopes, columns], axis=1)
     center = np.concatenate([-found.z, np.zeros(columns.shape[1])])

@@ -40,7 +40,7 @@ class HypothesisSamples:
     _known: dict[tuple[Names, bool], ModelSamples] = field(default_factory=dict)
 
     def averaged_over_orders(self, candidate: WeighedFit) -> ModelSamples:
-        """Return posterior samples of a candidate's hypothesis, drawn once, averaged over its probable SSF orders."""
+        """Return posterior samples of a candidate's hypothesis, averaged over its probable numbers of Gaussians."""
         key = candidate.names, candidate.found.model.sensor.exchangeable
         if key not in self._known:
             alike = self._candidates_of_same_form(candidate, candidate.names)
@@ -52,7 +52,7 @@ class HypothesisSamples:
         return self._known[key]
 
     def compatible_probabilities(self, best: WeighedFit) -> dict[Names, float]:
-        """Return the probability of each hypothesis whose SSF has the best candidate's form; their sum is one.
+        """Return the probability of each hypothesis whose SSF has the best candidate's form, by names; sum one.
 
         A user's own effects are excluded unless the best candidate has them.
         """
@@ -87,7 +87,7 @@ class HypothesisSamples:
         return mix_over_hypotheses(parts, shares, null, self.searched.prepared.recording.plan, rng=self.rng)
 
     def _candidates_of_same_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
-        """List the refitted candidates of a combination, one per SSF order, whose SSF has the best one's form."""
+        """List the refits of a combination whose SSF has the best candidate's form, one per number of Gaussians."""
         form = best.found.model.sensor.exchangeable
         return [
             c
@@ -141,7 +141,7 @@ def draw_models(
 def _average_of_named_and_null(
     cached: HypothesisSamples, searched: Searched, test: GlobalTest, noise: Names
 ) -> ModelSamples:
-    """Average over named hypotheses by probability, and the null for the rest; used if the verdict names none."""
+    """Average over named hypotheses by probability, and the null for the rest, where the verdict names no effect."""
     by_mean = searched.posterior.marginal_over_noise
     named = [names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)]
     fit = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null

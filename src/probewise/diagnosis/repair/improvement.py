@@ -21,8 +21,9 @@ N_DRAWS = 499
 class Improvement:
     """The gain of the repaired model over the null.
 
-    `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading, `heldout_by_scan`
-    by part; rms residuals in the unit of the readings; `p_value_after` of the global test of the repaired model.
+    `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading,
+    `heldout_by_scan` the mean by part; rms residuals in the unit of the readings; `p_value_after` of the global test of
+    the repaired model.
     """
 
     log_evidence: float

@@ -1,4 +1,4 @@
-"""Places, in the covariates, of the effects of a repair and of other significant residuals."""
+"""Places (ranges of covariates) of the effects of a repair and of other significant residuals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def locate_effects_and_residuals(
 ) -> tuple[Place, ...]:
     """Return the places of the repair's effects, largest first, then of other significant residuals of the null.
 
-    One place per figure: of several with the same figure, only the first is kept.
+    A place is a range of a covariate, such as time. Of several places with the same figure, only the first is kept.
 
     Parameters
     ----------

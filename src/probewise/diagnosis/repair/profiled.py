@@ -34,7 +34,7 @@ _INDEPENDENT = 0.25  # least effective sample size, as a share of the samples wa
 
 @dataclass(frozen=True, eq=False)
 class ProfiledDensity:
-    """A density of a fit's coordinates: one by the evidence of slices at fixed values, the others Student-t in each.
+    """A density of a fit's coordinates: the sliced one has the evidence of each slice, the others are Student-t in it.
 
     Parameters
     ----------
@@ -88,9 +88,9 @@ class ProfiledDensity:
         readings, n, eye = recording.readings[usable], len(nodes), np.eye(len(found.z))
 
         def heights_and_slopes(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-            """Return each slice's log posterior, (n_nodes,), and its whitened slopes by the others, then residuals.
+            """Return each slice's log posterior, (n_nodes,), and whitened slopes, (n_nodes, n_params, n_points).
 
-            The second is (n_nodes, n_params, n_points): n_params - 1 rows of slopes, and one of residuals.
+            The slopes are those by the other n_params - 1 coordinates; the last row is the residuals.
             """
             near = z[:, None, :] + _STEP * np.concatenate([np.zeros((1, len(rest))) @ eye[rest], eye[rest]])
             predicted = found.model.predict(near.reshape(-1, z.shape[1]))[:, usable]
@@ -197,7 +197,6 @@ Slices = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _better_fit_of_each_slice(old: Slices, new: Slices) -> Slices:
-    """Return, of each slice, the fit with the higher log posterior."""
     higher = new[1] > old[1]
     return (
         np.where(higher[:, None], new[0], old[0]),

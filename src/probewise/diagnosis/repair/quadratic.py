@@ -20,8 +20,8 @@ _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at 
 class QuadraticPredictions:
     """Quadratic predictions at steps `e` from a point: `center` + `change_coefficients(e)` @ `changes`.
 
-    `center` (n_points,) are the predictions at the point, `changes` (n_changes, n_points) orthonormal changes of them.
-    Their amounts are the steps and the products of `pairs` of steps (n_terms in all), times `shares` (n_terms,
+    `center` (n_points,) are the predictions at the point; `changes` (n_changes, n_points) are orthonormal. Their
+    coefficients are linear in n_terms terms, the steps and products of `pairs` of steps, by `shares` (n_terms,
     n_changes).
     """
 
@@ -41,7 +41,7 @@ class QuadraticPredictions:
         n_params
             Number of parameters, one step each.
         sd
-            Noise sd of a reading: changes far smaller are neglected.
+            Noise sd of a reading: changes by less than 0.02 sd over all readings together are neglected.
         """
         first, second = np.triu_indices(n_params)
         apart = first != second
@@ -58,6 +58,6 @@ class QuadraticPredictions:
         return cls(y[0], (first, second), axes[:, kept] * root, (axes[:, kept] / root).T @ terms)
 
     def change_coefficients(self, e: FloatArray) -> FloatArray:
-        """Return the amount of each change at steps `e`, (n_samples, n_params) -> (n_samples, n_changes)."""
+        """Return the coefficient of each change at steps `e`, (n_samples, n_params) -> (n_samples, n_changes)."""
         first, second = self.pairs
         return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)

@@ -63,9 +63,9 @@ class Repair:
 
     @property
     def combination_shares(self) -> dict[tuple[str, ...], float]:
-        """Share of the repaired model's samples by combination of those effects that not all samples contain.
+        """Share of the repaired model's samples with each combination of the effects that not all samples contain.
 
-        Largest first; {} if all samples contain the same effects.
+        Largest share first; {} if all samples contain the same effects.
         """
         absent = self.model.absent
         if not absent:
@@ -101,7 +101,7 @@ def repair_of(
     prepared, test, best, drawn
         Input of the search; global test of the null; the best fit; samples of the models.
     change
-        Correction of the predictions of the readings that are used, (n_usable,), 0 if there is none; others have none.
+        Correction of the predictions of the readings that are used, (n_usable,), 0 if there is none.
     """
     null, fit = test.null.found, best.fit.found
     everything = prepared.everything

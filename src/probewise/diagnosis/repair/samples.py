@@ -52,9 +52,9 @@ class ModelSamples:
     """Equally weighted posterior samples of a model (`chain`) with effects.
 
     `theta` (n_samples, n_params) has columns `chain.names`; `noise_sd` (n_samples,) is that of one reading; `effects`
-    names all effects, including noise effects, in the order of their columns; `nuisance` names parameters of this
-    recording only; `exchangeable`: whether permuting the SSF's Gaussians changes nothing; `absent` marks, by effect,
-    the samples without it, (n_samples,).
+    names all effects, including noise effects, in the order of their columns; `n_gaussians` is that of the SSF, 0
+    without; `nuisance` names parameters of this recording only; `exchangeable`: whether permuting the Gaussians changes
+    nothing; `absent` marks, by effect, the samples without it, (n_samples,).
     """
 
     chain: Predictor
@@ -79,7 +79,7 @@ class ModelSamples:
     """The old name of `effect_samples`."""
 
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
-        """Convert to a FittedSensor, for predictions, the robot, and sensor.json; `recording` is what was fitted."""
+        """Convert a light sensor's samples to a FittedSensor, as in sensor.json; `recording` is what was fitted."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
         from_chain = gaussians_sorted_by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_median_step_mm(recording))
@@ -121,11 +121,11 @@ def sample_model(
     annealed: bool = True,
     progress: Progress = silent,
 ) -> ModelSamples:
-    """Draw samples of a model from its posterior about a fit, under one noise model.
+    """Draw 500 samples of a model from its posterior about a fit, under one noise model.
 
     Samples of the Laplace approximation are moved to the posterior in two stages, the first through a quadratic
-    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles worse by tens of
-    nats. Where many samples cost little more than one, and an effect has a nonlinear coordinate, they are drawn from a
+    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse.
+    Where many samples cost little more than one, and an effect has a nonlinear coordinate, they are drawn from a
     `ProfiledDensity` by importance instead.
 
     Parameters
@@ -135,7 +135,7 @@ def sample_model(
     recording
         What was fitted.
     weights
-        Probability of each variant of each effect, by the effect's name.
+        By effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,).
     rng
         Source of randomness.
     annealed
@@ -250,7 +250,8 @@ def _uniform_draws_about_nodes(
 ) -> FloatArray:
     """Draw a noise effect's parameters uniformly about drawn nodes, half way to the next: (n_samples, n_params).
 
-    `nodes` (n_samples,) are indices of nodes; parameters that are the same in all nodes stay as they are.
+    `nodes` (n_samples,) are indices of nodes; parameters that are the same in all nodes stay as they are. An effect
+    with a rule of its own (`draws_about`) follows that rule.
     """
     settings = noise.nodes.settings[:, noise.noise.columns_of_effect(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)

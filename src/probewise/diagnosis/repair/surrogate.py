@@ -18,9 +18,9 @@ from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 class SurrogatePosterior:
     """An approximate posterior of coordinates z = center + e @ steps, as a function of e, (n_samples, n_params).
 
-    The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-residuals. `residual`
-    (n_axes,), at the center, and `changes` (n_axes, n_changes) are whitened, in orthonormal axes of the space that they
-    span, where a sum of squares has few terms: n_axes is n_changes + 1, or n_usable if that is less.
+    The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-residuals. `residual` (n_axes,), at
+    the center, and `changes` (n_axes, n_changes) are whitened, in orthonormal axes of the space that they span: n_axes
+    is n_changes + 1, or n_usable if that is less.
     """
 
     quadratic: QuadraticPredictions
@@ -39,10 +39,7 @@ class SurrogatePosterior:
         readings: FloatArray,
         law: NoiseLaw,
     ) -> Self:
-        """Build from quadratic predictions at steps from `center`, the readings, and their noise; usable rows only.
-
-        `readings` are (n_usable,).
-        """
+        """Build from quadratic predictions at steps from `center`, the readings (n_usable,), and their noise."""
         residual = law(readings - quadratic.center)[:, None]
         residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
         _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))

@@ -1,1 +1,1 @@
-"""Analysis of residuals: p-values, places in covariates, and basis functions for unknown effects."""
+"""Analysis of residuals: p-values, ranges of covariates where they show, and basis functions for unknown effects."""

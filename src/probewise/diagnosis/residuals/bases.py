@@ -28,7 +28,7 @@ _MEMORIES = (3.0, 10.0, 30.0)  # readings
 
 @dataclass(frozen=True, eq=False)
 class _BasisMultipliers:
-    """What a function of a covariate is multiplied by to give a basis, (n_points,) each.
+    """Factors by which a function of a covariate is multiplied to give a basis, (n_points,) each; number of scans.
 
     `adds`: 1, an added error; `gain`: the signal; `shift`: the slope along the axis of motion, a displacement;
     `turned`: the sign of the motion, an error that reverses with it.
@@ -79,10 +79,10 @@ def bank_of_unknown_effects(
 
 
 def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linearised) -> TemplateBank:
-    """Return the bases without those of one column that are nearly collinear with a named effect's template.
+    """Return the bases without those of one column that are nearly collinear with a template of a named effect.
 
-    That is, whose projections orthogonal to the null have a cosine of 0.9 or more. A window that extends to the end of
-    the recording, for instance, is the effect of a light switched on.
+    With the parameters of the fit `problem` projected out, their cosine is 0.9 or more. A window that extends to the
+    end of the recording, for instance, is the effect of a light switched on.
     """
     single = np.flatnonzero(bases.widths == 1)
     if single.size == 0 or named.widths.size == 0:
@@ -96,7 +96,7 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
 
 
 def _basis_family_name(covariate: Covariate, template: FloatArray) -> str:
-    """Return the label of a template's family; a covariate's many local bases form a family apart from smooth ones."""
+    """Name a template's family, such as "time" or, for windows and steps, "time, locally"."""
     name = covariate.published_name
     where = name if covariate.scan is None else f"{name} within scans"
     return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
@@ -157,7 +157,7 @@ def _group_bases(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[Floa
 
 
 def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
-    """Yield memories of the scan's earlier readings: exponential averages with the maximum, and the maximum alone."""
+    """Yield exponential averages (of 3, 10, 30 readings) and maximum of the signal within scans; the maximum alone."""
     held = np.empty((len(signal), len(_MEMORIES) + 1))
     keep = np.exp(-1 / np.array(_MEMORIES))
     first = np.zeros(len(signal), dtype=np.bool_)
@@ -204,7 +204,7 @@ def _cosine_bases(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatA
 
 
 def _step_bases(covariate: Covariate, way: FloatArray) -> Iterator[FloatArray]:
-    """Yield 15 bases, `way` after a change point and 0 before, with equal sums of `way` squared between them."""
+    """Yield 15 bases: `way` after a change point, 0 before; between points, the sums of `way` squared are equal."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     order = np.argsort(values, kind="stable")
     share = np.cumsum(weight[order])

@@ -25,5 +25,5 @@ class Covariate:
 
     @property
     def published_name(self) -> str:
-        """Its name in results: a column's own where that means nothing else in a table."""
+        """Its name in results: without the prefix "column:" where no covariate of a table has that name."""
         return published_covariate(self.name)

@@ -38,8 +38,8 @@ class Place:
 
     `start`, `end` in the covariate's unit; None for a whole `scan`. `z`: the statistic of the window in noise sds; for
     an effect, its lambda. The curve is the mean residual in bins of the covariate, with the noise sd of that mean.
-    `values` (n_usable,): the covariate at each usable reading, NaN if undefined; `without_effect`: they are readings
-    predicted without the effect.
+    `values` (n_usable,): the covariate at each usable reading, NaN if undefined. `without_effect`: whether the values
+    are readings predicted without the effect.
     """
 
     covariate: str
@@ -62,7 +62,7 @@ class Place:
 
     @property
     def figure_name(self) -> str:
-        """Name of the figure file that shows it, "witness_COVARIATE.svg" or "witness_COVARIATE_SCAN.svg"."""
+        """Name of the place's figure file: "witness_COVARIATE.svg" or "witness_COVARIATE_SCAN.svg"."""
         where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
         return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
 
@@ -157,7 +157,7 @@ def significant_places(
     residuals: FloatArray,
     draws: FloatArray,
 ) -> list[Place]:
-    """Return the most significant window of each covariate with a p-value up to 0.05, most significant first.
+    """Return, for each covariate, its most significant window if that has p up to 0.05; most significant first.
 
     Parameters
     ----------
@@ -216,12 +216,13 @@ def places_of_effect(
 ) -> list[Place]:
     """Locate a named effect: the interval of a covariate in which it is at least half its maximum.
 
-    In `level` a twentieth suffices; in `run`, it is the run of the largest change. One place, or one per scan.
+    In `level` a twentieth suffices; in `run`, it is the run of the largest change. The list holds one place, or, for an
+    effect bound to scans, one per scan in which it is a twentieth of its maximum or more.
 
     Parameters
     ----------
     effect
-        The effect; one that is bound to scans is located in those in which its change is not negligible.
+        The effect.
     change
         Its change of the readings, (n_points,).
     covariate

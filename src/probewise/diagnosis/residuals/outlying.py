@@ -24,13 +24,13 @@ _A = 0.5  # parameter of the beta prior of the share of outlying readings (Jeffr
 
 
 def outlier_probabilities(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
-    """Return each reading's probability to be of the wide component of heavy-tailed noise, (n_points,)."""
+    """Return the probability of each residual to be from the wide part of a noise distribution, (n_points,)."""
     whitened = law(residuals)
     return Tail(law.share, law.times).wide_probability((whitened / law.likeliest_sigma(whitened[:, None])[0]) ** 2)
 
 
 def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
-    """Return, by covariate, the log Bayes factor for another share of outlying readings in a window than elsewhere.
+    """Return log Bayes factors for another share of outlying readings in a window of a covariate than elsewhere.
 
     Parameters
     ----------

@@ -13,8 +13,8 @@ from probewise.effects import AGAIN
 def eliminate_backward(state: SearchState) -> None:
     """Refit the leading combinations without each of their effects in turn, and extend what remains by other effects.
 
-    An effect selected first may be superfluous. Or it stood in for another one as well, and its variant (scans or
-    place) suits neither. Candidates are stored in the state.
+    An effect selected first may be superfluous. Or it stood in for two effects, and its variant (scans or parameters)
+    suits neither. Candidates are stored in the state.
     """
     several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.log_posterior(c))
     named = [c for c in several if not effects_out_of_vocabulary(c.names)]
@@ -34,7 +34,7 @@ def eliminate_backward(state: SearchState) -> None:
 
 
 def _refit_leading_extensions(state: SearchState, held: WeighedFit, names: Names) -> None:
-    """Refit a candidate extended to `names`, by one effect, and by the effects that screening favours beside it."""
+    """Refit a candidate with one more effect: the one that makes it `names`, and those that screening favours."""
     proposals = proposals_for(state, held, {})
     chosen = [names, *promising_combinations(state, proposals, width=SWAPPED, behind=STEERING)[:SWAPPED]]
     for added in [proposals[key].added for key in chosen if key in proposals]:

@@ -1,6 +1,6 @@
 """A second search, with formulas, unless noise without memory explains the readings.
 
-Formulas are effects out of vocabulary that the apparatus proposes.
+Formulas are effects out of vocabulary that the apparatus proposes: short expressions of a table's columns and states.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _WITHIN = 12.0  # nats behind the best of what was refitted, within which screen
 def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> Searched:
     """Return a second search that includes the formulas favoured by screening; the given one if there are none.
 
-    The given one is also returned if the budget of refits is spent. Named effects can partly explain what one formula
-    explains, and then predict other runs badly: a square law an exponential leak, a step and a sensitivity together a
-    product. Noise with memory absorbs slow changes.
+    The given search is also returned if noise without memory explains the readings, or the budget of refits is spent.
+    Named effects can partly explain what one formula explains, and then predict other runs badly: a square law an
+    exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
     """
     prepared = searched.prepared
     if not needs_more_than_memoryless_noise(searched) or prepared.apparatus.is_refit_budget_spent():
@@ -57,13 +57,13 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
 
 
 def needs_more_than_memoryless_noise(searched: Searched) -> bool:
-    """Return whether hypotheses with an effect on the mean, or noise with memory, have a probability above 0.1."""
+    """Return whether effects on the mean, or noise with memory, together have a probability above 0.1."""
     plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
     return 1.0 - sum(plain) > _LEFT_FROM
 
 
 def _log_evidence_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
-    """Return, by formula, its log evidence by screening beside the null or the best single effect, the larger one.
+    """Return, by formula, its log evidence by screening, added to the null or to the best single effect, if larger.
 
     The log prior of that null or effect is included, that of the formula is not.
     """

@@ -30,7 +30,7 @@ from probewise.effects import AGAIN, name_of_first_copy
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A possible refit: the candidate `parent` with the effect `added`; `score` is its log evidence by screening."""
+    """A possible refit: candidate `parent` with the effect `added`; `score` is its log evidence by templates."""
 
     score: float
     parent: WeighedFit
@@ -40,7 +40,7 @@ class Proposal:
 def select_forward(state: SearchState, *, depth: int) -> None:
     """Refit the best combinations of each size up to `depth`, extended from the best of the size before.
 
-    Candidates are stored in the state.
+    Fits with significant effects are stored in the state as candidates.
     """
     null = state.null
     state.progress("screening effects")
@@ -72,7 +72,7 @@ def select_forward(state: SearchState, *, depth: int) -> None:
 def _proposals_to_refit(
     state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int
 ) -> list[Proposal]:
-    """Choose the combinations of one size to refit, each a parent with one more effect."""
+    """Choose the combinations of `size` effects to refit, each as a candidate (parent) with one more effect."""
     proposals: dict[Names, Proposal] = {}
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
@@ -89,7 +89,7 @@ def _proposals_to_refit(
 
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
-    """Store the log evidence of pairs of the best effects by templates about a null, under its leading noises."""
+    """Store in the state the log evidence of pairs of the best effects, by templates about a null."""
     for noise, evidence in null.leading_noises():
         singles = state.log_bayes_factors_by_effect(null, evidence.likeliest_law, null)
         alone = [name for name in singles if name_of_first_copy(name) is None]
@@ -105,9 +105,9 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
 
 
 def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
-    """Screen every effect that a candidate does not contain, by its templates about the null of the same SSF order.
+    """Screen every effect that a candidate lacks, by its templates about the null with the same number of Gaussians.
 
-    The log evidence of each resulting combination is stored in the state.
+    The log evidence of each resulting combination, by noise model, is stored in the state.
 
     Returns
     -------
@@ -136,7 +136,8 @@ def promising_combinations(
 ) -> list[Names]:
     """Choose the proposed combinations that are most probable by screening, at most `width` in the vocabulary.
 
-    Those more than `behind` nats behind the best refitted combination that they compete with are left out.
+    At most three more are out of vocabulary. Combinations more than `behind` nats behind the best refitted one that
+    they compete with are left out.
     """
     odds = {names: proposal.score + state.prior.log_prior_on_mean(names) for names, proposal in proposals.items()}
     ranked = sorted(odds, key=lambda names: -odds[names])
@@ -156,7 +157,7 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
     """Choose the effects to refit alone: the leader, those not far behind, and those that screening cannot judge.
 
     Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
-    null absorbs nearly completely to first order, nor one of two copies of an effect. Each is a combination of one.
+    null absorbs nearly completely to first order, nor one of two copies of an effect. Each is a tuple of one name.
     """
     ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_prior_on_mean(names)))
     faint, about = set[str](), Linearised.of(null.found, null.law)
@@ -171,7 +172,7 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
 
 
 def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[Names]:
-    """Return the pairs (effect, its copy) of effects that may occur twice and are significant alone in simplest noise.
+    """Return the pairs (effect, its copy) of effects that may occur twice and, alone, gain two nats in simplest noise.
 
     While only one of two waves is fitted, the other looks like noise with memory, which may hide both.
     """
@@ -191,8 +192,7 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
     """Propose the effects that lead about the given null, refitted under the simplest noise.
 
     Where noise with memory (a random walk, a correlation) leads, it absorbs a missing effect, and the effect may be
-    undetectable about the null that was fitted under it. None are proposed elsewhere, nor if the refit predicts the
-    same.
+    undetectable about the null that was fitted under it. Otherwise, or if the refit predicts the same: no proposals.
     """
     plain = state.refits.null_under_simplest_noise(null)
     if plain is None:
@@ -208,7 +208,7 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
 
 
 def _with_larger_pair_scores(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
-    """Return the proposals, each with the larger of its score and that of its combination by pairs about the null."""
+    """Replace each proposal's score by the log evidence of the pair about the null, where that is larger."""
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():
         best[names] = max(value, best.get(names, value))

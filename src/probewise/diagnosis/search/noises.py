@@ -70,16 +70,16 @@ class NoiseModels:
         return self.prior.log_prior_on_noise(self._uncertain_names(names))
 
     def average_log_evidence(self, log_z: Mapping[Names, float]) -> float:
-        """Return the log of the evidence averaged over these noise models by their priors; minus infinity for none."""
+        """Return the log of the evidences' average over noise models, by prior; minus infinity without any."""
         values = [value + self.log_prior(names) for names, value in log_z.items()]
         return float(logsumexp(values)) if values else -math.inf
 
     def evidence_by_noise(self, found: Fit) -> dict[Names, NoiseEvidence]:
-        """Compute the evidence of a fit under every noise model, by its names."""
+        """Compute the evidence of a fit under every noise model, by the names of its effects."""
         return {names: laplace_evidence(found, model) for names, model in self.models.items()}
 
     def best_evidence(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
-        """Return that of these evidences whose noise model is most probable, priors included."""
+        """Return the evidence, of those given by noise model, whose noise model is most probable, priors included."""
         return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))]
 
     def add_significant_pairs(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
@@ -89,7 +89,7 @@ class NoiseModels:
 
         Returns
         -------
-        Whether any were tried.
+        Whether any pair was tried.
         """
         known, singles = dict(evidence), list(evidence)
         for size in range(1, MOST_FAULTS):

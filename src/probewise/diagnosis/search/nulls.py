@@ -14,8 +14,9 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None:
     """Fit the given null; if there is none, each form of the SSF: one Gaussian, the free form, more Gaussians.
 
-    At most `max_order` + 1 Gaussians, and no more where the last one was far behind the best. The fits are stored in
-    the state. Then pairs of noise effects are added to the noise models, if single ones are significant.
+    At most `max_order` + 1 Gaussians, and no more once a fit is three nats behind the best; one Gaussian alone if
+    `max_order` is 1. The fits are stored in the state. Then pairs of noise effects are added to the noise models, if
+    single ones are significant.
     """
     noises, refits, null = state.noises, state.refits, prepared.null
     recording = prepared.recording

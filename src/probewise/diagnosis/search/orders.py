@@ -15,9 +15,9 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 
 def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
-    """Refit the most probable combinations of effects on the mean at other plausible SSF orders.
+    """Refit the most probable combinations of effects on the mean at other numbers of Gaussians (SSF orders).
 
-    Refits that are significant are stored in `state`. `by_mean` is the posterior probability of each combination,
+    Refits with significant effects are stored in `state`. `by_mean` is the posterior probability of each combination,
     whatever the noise. An unknown effect may lead at an order at which no named effect was tried; named ones must then
     be tried there.
     """
@@ -33,7 +33,7 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
 
 
 def _orders_to_refit(state: SearchState, source: WeighedFit) -> list[int]:
-    """List the other SSF orders at which a candidate's combination should be refitted."""
+    """List the other numbers of Gaussians with which a candidate's effects should be refitted."""
     own = state.candidates[source.n_gaussians, ()].log_z
     behind = own - REFITTED_WITHIN
     return [
@@ -47,7 +47,7 @@ def _orders_to_refit(state: SearchState, source: WeighedFit) -> list[int]:
 
 
 def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
-    """Refit a candidate's effects at SSF order `n`; store the fit if the effects are significant there."""
+    """Refit a candidate's effects with `n` Gaussians; store the fit if it is significantly better than that null."""
     null, sensor = state.candidates[n, ()], state.sensors[n]
     own = source.found.z[source.found.model.sensor.n_params :]
     candidate = state.refits.fit_and_weigh(

@@ -19,8 +19,8 @@ def prune_out_of_vocabulary(
 ) -> tuple[dict[Key, WeighedFit], set[Names]]:
     """Drop or penalise combinations out of vocabulary that compete with named ones of no more effects.
 
-    One that predicts so much the same that the expected lead is below three nats is dropped. If the observed lead is
-    below three nats, its evidence is reduced to that of the best named one: the lead may be noise.
+    A combination is dropped if it predicts so much the same as a named one that its expected lead is below three nats.
+    If its observed lead is below three nats, its evidence is reduced to that of the best named one.
 
     Returns
     -------

@@ -36,7 +36,7 @@ _SAME_START = 0.1  # in prior sds: starts that are closer together are duplicate
 class Refits:
     """The refits of one recording, each made once; a second search of the recording reuses them.
 
-    `sensor` is the given null, if any.
+    `sensor` is the given null, if any; `templates` caches the templates of effects about fits.
     """
 
     sensor: Null | None
@@ -52,7 +52,7 @@ class Refits:
     """Log Bayes factors of the templates of a bank, by label."""
 
     def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw, bank: TemplateBank) -> dict[str, FloatArray]:
-        """Return the log Bayes factors of a bank's templates about a fit, by label; one per template."""
+        """Return the log Bayes factors of a bank's templates about a fit under noise `law`, by label; cached."""
         key = found, law, bank
         if key not in self.scored:
             self.scored[key] = log_bayes_factors_by_label(Linearised.of(found, law), bank)
@@ -74,8 +74,8 @@ class Refits:
         """Fit a model from the best of `starts`, (n_starts, n_params), and compute its evidence under all noise models.
 
         The fit is under `law`, and is repeated if another noise distribution proves more probable. A fit that is not
-        significantly better than `beyond` takes over that one's evidence, to save the computation, unless the noise
-        has memory: there it may still gain under white noise.
+        significantly better than the fit `beyond` takes over its evidence, to save the computation, unless the noise
+        has memory: there the fit may still gain under white noise.
         """
         found = self._fit_from_best_start(model, starts, law, max_steps)
         if beyond is not None and not law.has_memory and not _improves_fit(found, beyond.found, law):
@@ -102,7 +102,7 @@ class Refits:
         return there < found.objective - SAME_MODE
 
     def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit | None:
-        """Return the given null refitted under the simplest noise.
+        """Return the given null refitted under the simplest noise, with no effects but those beyond doubt.
 
         None if that predicts the same, if the most probable noise has no memory, or if no null is given.
         """
@@ -117,9 +117,10 @@ class Refits:
         return self.plain[null]
 
     def refit_with_effect(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
-        """Refit a candidate with one more effect, in its likely variants, unless that was done before.
+        """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
 
-        An effect that changes the readings exactly as one refitted before takes over its fit and evidence.
+        A refit made before is returned as it was; an effect that changes the readings exactly as one refitted before
+        takes over that fit and evidence.
 
         Returns
         -------
@@ -135,11 +136,11 @@ class Refits:
         return self.known[key]
 
     def replace_fit(self, held: WeighedFit, better: WeighedFit) -> None:
-        """Replace a refit with one more effect by a better fit of the same combination, for later calls."""
+        """Use the fit `better` in place of `held`, of the same combination, in later calls of `refit_with_effect`."""
         self.known.update({key: (better, scores) for key, (fit, scores) in self.known.items() if fit is held})
 
     def _refit_taken_from_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
-        """Return an earlier refit of the parent with a twin of this effect, the effect in its place; None: no twin."""
+        """Take over an earlier refit of the parent with an effect of proportional templates (a twin); None: no twin."""
         own = self.templates.templates_of(parent.found, effect)
         for (held, other, less), (candidate, scores) in list(self.known.items()):
             if (
@@ -157,7 +158,7 @@ class Refits:
     def _refit_taken_from_parents_twin(
         self, parent: WeighedFit, effect: NamedEffect[Any], against: float
     ) -> Extended | None:
-        """Return an earlier refit of this effect beside a twin of the parent's last effect, swapped; None: no twin."""
+        """Take over a refit of this effect where the parent's last effect is replaced by its twin; None: no twin."""
         first, swap = self.twins.get(parent, (None, None))
         known = None if first is None else self.known.get((first, effect, against))
         if known is None or swap is None:
@@ -166,7 +167,6 @@ class Refits:
         return None if twin is None else (twin, known[1])
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
-        """Refit a candidate with one more effect in its likely variants, see `refit_with_effect`."""
         templates = self.templates.templates_of(parent.found, effect)
         own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
 
@@ -227,7 +227,7 @@ class Refits:
         variant: int,
         seen: Sequence[tuple[Linearised, FloatArray]],
     ) -> WeighedFit:
-        """Refit with one variant of one more effect, from its best templates in each of the linearisations `seen`."""
+        """Refit with one variant of one more effect, from its best templates by each linearisation in `seen`."""
         own = np.flatnonzero(templates.choice == variant)
         model = parent.found.model.with_effect(templates.variants[variant])
         ranked = [(about, scores, own[np.argsort(-scores[own])]) for about, scores in seen]
@@ -257,13 +257,13 @@ class Refits:
         return max(fitted, key=lambda candidate: self.noises.average_log_evidence(_log_z_by_noise(candidate)))
 
     def _linearised_under_simplest_noise(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
-        """Return a fit's linearisation under the simplest noise distribution; [] if `problem` is under the same."""
+        """Linearise a fit under the simplest noise: one problem; none if `problem` is under the same noise."""
         plain = parent.evidence[self.noises.certain].likeliest_law
         return [] if plain.is_practically_equal(problem.law) else [Linearised.of(parent.found, plain)]
 
 
 def _amplitudes_in_residual(projected: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return the amounts, (n_columns,), of projected columns, (n_rows, n_columns), in a residual.
+    """Fit the amplitudes, (n_columns,), of projected columns, (n_rows, n_columns), to a residual.
 
     Several columns have a normal prior. An effect of one value per run is collinear in its sum with a parameter: by
     least squares alone all runs would start far off, the parameter as far on the other side, and the fit stay there.
@@ -280,7 +280,7 @@ def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:
 
 
 def is_significantly_better(candidate: WeighedFit, parent: WeighedFit) -> bool:
-    """Return whether a candidate fits significantly better than its parent: twice the log likelihood gains over 3."""
+    """Return whether a candidate's log likelihood exceeds that of `parent` by more than 1.5 nats."""
     return _improves_fit(candidate.found, parent.found, candidate.law)
 
 
@@ -293,13 +293,13 @@ def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
 
 
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:
-    """List the indices of the variants to refit, best first: the leading one, and the next if bound to scans.
+    """List the numbers of an effect's variants (discrete choices, such as of scans) to refit, best first.
 
-    Two scans of opposite direction are aliased to first order; a refit shows which one was turned by 30 degrees. If
-    there are one or two variants (a tank may overflow to waste or into the next one), all are refitted.
+    All of one or two; of more, the best, and the next too if bound to scans and of a twentieth of the best's weight.
     """
     if len(weights) <= FEW_VARIANTS:
         return [int(k) for k in np.argsort(-weights)]
+    # Two scans of opposite direction are aliased to first order; a refit shows which one was turned.
     first, *others = np.argsort(-weights)[:2].tolist()
     bound = templates.variants[first].scans or templates.variants[first].patterns
     return [first, *(k for k in others if bound and weights[k] > VARIANTS_TRIED * weights[first])]

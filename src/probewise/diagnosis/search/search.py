@@ -90,7 +90,7 @@ def search(
     spent = prepared.apparatus.refit_budget_share_spent()
 
     def share_is_spent(share: float) -> bool:
-        """Return whether this share of the budget of refits is spent, of what an earlier search left of it."""
+        """Return whether this share is spent of the budget of refits that an earlier search left."""
         return prepared.apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
     state = SearchState(on_mean, prior, noises, templates, refits, own, progress, share_is_spent)
@@ -136,7 +136,6 @@ def search(
 
 
 def _effects_on_mean_and_noise(prepared: Prepared) -> tuple[dict[str, NamedEffect[Any]], dict[str, NoiseEffect]]:
-    """Return the effects on the mean, and those on the noise, by name."""
     effects, on_noise = prepared.effects, prepared.noise_effect_names
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
     return on_mean, {name: cast(NoiseEffect, effects[name]) for name in effects if name in on_noise}
@@ -145,9 +144,9 @@ def _effects_on_mean_and_noise(prepared: Prepared) -> tuple[dict[str, NamedEffec
 def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:
     """Refit the combinations that are probable by screening alone, until none is or six were refitted.
 
-    In the second case, all other screened evidences are reduced by the least amount by which a refit fell short of its
-    own (`state.optimism`). Screening is linear: where an effect gains hundreds of nats, the gain of another one beside
-    it may be wrong by a hundred.
+    After six, all other screened evidences are reduced (`state.optimism`) by the least amount by which a refit fell
+    short of its screened evidence. Screening is linear: where an effect gains hundreds of nats, the gain of another one
+    beside it may be wrong by a hundred.
     """
     shortfalls: list[float] = []
     for k in range(MOST_REFITTED_LATE):

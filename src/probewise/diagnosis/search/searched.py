@@ -37,18 +37,18 @@ class Evidences:
     """Log evidences of hypotheses.
 
     A hypothesis is a pair (mean, noise): the names of its effects on the mean, and on the noise. The mean ("unknown",)
-    stands for an unknown effect, alone or beside others.
+    stands for an unknown effect, alone or with others. The SSF order is the number of Gaussians.
 
     Parameters
     ----------
     fits
-        Combinations of effects on the mean that were refitted, by (SSF order, mean).
+        Refits by (SSF order, mean), with their evidence by noise.
     screened
-        The rest, by templates: (mean, noise) -> log evidence.
+        Combinations not refitted, by templates: (mean, noise) -> log evidence.
     unknown
-        Unknown effects beside fits: (SSF order, mean, noise) -> log evidence.
+        Unknown effects added to fits: (SSF order, mean, noise) -> log evidence.
     unknown_shares
-        Share of each family of bases in the evidence of an unknown effect.
+        Share of each family of bases, such as "time", in the evidence of an unknown effect.
     """
 
     fits: Mapping[tuple[int, Names], WeighedFit]
@@ -57,9 +57,9 @@ class Evidences:
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
 
     def named_outweigh_unknown(self, order: int, names: Names, noise: Names) -> bool:
-        """Return whether named effects gain more evidence over the null than an unknown effect adds beside them.
+        """Return whether named effects gain more evidence over the null than an unknown effect adds to theirs.
 
-        At one SSF order, under one noise model.
+        The comparison is at one SSF order, under one noise model.
         """
         if not names or (order, ()) not in self.fits:
             return False
@@ -69,8 +69,8 @@ class Evidences:
     def reported_names(self, mean: Names) -> Names:
         """Return the names by which a combination is reported: its own, or ("unknown",) if any is out of vocabulary.
 
-        There are two exceptions: its named part is reported if that alone has over half of its gain over the null; and
-        instead of a formula alone, the best single named effect if that has nine tenths of its gain.
+        There are two exceptions: the combination's named part is reported if it alone has over half of the gain over
+        the null; instead of a formula alone, the best single named effect if it has nine tenths of the formula's gain.
         """
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
@@ -100,15 +100,15 @@ class Evidences:
 
     @property
     def _simplest_noise(self) -> Names:
-        """The noise model with the fewest effects: those that the readings show beyond doubt."""
+        """Names of the noise model with the fewest effects."""
         return min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
 
     def _largest_log_z(self, names: Names) -> float:
-        """Return a combination's largest log evidence over SSF orders and noise models; minus infinity: no refit."""
+        """Return a combination's largest log evidence over SSF orders and noise models; minus infinity: no fit."""
         return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
 
     def with_log_evidence_shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
-        """Return them with the log evidence of fits, and of unknown effects beside them, shifted by `gaps` in nats.
+        """Return a copy with the log evidence of fits, with and without an unknown effect, shifted by `gaps` in nats.
 
         `gaps` is by (SSF order, mean), the same under every noise model.
         """
@@ -119,7 +119,7 @@ class Evidences:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Probabilities of (mean, noise) hypotheses, which sum to one, and of each SSF order of the null."""
+    """Probabilities of hypotheses by (names on the mean, names on the noise), and of each SSF order of the null."""
 
     probabilities: Mapping[tuple[Names, Names], float]
     order_probabilities: Mapping[int, float]
@@ -133,7 +133,7 @@ class Posterior:
         return out
 
     def likeliest_noise(self, stated: Names | None = None) -> Names:
-        """Return the most probable noise model, of all or of those whose effects of the vocabulary are `stated`."""
+        """Return the names of the most probable noise model, of all or of those with just the `stated` effects."""
         marginal: dict[Names, float] = {}
         for (_, noise), p in self.probabilities.items():
             if stated is None or noise_effects_in_vocabulary(noise) == stated:
@@ -142,7 +142,7 @@ class Posterior:
 
 
 def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
-    """Convert evidences to probabilities of hypotheses, summed over SSF orders.
+    """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians).
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
 class MisfitTemplates:
     """Templates by which a fit is tested for misfits: of effects, and of the basis functions of unknown effects.
 
-    All are built about one fit (`about`): fits to a recording predict much the same, and a test is valid with any
+    All are built about one fit (`about`), since fits to a recording predict much the same, and a test is valid with any
     templates. `covariates` are those of the basis functions.
     """
 
@@ -204,9 +204,9 @@ class Searched:
     prior
         Prior odds.
     noise_models, certain
-        Noise models by the names of their effects; noise effects beyond doubt.
+        Noise models by the names of their effects; names of the noise effects beyond doubt.
     nulls
-        The null by SSF order, without fits.
+        The null by SSF order (number of Gaussians), without fits.
     misfit_templates
         Templates by which a fit is tested.
     refits
@@ -242,14 +242,14 @@ class Searched:
         return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
 
     def best_refit_of(self, names: Names, noise: Names) -> WeighedFit | None:
-        """Return the refit of these effects at the SSF order of most evidence under a noise model; None: no refit."""
+        """Return the refit of these effects with the number of Gaussians of largest evidence under a noise, if any."""
         options = [fit for (_, key), fit in self.evidences.fits.items() if key == names]
         return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
 
     def combinations_aliased_with(self, names: Names) -> frozenset[Names]:
-        """Return the combinations aliased with this one: expected to differ by less than three nats at any SSF order.
+        """Return the combinations aliased with this one: their expected log Bayes factor is below three nats.
 
-        The combination () has none.
+        One number of Gaussians at which this is so suffices. The combination () has none.
         """
         fits = self.evidences.fits
         return frozenset(
@@ -260,7 +260,7 @@ class Searched:
         )
 
     def likeliest_fit_beside_unknown(self, noise: Names) -> WeighedFit | None:
-        """Return the fit beside which an unknown effect is most probable under a noise model; None: not weighed."""
+        """Return the fit that, with an unknown effect added, is most probable under a noise model, if any."""
         scores = {
             (n, names): value + self.prior.log_prior_with_unknown(names)
             for (n, names, own), value in self.evidences.unknown.items()
@@ -269,7 +269,7 @@ class Searched:
         return self.evidences.fits[max(scores, key=lambda key: scores[key])] if scores else None
 
     def effect_probabilities_given_unknown(self) -> dict[str, float]:
-        """Return the probability of each effect that stands beside an unknown effect, given that there is one."""
+        """Return, by effect, the probability that it acts too, given that an unknown effect acts."""
         scores = {
             (names, noise): value
             + self.prior.log_prior_with_unknown(names)
@@ -296,7 +296,7 @@ class Searched:
 
     @property
     def likeliest_order(self) -> int:
-        """The most probable SSF order, over explanations with and without a name; the null is tested at this order."""
+        """The most probable number of Gaussians (SSF order), over all refits, with and without an unknown effect."""
         by_order: dict[int, float] = {}
         terms = [
             (n, fit.log_z + self.prior.log_prior_on_mean(names)) for (n, names), fit in self.evidences.fits.items()
@@ -309,11 +309,11 @@ class Searched:
 
     @property
     def null(self) -> WeighedFit:
-        """The fit of the null at the likeliest SSF order."""
+        """The fit of the null with the likeliest number of Gaussians."""
         return self.evidences.fits[self.likeliest_order, ()]
 
     def leading_out_of_vocabulary(self) -> Names:
-        """Return the most probable combination out of vocabulary if it beats an unknown effect of bases; else ()."""
+        """Return the most probable combination with a formula out of vocabulary, if it beats one without; else ()."""
         by_mean = self.posterior.marginal_over_noise
         own = {names: p for names, p in by_mean.items() if effects_out_of_vocabulary(names)}
         refitted = {names for _, names in self.evidences.fits}
@@ -321,10 +321,7 @@ class Searched:
         return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
 
     def probabilities_of_unknown_forms(self) -> dict[str, float]:
-        """Return the probability of each form of an unknown effect: effects out of vocabulary, families of bases.
-
-        They sum to one, if any has a probability.
-        """
+        """Return the share of each form of an unknown effect: effects out of vocabulary, families of bases."""
         by_mean = self.posterior.marginal_over_noise
         unknown = by_mean.get(("unknown",), 0.0)
         shares = {family: unknown * p for family, p in self.evidences.unknown_shares.items()}

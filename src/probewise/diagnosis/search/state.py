@@ -1,4 +1,4 @@
-"""The state of a search: candidates by SSF order and names, what screening said of others, and further refits."""
+"""The state of a search: candidates by SSF order and names, screened evidences of others, and further refits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from probewise.progress import Progress, silent
 
 @dataclass(eq=False)
 class SearchState:
-    """The mutable state of a search. A candidate is a refitted combination of effects at one SSF order.
+    """The mutable state of a search. A candidate is a refitted combination of effects with one number of Gaussians.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class SearchState:
 
     @property
     def nulls(self) -> list[WeighedFit]:
-        """The candidates without effects, one per SSF order."""
+        """The candidates without effects, one per number of Gaussians."""
         return [c for (_, names), c in self.candidates.items() if not names]
 
     @property
@@ -89,11 +89,11 @@ class SearchState:
 
     @property
     def refitted_combinations(self) -> set[Names]:
-        """The combinations that were refitted, at any SSF order."""
+        """The combinations that were refitted, with any number of Gaussians."""
         return {names for _, names in self.candidates}
 
     def candidates_of_combination(self, names: Names) -> list[WeighedFit]:
-        """List the candidates of one combination, one per SSF order."""
+        """List the candidates of one combination, one per number of Gaussians."""
         return [c for (_, key), c in self.candidates.items() if key == names]
 
     def log_posterior(self, candidate: WeighedFit) -> float:
@@ -101,13 +101,13 @@ class SearchState:
         return candidate.log_z + self.prior.log_prior_on_mean(candidate.names)
 
     def template_banks(self, null: WeighedFit) -> list[TemplateBank]:
-        """Return the template banks of all effects about a null: of those in the vocabulary, and of the others."""
+        """Return the template banks of all effects about a null: one in the vocabulary, and one out of it if any."""
         named = [effect for name, effect in self.effects.items() if not effects_out_of_vocabulary((name,))]
         rest = [effect for name, effect in self.effects.items() if effects_out_of_vocabulary((name,))]
         return [self.templates.coarse_bank(null.found, effects) for effects in (named, rest) if effects]
 
     def log_bayes_factors_by_effect(self, about: WeighedFit, law: NoiseLaw, null: WeighedFit) -> dict[str, FloatArray]:
-        """Return the log Bayes factors of every effect's templates beside a candidate, by name, (n_templates,) each.
+        """Return, by effect, the log Bayes factors of adding its templates to a candidate, (n_templates,) each.
 
         The templates are those about `null`.
         """
@@ -130,7 +130,7 @@ class SearchState:
         )
 
     def store_candidate(self, candidate: WeighedFit) -> WeighedFit:
-        """Store a candidate in place of an earlier one of the same SSF order and effects, and return it."""
+        """Store a candidate in place of an earlier one of the same effects and number of Gaussians; return it."""
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
@@ -174,9 +174,8 @@ class SearchState:
     def refit_subset_from(self, candidate: WeighedFit, left_out: str) -> None:
         """Refit the combination without `left_out` from its coordinates in `candidate`, if it fits better there.
 
-        A better fit replaces the candidate of that combination. Where an effect changes what other parameters are (a
-        stiffness that hardens, and a frequency), a fit from where they were without it may stop at a poor local
-        optimum, which one more effect lets it leave.
+        A better fit replaces the candidate of that combination. Where an effect changes the meaning of other parameters
+        (a stiffness that hardens, and a frequency), a fit from their values without it may stop at a local optimum.
         """
         model, stay = candidate.found.model.model_and_mask_without(left_out)
         start = candidate.found.z[stay]
@@ -210,8 +209,8 @@ class SearchState:
     def screened_log_evidences(self) -> dict[tuple[Names, Names], float]:
         """Return the log evidence of (mean, noise) by screening, for combinations that were not refitted.
 
-        Screening about a fit with part of the effects is more accurate than about the null; the latter is corrected for
-        refits of its parts. `optimism` is taken off, unless a refit has shown that an effect is insignificant.
+        Screening about a fit with part of the effects is more accurate than about the null, which is corrected for
+        refits of parts. `optimism` (nats) is subtracted, unless a refit has shown that an effect is insignificant.
         """
         refitted = self.refitted_combinations
         out = {}
@@ -231,17 +230,14 @@ class SearchState:
         }
 
     def log_evidence(self, names: Names) -> float:
-        """Return a combination's log evidence, the largest over SSF orders and noise models.
+        """Return a combination's largest log evidence over noise models and numbers of Gaussians.
 
-        It is that of the refits or, if there are none, that by screening; minus infinity if there is neither.
+        It is that of refits or, if there are none, that by screening; minus infinity if there is neither.
         """
         screened = (value for (own, _), value in self.screened_log_evidences().items() if own == names)
         return max([c.log_z for c in self.candidates_of_combination(names)] or screened, default=-np.inf)
 
 
 def competing_candidates(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
-    """List the candidates with which a combination competes.
-
-    These are all candidates if it has an effect out of vocabulary, otherwise only those without one.
-    """
+    """List the candidates that compete with a combination: those in the vocabulary, or all if it is out of it."""
     return [c for c in among if effects_out_of_vocabulary(names) or not effects_out_of_vocabulary(c.names)]

@@ -66,11 +66,11 @@ def weigh_thoroughly(
     rng
         Source of randomness.
     n_live
-        Live points of each run. The first run, from the whole prior, locates the posterior; further runs, from priors
-        near it (`probewise.nested.repartitioned`), estimate the evidence until its error is small.
+        Live points of each run, or more if there are many parameters. The first run, from the whole prior, locates the
+        posterior; further runs, from priors near it (`probewise.nested.repartitioned`), estimate the evidence until its
+        error is small.
     progress
-        Called first with an estimate of the minutes, from timed evaluations of the leading hypothesis; then after every
-        round.
+        Called first with an estimate of the minutes, from timed evaluations of the hypotheses; then after every round.
 
     Returns
     -------
@@ -97,9 +97,9 @@ def weigh_thoroughly(
 
 
 def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
-    """List the leading refitted hypotheses on the mean, each with its most probable noise model, and the null.
+    """List two or three leading refitted hypotheses on the mean, and the null, each with its most probable noise.
 
-    Each is at its SSF order of largest evidence; the null, if it is not among them, at that of the first.
+    Each has the number of Gaussians of largest evidence; the null, if it is not among them, that of the first.
     """
     merged = searched.posterior.marginal_over_noise
     out: list[tuple[WeighedFit, Names]] = []
@@ -117,7 +117,6 @@ def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
 
 
 def _likeliest_noise_of(searched: Searched, mean: Names) -> Names:
-    """Return the noise model with which a hypothesis on the mean is most probable."""
     own = {noise: p for (names, noise), p in searched.posterior.probabilities.items() if names == mean}
     return max(own, key=lambda noise: own[noise])
 
@@ -172,7 +171,7 @@ def _hypothesis_problem(candidate: WeighedFit, noise: Names, searched: Searched)
 def _least_and_most_minutes(
     leaders: Sequence[tuple[WeighedFit, Names]], searched: Searched, n_live: int, *, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Estimate the least and the most minutes of all runs, from the measured time of an evaluation."""
+    """Estimate the least and the most minutes of all runs, from the measured time of one likelihood."""
     seconds = 0.0
     for candidate, noise in leaders:
         problem = _hypothesis_problem(candidate, noise, searched)
@@ -195,7 +194,7 @@ class _ProgressBar:
         progress(self._stage, 0, n * _STEPS)
 
     def show_round(self, k: int, label: str, state: nested.RoundSummary) -> None:
-        """Show the progress after one round of a run; `k` is the number of the hypothesis, from 0, `label` its name."""
+        """Show the progress after one round of a run for hypothesis number `k`, from 0, with the name `label`."""
         depth = -state.log_volume
         if k != self._at or depth < self._depth:  # a new run starts from the whole prior
             self._runs = 1 if k != self._at else self._runs + 1
@@ -216,10 +215,10 @@ def _minutes_in_words(minutes: tuple[float, float]) -> str:
 def _evidence_near_posterior(
     theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator
 ) -> _Evidence:
-    """Estimate the evidence by up to four runs from priors near the posterior, until its error is small.
+    """Estimate the evidence by up to four runs from priors near the posterior, until its error is below 0.3 nats.
 
     The first is near the samples `theta`, each further one near the samples of the last; the result is their weighted
-    mean, or a run refined to a smaller error.
+    mean, or that of a run whose refinement has a smaller error.
     """
     runs: list[nested.NestedResult] = []
     while True:

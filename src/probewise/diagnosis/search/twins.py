@@ -17,7 +17,7 @@ _SAME_SLOPES = 1e-3  # of the norm of a slope
 
 
 def are_proportional(first: EffectTemplates, second: EffectTemplates) -> bool:
-    """Return whether all corresponding templates of two effects are proportional; False for one and the same object."""
+    """Return whether all corresponding templates of two effects are proportional; False if both are one object."""
     if first is second or [a.shape for a in first.settings] != [b.shape for b in second.settings]:
         return False
     if len(first.variants) != len(second.variants):
@@ -37,10 +37,7 @@ class TwinSwap:
     of_twin: EffectTemplates
 
     def candidate_with_twin(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
-        """Return a candidate with the twin in place of the effect; None if its predictions or their slopes change.
-
-        `usable` are the row numbers of usable readings, (n_usable,).
-        """
+        """Return a candidate with the twin in place of the effect; None if this changes predictions or slopes."""
         found = self._fit_with_twin(candidate.found, usable)
         if found is None:
             return None

@@ -1,4 +1,4 @@
-"""Unknown effects beside refitted candidates: their evidence, and their removal in favour of named effects."""
+"""Unknown effects in addition to candidates: their evidence, and their removal in favour of named effects."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vo
 
 @dataclass(eq=False)
 class UnknownEffects:
-    """Evidence of an unknown effect, by basis functions, beside candidates, under each of their leading noise models.
+    """Evidence of an unknown effect, by basis functions, added to candidates, under each of their leading noise models.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ class UnknownEffects:
     noises
         The noise models.
     complexity_penalty
-        Function of the degrees of freedom of an SSF: penalty in nats of an unknown effect beside the null.
+        Function of the degrees of freedom of an SSF: penalty in nats of an unknown effect added to the null.
     log_n_choices
-        Function of names: log of the number of combinations of as many names, over the number of single names.
+        Function of names: log of the number of combinations of this size, relative to single names.
     """
 
     scores: Callable[[Fit, NoiseLaw, TemplateBank], Mapping[str, FloatArray]]
@@ -54,7 +54,7 @@ class UnknownEffects:
     log_n_choices: Callable[[Names], float] = lambda names: 0.0
 
     def weigh_beside(self, candidates: Iterable[WeighedFit]) -> None:
-        """Compute and store the log evidence of an unknown effect beside each candidate."""
+        """Compute and store (`log_z`) the log evidence of each candidate with an unknown effect added."""
         best = -np.inf
         for candidate in candidates:
             for noise, evidence in candidate.leading_noises():
@@ -75,11 +75,11 @@ class UnknownEffects:
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
     def drop_superfluous(self, candidates: Collection[WeighedFit]) -> None:
-        """Drop an unknown effect, alone or beside one named effect, if one or two more named effects explain as much.
+        """Drop an unknown effect, alone or with one named effect, if one or two more named effects explain as much.
 
-        No unknown effect may then be significant beside them. A basis of many columns, such as one value per scan, can
-        imitate named effects. Two names are chosen from many more combinations than one, so they must explain
-        correspondingly more.
+        An unknown effect added to the named ones must then be insignificant. A basis of many columns, such as one value
+        per scan, can imitate named effects. Two names are chosen from many more combinations than one, so they must
+        explain correspondingly more.
         """
         named = [c for c in candidates if not effects_out_of_vocabulary(c.names)]
         for known in dict.fromkeys(c.names for c in named if len(c.names) <= 1):
@@ -88,9 +88,9 @@ class UnknownEffects:
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
 
     def _is_superfluous(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
-        """Return whether one of the rivals makes an unknown effect beside `known` superfluous.
+        """Return whether one of the `rivals` makes an unknown effect added to `known` superfluous.
 
-        That is, its evidence is at most ALIASED_NATS lower, and an unknown effect beside it adds less than that.
+        The rival's evidence is at most three nats lower, and an unknown effect adds less than three to it.
         """
         most = max((self._log_evidence_with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
         believed = {c: self._log_evidence_less_choices(c, len(known)) for c in rivals}

@@ -18,7 +18,7 @@ from probewise.effects import NUISANCES, is_out_of_vocabulary
 
 @dataclass(frozen=True, eq=False)
 class WeighedFit:
-    """A combination of effects on the mean at one SSF order, refitted, with its evidence under each noise model."""
+    """A candidate: effects on the mean refitted with an SSF of some number of Gaussians; evidence by noise effects."""
 
     found: Fit
     law: NoiseLaw  # noise distribution of the fit
@@ -34,34 +34,34 @@ class WeighedFit:
 
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_detectable: float) -> WeighedFit:
-        """Build from a fit and its `plain` evidence: of its parameters alone, without prior factors."""
+        """Build from a fit and its `plain` evidence by noise model: of its parameters alone, without prior factors."""
         return cls(found, law, {}, 0.0, log_detectable, {}).with_evidence(plain)
 
     @property
     def log_prior_factor(self) -> float:
-        """Log of the prior factor by which its evidence differs from that of its parameters alone."""
+        """Log prior factor in its evidence: of its effects' discrete choices, and of their detectable sizes."""
         return self.log_share + self.log_detectable
 
     def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
-        """Return it with new evidence, by noise model: `plain`, that of its parameters alone, plus its prior factor."""
+        """Return a copy with new evidence, by noise model: `plain`, of its parameters alone, plus its prior factor."""
         return replace(self, evidence=plain).with_log_evidence_shifted(self.log_prior_factor)
 
     def with_variant_factor_and_weights(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
-        """Return it with another log prior factor of its effects' variants, and the variants' weights, by effect."""
+        """Return a copy with other log prior factor and weights of its effects' variants (discrete choices)."""
         return replace(self.with_log_evidence_shifted(log_share - self.log_share), log_share=log_share, weights=weights)
 
     def with_log_evidence_shifted(self, by: float) -> WeighedFit:
-        """Return it with its log evidence shifted by these nats under every noise model."""
+        """Return a copy with its log evidence shifted by these nats under every noise model."""
         return replace(self, evidence={noise: replace(e, log_z=e.log_z + by) for noise, e in self.evidence.items()})
 
     @property
     def n_gaussians(self) -> int:
-        """Its SSF order, the number of Gaussians."""
+        """Number of Gaussians of its SSF (SSF order)."""
         return self.found.model.sensor.n_gaussians
 
     @property
     def whitened_sd(self) -> float:
-        """Sd of a whitened reading, including rounding but not a tail."""
+        """Noise sd of a whitened reading, in reading units, including rounding but not a tail."""
         return self.found.sd * self.law.sd_factor_of_rounding
 
     @property
@@ -75,7 +75,7 @@ class WeighedFit:
         return max(e.log_z for e in self.evidence.values())
 
     def leading_noises(self) -> Iterator[tuple[Names, NoiseEvidence]]:
-        """Iterate over names and evidence of the noise models within three nats of the best, and of the simplest one.
+        """Iterate over the noise models within three nats of the best, and the simplest one: names and evidence.
 
         A missing effect on the mean can look like any noise effect, and be detectable under white noise only.
         """
@@ -86,17 +86,17 @@ class WeighedFit:
 def expected_log_bayes_factor(first: WeighedFit, second: WeighedFit) -> float:
     """Return the log Bayes factor expected between two candidates if the first is true, in nats.
 
-    It is half the squared distance between their predictions, whitened, in noise sds of the first.
+    This is half the squared distance between their predictions, whitened, in noise sds of the first.
     """
     apart = first.law((first.found.residuals - second.found.residuals)[:, None])
     return 0.5 * float(np.sum(apart**2)) / first.whitened_sd**2
 
 
 def noise_effects_in_vocabulary(noise: Names) -> Names:
-    """Return those effects of a noise model that are in the vocabulary, without nuisances."""
+    """Return the effects of a noise model without nuisances, which have no name in the vocabulary."""
     return tuple(name for name in noise if name not in NUISANCES)
 
 
 def effects_out_of_vocabulary(mean: Names) -> Names:
-    """Return those effects on the mean that are out of vocabulary."""
+    """Return the effects on the mean, of those named, that are out of vocabulary."""
     return tuple(name for name in mean if is_out_of_vocabulary(name))

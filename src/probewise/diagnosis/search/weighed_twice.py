@@ -25,7 +25,7 @@ class Weighing:
 
     @property
     def label(self) -> str:
-        """Its effects joined by "+", or "clean"."""
+        """Effects joined by "+", or "clean"."""
         return "+".join(self.effects) or "clean"
 
     @property
@@ -40,7 +40,7 @@ class Weighing:
 
 
 def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
-    """Return a reason extended by whether nested sampling agrees, by how many nats not, and its first warning."""
+    """Extend a verdict's reason by whether nested sampling agrees, by how many nats not, and its first warning."""
     if not weighings:
         return reason
     apart = ", ".join(f"{w.label} by {w.gap:+.1f} nats".replace("-", "−") for w in weighings if not w.agree)

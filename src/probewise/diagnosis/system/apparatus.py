@@ -73,7 +73,7 @@ class SimulatorApparatus:
     about
         The system, its table, the first fit, and the sd of a reading.
     stop
-        The undeclared stop of the meter, if the readings show one.
+        The level at which the meter stops without having declared it, if the readings show one.
     """
 
     about: ReferenceFit
@@ -113,32 +113,29 @@ class SimulatorApparatus:
         return forms | {effect.name: effect for effect in on_noise} | stops
 
     def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
-        """Return by name the formulas to propose: short expressions of columns and states."""
+        """Return formulas for effects out of vocabulary, by name: short expressions of columns and states."""
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in formula_forms(self.about)})
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
-        """Return the names of those of these effects that the user's simulator file adds."""
+        """Return the names of the effects that the user's simulator file adds."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
     def refit_budget_share_spent(self) -> float:
-        """Return the share of the budget of calls of `simulate`, or of integration steps, that is spent.
-
-        0 if `simulate` takes all samples at once.
-        """
+        """Return the spent share of the budget of calls or integration steps; 0 if `simulate` takes arrays."""
         caller = self.system.caller
         if caller is None:
             return self.system.tally.n_steps / STEPS_OF_A_SEARCH
         return 0.0 if caller.broadcasts else caller.n_calls / CALLS_OF_A_SEARCH
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:
-        """Return whether this share of that budget is spent; if so, record that the search was cut short."""
+        """Return whether at least this share of the budget is spent; if so, record that the search was cut short."""
         over = self.refit_budget_share_spent() >= share
         tally = self.system.caller or self.system.tally
         tally.cut_short |= over
         return over
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
-        """Return the prior odds of these effects, of an unknown effect, and of none."""
+        """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
         return replace(
             PriorOdds.for_effects(effects),
             by_size=_BY_SIZE,
@@ -154,7 +151,7 @@ class SimulatorApparatus:
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
         """Return the covariates that vary, and the predicted change since the previous row, (n_usable,).
 
-        Covariates are time or row, level, columns, states, that change, and the run.
+        Covariates are time or row, predicted level, its change since the row before, columns, states, and the run.
         """
         table = cast(RunTable, recording.plan)
         usable = np.flatnonzero(recording.usable)
@@ -188,7 +185,7 @@ class SimulatorApparatus:
         plan: Plan,
         known: Sequence[Covariate],
     ) -> Covariate | None:
-        """Return the first known one of an effect's covariates; None if none is known, or `change` is 0 at every row.
+        """Return the first of an effect's covariates that is `known`; None if none is, or `change` is 0 at every row.
 
         The values of `level` are those predicted `without` the effect.
         """
@@ -203,7 +200,7 @@ class SimulatorApparatus:
         return np.zeros((len(usable), 0))
 
     def held_out_parts(self, recording: Recording) -> Parts:
-        """Return the runs as parts to hold out in turn or, for a single run, five blocks of successive rows."""
+        """Return the part of each usable reading, (n_usable,), and names: runs or, of one run, five blocks."""
         table, usable = cast(RunTable, recording.plan), recording.usable
         run = table.scan[usable]
         if np.sum(np.bincount(run) >= LEAST_ROWS) > 1:

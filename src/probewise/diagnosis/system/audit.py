@@ -38,6 +38,11 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     table
         Its input columns, row by row: a table, a dict of arrays, or a DataFrame.
 
+    Returns
+    -------
+    PlanAudit
+        Without cures; of each effect with the rows that it needs, and groups of aliased effects.
+
     Raises
     ------
     ParameterError
@@ -78,10 +83,10 @@ def _without_reading_column(simulator: Simulator, table: RunTable) -> RunTable:
 
 
 def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
-    """Return a point of the prior at which readings vary, its middle if possible.
+    """Return a point of the prior at which readings vary, its middle if possible, (n_params,).
 
-    Coordinates, (n_params,); the predicted readings, (n_points,); the point in words. Raises ParameterError if there is
-    none, or a row has no reading at any.
+    With the predicted readings there, (n_points,), and the point in words. Raises ParameterError if there is none, or a
+    row has no reading at any.
     """
     never = np.ones(len(table), dtype=np.bool_)
     for k, z in enumerate(system.starts):
@@ -114,7 +119,7 @@ def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: Float
 
 
 def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
-    """Return, for every effect of the vocabulary, the reason to give if it is absent from this table's effects."""
+    """Return, for every possible effect by name, the reason to give if it cannot act in this table."""
     own, table = about.system.simulator, about.table
     nothing = "it leaves no trace here"
     timeless = "no time was recorded" if not table.has_varying_time else nothing
@@ -145,7 +150,7 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
 def _with_rows_needed(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
     """Return an audit with the number of rows like these that give lambda 8 to an effect of one noise sd rms.
 
-    An invisible effect gets the reason for that instead.
+    An invisible effect gets a reason why it is invisible instead.
     """
     if effect.detectability == "invisible":
         return replace(effect, reason=effect.reason if effect.share > 0 else reasons.get(effect.name, effect.reason))
@@ -153,7 +158,7 @@ def _with_rows_needed(effect: EffectAudit, reasons: dict[str, str]) -> EffectAud
 
 
 def _alias_classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:
-    """Return groups of names of aliased effects, directly or through others of the group, sorted."""
+    """Return sorted groups of names: effects aliased directly, or through others of the group."""
     group = {effect.name: {effect.name} for effect in effects}
     for effect in effects:
         for name, _ in effect.alike:

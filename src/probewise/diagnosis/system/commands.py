@@ -39,7 +39,7 @@ class RunCommand:
 
 
 def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[RunCommand]:
-    """List the runs that could be recorded: recorded runs again, and with their controls moved otherwise.
+    """List the runs that could be recorded: recorded runs again, reversed, slower, or with a control moved otherwise.
 
     At most four recorded runs are taken, those that differ in their controls.
 
@@ -52,7 +52,7 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
     controls
         Columns that can be set; without any, runs can only be repeated.
     time_unit
-        Unit of time.
+        Unit of the table's time.
     """
     out: list[RunCommand] = []
     settable = [name for name in controls if name in table.covariates]
@@ -116,9 +116,9 @@ def _planned_run(
     like: str,
     slower: float,
 ) -> RunTable:
-    """Return rows of a table as a new run after it: without readings, with `columns` set, and named `name`.
+    """Return rows of a table as a new run after it, called `name`: without readings, with `columns` set.
 
-    It takes `slower` times as long as the rows did, and resembles the run `like`.
+    The run takes `slower` times as long as the rows did; parameters per run are taken as in the run `like`.
     """
     taken = table.take(rows)
     changed: dict[str, Any] = {**columns}
@@ -140,7 +140,7 @@ def _planned_run(
 
 
 def _next_start_time(table: RunTable) -> float:
-    """Return the time at which a run after a table starts: after the median gap between runs, else after ten rows."""
+    """Return the time at which a run after a table starts: the median pause between runs later, or ten rows."""
     by_run = [table.time_s[rows] for rows in table.rows_by_scan()]
     between = [later[0] - earlier[-1] for earlier, later in itertools.pairwise(by_run)]
     gaps = np.concatenate([np.diff(time) for time in by_run])
@@ -156,7 +156,7 @@ def plan_of_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
 
 
 def plan_in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
-    """Concatenate runs to be recorded in sequence: each begins after the last, unless time restarts with each run."""
+    """Concatenate runs to be recorded in sequence: each begins after the one before, unless time restarts with each."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []
     for command in commands:
@@ -169,7 +169,7 @@ def plan_in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
 
 
 def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
-    """Return the row numbers of the first four runs that differ in their controls, (n_rows,) each."""
+    """Return the row numbers of the first four runs, of four rows or more, that differ in their controls."""
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in table.rows_by_scan():
         if len(rows) >= _LEAST_ROWS:

@@ -56,16 +56,21 @@ def diagnose_system(
     source, notes
         Name of the table, and notes on it for the report.
     thorough
-        Function that computes the evidence of the leading hypotheses a second time, such as `weigh_thoroughly`.
+        As in `diagnose`.
     rng
         Source of randomness.
     progress
         Called with each stage, and with the number of calls of `simulate`.
 
+    Returns
+    -------
+    Diagnosis
+        As that of `diagnose`.
+
     Raises
     ------
     ParameterError
-        If the table lacks a column that the simulator names.
+        If the table lacks a column that the simulator names or any reading, or time falls within a run.
     NotConvergedError
         If the fit of the simulator did not converge.
     """
@@ -91,8 +96,7 @@ def _finer_step_for_repair(diagnosis: Diagnosis) -> float | None:
     """Return the finer integration step that the repaired law needs, or the finest within reach.
 
     None if the step used was fine enough, or the simulator has no law, or the repair no effects. The step was chosen
-    for the residuals of the law without effects. The repair may leave residuals so small that the integration error
-    would dominate them.
+    for the larger residuals of the law without effects.
     """
     system = cast(SimulatorApparatus, diagnosis.apparatus).system
     model, table = diagnosis.repaired, cast(RunTable, diagnosis.recording.plan)
@@ -117,7 +121,7 @@ def prepare_system(
     progress: Progress = silent,
     with_effects: bool = True,
 ) -> Prepared:
-    """Fit the simulator, and build what the engine needs; effects are scaled to the fit, none unless `with_effects`."""
+    """Fit the simulator, and build the engine's input; effects are scaled to the fit, none unless `with_effects`."""
     recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
     plan, recording = recording.plan, without_unpredictable_readings(system, recording)
@@ -143,8 +147,8 @@ def _progress_with_call_count(progress: Progress, system: System) -> Progress:
 def without_unpredictable_readings(system: System, recording: RunRecording) -> RunRecording:
     """Leave out, with a note, the readings of rows in which a missing column makes a prediction impossible.
 
-    If there is such a row, what columns lack is interpolated from the other rows of the run, so that effects with a
-    memory, such as backlash, are defined in the rows after it.
+    If there is such a row, missing values of all columns are interpolated from the other rows of the run, so that
+    effects with a memory, such as backlash, are defined in later rows.
 
     Raises
     ------
@@ -205,10 +209,7 @@ def without_readings_at_stop(
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return notes on a simulator's calls: a search cut short, calls that failed, parameters not taken as arrays.
-
-    () for the diagnosis of a light sensor.
-    """
+    """Return notes on a simulator's calls: search cut short, failed calls, parameters not taken as arrays; else ()."""
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
@@ -240,9 +241,9 @@ def _notes_on_integration(tally: IntegrationTally) -> Iterator[str]:
 
 
 def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
-    """Return a table with its predicted column as readings, of which about 2,400 are used, in stretches of six.
+    """Convert a table to a recording whose readings are the predicted column.
 
-    The simulator still predicts every row.
+    Of more than 2,400 readings, about that many are used, in stretches of six; the simulator still predicts every row.
 
     Raises
     ------
@@ -301,12 +302,11 @@ def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -
 
 
 def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatArray]:
-    """Return starts of a fit, (n_params,) each: the best fits to the beginning of every run.
+    """Return starts of a fit, (n_params,) each: the best three fits to the beginning of every run.
 
-    That is up to half of the longest run's duration, from fits up to a quarter of it. There are none without a time, or
-    if a prediction is costly.
-    For an oscillating system the objective has a local minimum for every period by which a run can be wrong; over the
-    first quarter of a run there are few.
+    A quarter of the longest run's duration is fitted first, then half of it. There are no starts without a time, with
+    too few readings, or if predictions are costly. For an oscillating system the objective has a local minimum for
+    every period by which a run can be wrong; over the first quarter of a run there are few.
     """
     system, table = cast(System, model.sensor), cast(RunTable, recording.plan)
     if not (system.predicts_in_bulk and table.has_varying_time):

@@ -42,7 +42,7 @@ _MOST_PARAMETERS = 24  # beyond them it would take more
 
 @dataclass(frozen=True)
 class Evidence:
-    """Log evidence in nats and its standard error, 0 if unknown; the method, and why it is not nested sampling."""
+    """Log evidence in nats, its standard error, 0 if unknown, the method, and why it is not nested sampling ("")."""
 
     log_z: float
     error: float
@@ -79,7 +79,7 @@ class SystemFit(ShowsItself):
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals."""
+        """Root mean square of the residuals, in the unit of the readings."""
         return float(np.sqrt(np.nanmean(self.residuals**2)))
 
     def summary(self) -> str:
@@ -122,14 +122,14 @@ def fit_simulator(
     Returns
     -------
     SystemFit
-        Evidence and posterior, by nested sampling if `simulate` takes all samples at once, or there is a law, and if
-        the run ends before 60 million readings have been predicted; otherwise by the Laplace approximation, with the
-        reason.
+        Evidence and posterior, by nested sampling if `simulate` takes all samples at once, or there is a law, with at
+        most 24 parameters, and if the run ends without warning before 60 million readings (30 million of a law) have
+        been predicted; otherwise by the Laplace approximation, with the reason.
 
     Raises
     ------
     ParameterError
-        If the table lacks a column that the simulator names, or has too few readings.
+        If the table lacks a column that the simulator names, or has too few readings, or all are equal.
     NotConvergedError
         If the fit did not converge.
     """

@@ -52,7 +52,7 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
 def recorded_table_if_needed(about: ReferenceFit, model: ModelSamples) -> StoredFit | None:
     """Return the recorded table with the first fit's predictions if a model's file needs them, else None.
 
-    It does if the model has effects, whose scales that fit set, or if a column holds the noise sds.
+    A file needs them if the model has effects, whose scales the first fit set, or if a column holds the noise sds.
     """
     return extract_stored_fit(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
 
@@ -71,7 +71,7 @@ def fitted_system_from_samples(
     predicted
         Prediction for every row, (n_points,).
     known
-        From `recorded_table_if_needed`.
+        The recorded table, if the file needs it (`recorded_table_if_needed`).
     """
     level = predicted[recording.usable]
     return FittedSystem(

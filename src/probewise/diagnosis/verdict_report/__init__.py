@@ -1,1 +1,1 @@
-"""The result of a diagnosis (`Diagnosis`), the verdict in one sentence, and diagnosis.json."""
+"""The result of a diagnosis (`Diagnosis`), the verdict in words, and diagnosis.json."""

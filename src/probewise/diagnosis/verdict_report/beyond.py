@@ -22,8 +22,8 @@ _N_DRAWS = 199
 class Remainder:
     """A significant misfit that remains after all named effects.
 
-    `p_value`: of the global test of the repaired model; `share_of_gain`: the misfit's share of the total gain in log
-    evidence over the null; `where`: the covariate in which it is most significant, or None.
+    `p_value`: of the global test of the repaired model; `share_of_gain`: the share of the total gain in log evidence
+    that an unknown effect would add; `where`: the covariate in which the misfit is most significant, or None.
     """
 
     p_value: float
@@ -34,7 +34,7 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula proposed for an unknown effect, and what it gains over the null.
+    """A formula proposed for an unknown effect, and its gain over the null.
 
     The `expression` is added to the reading (`side` "reading") or to the rate of the state `target` ("rate").
     `log_evidence` is the gain in nats, `heldout_log_density_per_reading` that in nats per held-out reading.
@@ -49,7 +49,7 @@ class Formula:
 
 
 def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: np.random.Generator) -> Remainder | None:
-    """Return the misfit that remains after the repair; None if nothing is named, or no misfit is significant."""
+    """Return the misfit that remains, with p below .01, after a repair by effects; None if there is neither."""
     p_value, names = best.improvement.p_value_after, best.fit.names
     if judged.verdict not in ("named", "cannot_tell") or not names or p_value >= ALARM:
         return None

@@ -1,4 +1,4 @@
-"""The result of a diagnosis: verdict, probabilities, places, repair, next measurement."""
+"""The result of a diagnosis: verdict, probabilities, ranges of covariates, repair, next measurement."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ _MOVED = {
 class VerdictReport:
     """The verdict in words and numbers: reason, effects, noise, log evidences, and what named effects do not explain.
 
-    Log evidences are by Laplace's approximation and by nested sampling. `remainder` and `formula` are None if there is
-    none.
+    `weighings` are log evidences by Laplace's approximation and by nested sampling, if they were computed. `remainder`
+    (a misfit after the repair) and `formula` are None if there is none.
     """
 
     reason: str
@@ -73,7 +73,7 @@ class Diagnosis(ShowsItself):
     repair
         The calibrated and the repaired model, and the gain.
     where
-        Places of the repair's effects, largest first, then of other significant residuals.
+        Places (ranges of covariates) of the repair's effects, largest first, then of other significant residuals.
     next_measurement
         The next measurement to make; None if none would be informative.
     report
@@ -97,7 +97,7 @@ class Diagnosis(ShowsItself):
 
     @property
     def reason(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict and its reason, in a sentence or two."""
         return self.report.reason
 
     @property
@@ -107,17 +107,17 @@ class Diagnosis(ShowsItself):
 
     @property
     def combination(self) -> tuple[str, ...]:
-        """Most probable set of effects; () if clean, ("unknown",) if unknown."""
+        """Most probable set of effects; () if clean or none is named, ("unknown",) if unknown."""
         return self.judged.combination
 
     @property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """All hypotheses, most probable first."""
+        """All hypotheses (sets of effects) with their probabilities, most probable first."""
         return self.judged.hypotheses
 
     @property
     def effects(self) -> tuple[EffectFound, ...]:
-        """The effects of probability above 0.001, most probable first."""
+        """Findings on the effects of probability above 0.001, most probable first."""
         return self.report.effects
 
     @property
@@ -132,12 +132,12 @@ class Diagnosis(ShowsItself):
 
     @property
     def repaired(self) -> ModelSamples:
-        """Posterior samples of the repaired model."""
+        """Posterior samples of the repaired model, with its effects."""
         return self.repair.model
 
     @property
     def unstated_effects(self) -> tuple[tuple[str, float, str], ...]:
-        """Effects in the repaired model that are not among `effects`: name, share of the samples, sentence."""
+        """Effects in the repaired model that are not in `effects`: name, share of the samples with it, sentence."""
         return self.repair.unstated_effects({effect.name for effect in self.effects})
 
     carried = unstated_effects
@@ -188,7 +188,6 @@ class Diagnosis(ShowsItself):
 
 
 def _p_value_in_words(p_value: float) -> str:
-    """Write a p-value with its meaning."""
     return f"{p_in_words(p_value)} (probability of readings at least this odd if nothing is missing from the mean)"
 
 

@@ -26,8 +26,7 @@ def diagnosis_schema() -> dict[str, Any]:
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Convert a diagnosis to the content of diagnosis.json, as strict JSON allows.
 
-    The figures of places (`where`) and the next plan are given by file name, and written by the report and the command
-    line.
+    Figures of places (`where`) and the next plan are given by file name; the report and the command line write them.
     """
     require_diagnosis(diagnosis)
     gain, plan = diagnosis.improvement, diagnosis.next_measurement

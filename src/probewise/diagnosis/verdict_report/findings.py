@@ -42,7 +42,10 @@ class ParameterFound:
 
 @dataclass(frozen=True)
 class EffectFound:
-    """One effect: probability, size (lambda), sentence, parameters, and the scans to which it is bound."""
+    """One effect: probability in any hypothesis, size, sentence, parameters, and the scans to which it is bound.
+
+    `size_lambda` is the norm of the effect's change of the readings in noise sds, after a refit of all else.
+    """
 
     name: str
     probability: float
@@ -54,7 +57,7 @@ class EffectFound:
 
 @dataclass(frozen=True)
 class NoiseFound:
-    """The noise `model` ("white", or effects joined by "+"), the p-value of its test, and its parameters."""
+    """The noise `model` ("white", or effects joined by "+"), the p-value of deviations from it, and its parameters."""
 
     model: str
     p_value: float
@@ -79,7 +82,7 @@ def effects_found(
         All hypotheses with their probabilities.
     best, samples
         The repair and its posterior samples, which give size and parameters of its effects; those of other effects are
-        from the most probable fit that contains them.
+        from the most probable fit that contains them or, if there is none, from the linearised null.
     rng
         Source of randomness.
     """
@@ -118,7 +121,7 @@ def effects_found(
 
 
 def _likeliest_candidate_with(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
-    """Return the most probable refitted candidate that contains an effect, and its noise model; None, () if none."""
+    """Return the most probable refit that contains an effect, and its noise effects; None, () if there is none."""
     ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
     for (mean, noise), p in ranked:
         if p > 0 and name in (*mean, *noise):
@@ -135,7 +138,7 @@ def _samples_of_insignificant(
 
     Returns
     -------
-    The middle one of its variants, the samples, (N_SAMPLES, n_params), and its lambda at the best amplitudes.
+    The middle one of its variants (discrete choices), the samples, (N_SAMPLES, n_params), and lambda at the best.
     """
     null, misfit_templates = searched.null, searched.misfit_templates
     best = max(null.evidence.values(), key=lambda e: e.log_z)
@@ -163,8 +166,8 @@ def _samples_of_insignificant(
 def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
     """Return an effect's lambda: the residual norm, in noise sds, of a refit without it to noise-free readings.
 
-    Of an effect on the noise it is the size of an effect on the mean with equal evidence; of rounding, or of a noise
-    effect that also changes the mean, the norm of the change, in noise sds.
+    An effect on the noise has the lambda of an effect on the mean with equal evidence; rounding, and a noise effect
+    that also changes the mean, the norm of the change in noise sds.
     """
     law = holder.evidence[noise].likeliest_law
     found, prepared = holder.found, searched.prepared
@@ -191,9 +194,9 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
 
 
 def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
-    """Describe the noise of the repaired model, and test its residuals for what the noise model lacks.
+    """Describe the noise of the repaired model, and test its residuals for deviations from this noise.
 
-    That is autocorrelation, heavy tails, or a spread that depends on the level.
+    Deviations are autocorrelation, heavy tails, or a spread that depends on the level.
     """
     prepared, after = searched.prepared, best.problem
     steps, before = n_rows_since_previous_usable(prepared.recording), previous_usable(prepared.recording)
@@ -211,10 +214,7 @@ def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, 
 
 
 def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
-    """Summarise samples of an effect's parameters, (n_samples, n_params), fixed ones left out.
-
-    `unit` is that of a reading.
-    """
+    """Summarise an effect's parameter samples, (n_samples, n_params), without fixed ones; `unit` is a reading's."""
     fixed = getattr(effect, "fixed", ())
     return tuple(
         _parameter_found(name, substitute_reading_unit(own, unit), values[:, k])
@@ -224,7 +224,7 @@ def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) ->
 
 
 def _scan_numbers_found(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
-    """Return a parameter `scans`: the numbers, from 0, of the scans to which an effect is bound; () if it is not."""
+    """Return one parameter `scans`, of the numbers, from 0, of the scans to which an effect is bound, if any."""
     numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
     return (_parameter_found("scans", "scan", numbers),) if numbers.size else ()
 

@@ -1,4 +1,4 @@
-"""The verdict in one sentence."""
+"""The verdict and its reason in words."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WORTH_NAMING = 0.01  # least probability of a third rival
 
 @dataclass(frozen=True)
 class Grounds:
-    """The facts for the sentence that gives the reason, in addition to the verdict.
+    """The facts, in addition to the verdict, for the sentence that gives its reason.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ class Grounds:
     like
         Sentences on the effects that the unknown one resembles.
     family
-        The most probable family of bases of the unknown effect.
+        The most probable family of bases of the unknown effect, such as "time".
     beside
-        Named effects beside the unknown one.
+        Effects that act in addition to the unknown one.
     shows_in
-        Names of covariates in which residuals are significant, strongest first.
+        Names of the covariates in which effects and residuals are located, in the order of `Diagnosis.where`.
     p_value_after
         p-value of the global test of the repaired model.
     settles
@@ -60,7 +60,7 @@ class Grounds:
 
 
 def reason_of(judged: Judged, grounds: Grounds) -> str:
-    """Return the sentence that states the verdict and its reason."""
+    """Return the verdict and its reason, in one sentence or two."""
     if judged.too_little:
         return _too_little_sentence(grounds)
     if judged.withdrawn:
@@ -139,5 +139,5 @@ def _joined_effect_sentences(judged: Judged, grounds: Grounds) -> str:
 
 
 def _is_users_own_name(word: str, names: Iterable[str]) -> bool:
-    """Return whether a word is a user's own, with an underscore or in an effect's name, and so not capitalised."""
+    """Return whether a word is a user's own name, which is not capitalised."""
     return "_" in word or any(word in name.split(":")[1:] for name in names)

@@ -28,14 +28,11 @@ class Budget:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
     def minus(self, plan: Plan, after_s: float) -> Budget:
-        """Return the budget without the cost of a plan, 0 at least; minutes count from `after_s` to the plan's end."""
+        """Return the budget without the cost of a plan, at least 0; minutes count from time `after_s` to its end."""
         return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes_of_plan(plan, after_s), 0.0))
 
     def affordable_scans(self, plan: Plan, after_s: float) -> Plan | None:
-        """Return the plan's first scans that fit the budget; None if not even one does.
-
-        Minutes count from `after_s`.
-        """
+        """Return the plan's first scans that fit the budget, in minutes from the time `after_s`; None if none does."""
         kept = np.zeros(0, dtype=np.int64)
         for rows in plan.rows_by_scan():
             more = np.concatenate([kept, rows])

@@ -1,8 +1,8 @@
 """The folder of an investigation: the plan and the readings of each round, written as they arrive.
 
 `settings.json` holds the settings, `1_plan.csv` the plan of the first round, `1.csv` its readings. An interrupted round
-resumes after its last reading. A plan that has been written is used as it is, even if another machine's arithmetic
-would advise other readings.
+resumes after its last reading. A plan that has been written is used as it is, even if other readings would be advised
+now.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class RoundsFolder:
     Raises
     ------
     FileError
-        If the folder holds an investigation and `resume` is not asked for, or one with other settings, or none and
-        `resume` is asked for.
+        If the folder holds an investigation and `resume` is False, or holds none, or one with other settings, and
+        `resume` is True.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
@@ -68,7 +68,7 @@ class RoundsFolder:
     def record_round(
         self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent
     ) -> Recording:
-        """Take the readings of a round, or those still missing, write them to the folder, and return them.
+        """Take the readings of a round, or those still missing, write them to the folder, and return all of them.
 
         A plan of the round that is in the folder already is used in place of `plan`; `asked` is the plan in words.
         """
@@ -100,7 +100,7 @@ class RoundsFolder:
 
     @property
     def n_readings(self) -> int:
-        """Number of readings in the folder."""
+        """Number of readings in the folder, of all rounds."""
         return sum(len(recording) for recording in self._recordings_of_rounds())
 
     @property

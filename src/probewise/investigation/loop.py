@@ -37,7 +37,7 @@ def investigate(
     """Yield rounds of an investigation until an explanation is settled, no reading would help, or the budget is spent.
 
     A round, a recording and its diagnosis, is carried out only when it is asked for. An explanation is settled if it
-    has probability 0.95 and the verdict is not `cannot_tell`. All ends after `rounds` rounds.
+    has probability 0.95 and the verdict is not `cannot_tell`. There are at most `rounds` rounds.
 
     Parameters
     ----------

@@ -23,13 +23,13 @@ class Round:
     recording
         Recording of this round.
     reason_for_readings
-        Reason for these readings, in words.
+        The plan of this round in words.
     diagnosis
         Diagnosis of this and all earlier readings.
     stop_reason
         Reason why the investigation ends here; None: it continues.
     settled
-        Whether it ends because one hypothesis has probability `SURE`.
+        Whether it ends because one hypothesis has probability 0.95 or more.
     """
 
     number: int
@@ -51,7 +51,7 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Investigation(ShowsItself):
-    """All rounds of an investigation."""
+    """All rounds of an investigation, in order."""
 
     rounds: tuple[Round, ...]
 
@@ -80,7 +80,7 @@ class Investigation(ShowsItself):
 
 
 def reason_if_settled(diagnosis: Diagnosis) -> str | None:
-    """Return a sentence on the leading hypothesis if its probability is `SURE` or more; else None.
+    """Return a sentence on the leading hypothesis if its probability is 0.95 or more; else None.
 
     None also for the verdict cannot_tell: aliased effects are not settled.
     """

@@ -21,7 +21,10 @@ _LARGEST = 1e9  # largest magnitude of a parameter of an effect
 
 @dataclass(frozen=True)
 class SimulatedRecorder:
-    """A `Take` function that simulates plans in a world; a round's noise follows from the seed and its number."""
+    """A `Take` function (for `RoundsFolder`) that simulates a round's plan in a world.
+
+    The noise of a round follows from the seed and the round's number.
+    """
 
     world: World
     seed: int
@@ -39,13 +42,12 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
     Raises
     ------
     ParameterError
-        If an effect is unknown or takes other values.
+        If an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
     """
     return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
 
 
 def _parse_one_effect(text: str) -> Concealed:
-    """Parse one effect, NAME:VALUE,VALUE."""
     name, _, numbers = text.partition(":")
     kinds = _effect_classes_with_numeric_parameters()
     if name not in kinds:
@@ -67,7 +69,6 @@ def _parse_one_effect(text: str) -> Concealed:
 
 
 def _effect_classes_with_numeric_parameters() -> dict[str, Any]:
-    """Return the classes of concealed effects whose parameters are all numbers, by name."""
     every: list[Any] = [getattr(concealed, name) for name in concealed.__all__]
     named = [kind for kind in every if isinstance(getattr(kind, "name", None), str)]
     of_numbers = [kind for kind in named if all(field.type == "float" for field in fields(kind))]

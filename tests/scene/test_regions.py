@@ -16,6 +16,7 @@ from probewise.scene import (
     StripesRegion,
     UniformRegion,
     disc_region,
+    edge_distance,
     outlines,
     region_of,
 )

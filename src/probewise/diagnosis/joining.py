@@ -60,8 +60,8 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
     """Concatenate plans, with the covariates of the first and commanded columns (LED, height) of all.
 
     Commanded columns are NaN (as at calibration) where a plan lacks them, unless it declares another height than the
-    first; other covariates keep their last known value. With `own_sessions`, or if any plan has sessions (numbers of the
-    recordings joined in it), they are numbered on, and a plan without sessions is one.
+    first; other covariates keep their last known value. With `own_sessions`, or if any plan has sessions (numbers of
+    the recordings joined in it), they are numbered on, and a plan without sessions is one.
     """
     first = plans[0]
     plans = [with_declared_height_commanded(plan, first.instrumentation.height_mm) for plan in plans]

@@ -219,8 +219,8 @@ class PlanAudit(ShowsItself):
 
 
 def count_with_noun(names: Sequence[str], noun: str) -> str:
-    """Write the number of names with a noun, in the plural unless it is one; "scan" is always in the plural."""
-    return f"{len(names)} {noun}{'' if len(names) == 1 and noun != 'scan' else 's'}"
+    """Write the number of names with a noun, in the plural unless it is one."""
+    return f"{len(names)} {noun}{'' if len(names) == 1 else 's'}"
 
 
 def _name_with_alias(effect: EffectAudit) -> str:

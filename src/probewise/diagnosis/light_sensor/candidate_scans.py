@@ -59,6 +59,8 @@ def excerpts_of_scan(
         rows = scan[::stride][:MOST_READINGS]
         if rows.size >= _LEAST_ROWS:
             words = _WORDS.get(stride, f" (every {stride}th reading, {stride} times as fast)")
+            if len(scan[::stride]) > MOST_READINGS:
+                words += f", {MOST_READINGS} readings from its start"
             out.append(Excerpt("" if stride == 1 else f"_{stride}", words, rows, stride))
     if level is not None and scan.size > _NEAR:
         change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(level)))])

@@ -1,8 +1,8 @@
-"""Nested sampling: the evidence of a problem and samples of its posterior.
+"""Nested sampling: the evidence of a problem (a prior and a log likelihood) and samples of its posterior.
 
-The paper's section "The Machine Learning System" (50 samples, diversified by about 1000
-Metropolis-Hastings steps) and its section on estimating the SSF's parameters (the evidence Z and
-the stopping rule on consecutive values of log Z).
+After the paper's sections "The Machine Learning System" (50 posterior samples, made distinct by about 1000
+Metropolis-Hastings steps) and on estimating the parameters of the spatial sensitivity function (the evidence Z; stop
+when successive values of log Z agree).
 """
 
 from probewise.nested.dead_points import DeadPoints

@@ -1,9 +1,9 @@
-"""Climb to the top of a peak, such as that on which the last live points of a run are.
+"""Climb to the top of a likelihood peak, for instance from the last live points of a run.
 
-Every generation is drawn from a normal distribution. The best quarter of it gives the mean of the next one, and its
-scatter about the old mean the covariance (as in CMA-ES, Hansen & Ostermeier 2001): the distribution stretches along a
-direction in which the likelihood keeps rising and narrows along the others. So it follows the arm of a heavy tail, a
-hundred times as long as wide, to the middle in some thousand evaluations and without chains.
+As in CMA-ES (Hansen & Ostermeier 2001), every generation is drawn from a normal distribution. The mean of its best
+quarter becomes the next mean, and their scatter about the old mean updates the covariance. The distribution so
+stretches along a direction in which the likelihood keeps rising: the arm of a heavy tail, a hundred times as long as
+wide, is climbed in some thousand evaluations.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _AS_DRAWN = 0.2  # nats between the best draws of the distribution that is retur
 
 @dataclass(frozen=True, eq=False)
 class GaussianAtPeak:
-    """A normal distribution at a peak of the likelihood, and the `highest` point known there: start or end of a climb.
+    """A normal distribution at a peak of the likelihood: start or end of a climb.
 
-    `centre` is its mean, (n_params,), and `root` a root of its covariance, (n_params, n_params), in the sampling
-    coordinates. At a rounded top that `climb_to_top` has found, the best quarter of draws lies within 0.2 nats.
-    `met`: the highest point met on the climb, maybe on another peak; None before one.
+    `centre` is its mean, (n_params,), and `root` @ `root`.T its covariance, (n_params, n_params), in the sampling
+    coordinates; `climb_to_top` scales it so that the best quarter of draws spans 0.2 nats. `highest`: best point of the
+    last generation, or live point; `met`: best point of the whole climb, maybe on another peak; None before a climb.
     """
 
     highest: Points
@@ -52,8 +52,8 @@ def climb_to_top(
 ) -> GaussianAtPeak:
     """Climb from a normal distribution to the top of a peak; return the distribution about the top.
 
-    It ends where the best draws are level, or before it would exceed `max_calls` evaluations, which `evaluate` counts.
-    Only draws above the log likelihood `known` are followed: those below it may belong to another peak.
+    The climb ends when the best draws differ by less than 0.02 nats, after 80 generations, or before `max_calls`
+    evaluations would be exceeded. Draws below the log likelihood `known` are ignored: they may belong to another peak.
     """
     highest, centre, covariance = start.highest, start.centre, start.root @ start.root.T
     met = highest
@@ -82,7 +82,7 @@ def climb_to_top(
 
 
 def gaussian_of_last_live_points(run: NestedResult, evaluate: Evaluator) -> GaussianAtPeak:
-    """Return the start of a climb: mean and covariance of a run's last live points, and the highest of them."""
+    """Return the mean and covariance of a run's last live points, with the highest of them, to start a climb."""
     last = slice(-run.n_live, None)
     live = evaluate.points_from_known_values(run.theta[last], run.log_likelihood[last], run.label[last])
     return GaussianAtPeak(

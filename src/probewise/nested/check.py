@@ -1,15 +1,13 @@
 """Check a run's evidence by a second, independent estimate, and repeat the run where the two disagree.
 
-A run can be biased without any sign of it: chains that are too short bias every shell a little, always in the same
-direction. Then log Z drifts with every nat, while the insertion ranks and the scatter between seeds look right.
-The second estimate uses chains twice as long and has few nats of compression: it is a run from a prior near the
-posterior that the first run found (`repartition`). Where the posterior fills so much of the prior that this saves
-nothing, a small run of the same problem is used. The jump distance of the chains, in units of the live points' spread,
-is no substitute: it is smallest for many modes or a thin shell, where the evidence is right.
+Chains that are too short bias every shell a little, always in the same direction, so the bias of log Z grows with the
+compression. The insertion ranks and the scatter between seeds do not show this bias. The second estimate uses chains
+twice as long and compresses by few nats: it runs from a prior near the posterior of the first run (`repartition`).
+Where the posterior fills so much of the prior that this saves nothing, it is a small run of the same problem.
 
-Neither estimate sees a narrow peak that begins above where both end, or a part of the posterior without live points,
-both of which `missed_hills` looks for. Where a part without live points holds evidence that matters, the run is
-repeated with hops between the parts that are then known.
+Two things escape both estimates: a narrow peak whose likelihood exceeds the rest only where both have ended, and a part
+of the posterior without live points. `missed_hills` looks for both. Where a part without live points would raise log Z
+noticeably, the run is repeated with moves that hop between the known parts.
 """
 
 from __future__ import annotations
@@ -62,9 +60,9 @@ class SingleRunFunction(Protocol):
 class _EvidenceRoute:
     """A way to estimate the evidence again: a problem of the same evidence, the number of live points and the chains.
 
-    Before each chain there are hops between `modes`, where they are given.
-    It takes at most `most_calls` evaluations. Where the mean of its log likelihood over the posterior is not
-    `expected` to within `_SAME_MEAN`, it has found another posterior than the run and is no estimate.
+    `name`: for messages. `modes`: clusters between which a point may hop before its chain; None for no hops.
+    `most_calls`: limit of evaluations. `expected`: mean log likelihood over the posterior, nats, that a valid estimate
+    has to within `_SAME_MEAN`; None for no such test.
     """
 
     problem: Samplable
@@ -77,11 +75,10 @@ class _EvidenceRoute:
 
     @property
     def move(self) -> Move:
-        """The chains, after hops where there are `modes`."""
         return self.chain if self.modes is None else HoppingMove(self.chain, self.modes)
 
     def has_expected_mean_likelihood(self, found: NestedResult) -> bool:
-        """Return whether a run of this route has the expected mean log likelihood, its information plus log Z.
+        """Return whether a run has the expected posterior mean of its log likelihood (information plus log Z).
 
         True where the route expects none.
         """
@@ -96,7 +93,7 @@ class _EvidenceRoute:
 
 @dataclass
 class _CallBudget:
-    """The evaluations that a check may use, those of the first run included: `limit` in all, `spent` so far."""
+    """The likelihood evaluations of a check, the first run's included: at most `limit` in all, `spent` so far."""
 
     search: SingleRunFunction
     limit: float
@@ -105,11 +102,10 @@ class _CallBudget:
 
     @property
     def calls_left(self) -> int:
-        """Number of evaluations that may still be used."""
         return int(self.limit - self.spent)
 
     def run_route(self, route: _EvidenceRoute) -> NestedResult | None:
-        """Run nested sampling by a route; None if the budget or the route's limit does not suffice."""
+        """Run nested sampling by a route; None if the budget or the route's limit is too small for a complete run."""
         left = int(min(self.calls_left, route.most_calls))
         if left < route.least_calls_to_start:
             return None
@@ -122,7 +118,7 @@ class _CallBudget:
 class _SecondEstimate:
     """A second estimate of the evidence: one or two runs of a route.
 
-    `curved`: whether the clusters of the posterior failed to describe it, as about a curve.
+    `curved`: whether an estimate from clusters of the posterior failed before, as it does along a curved ridge.
     """
 
     route: _EvidenceRoute
@@ -131,28 +127,28 @@ class _SecondEstimate:
 
     @property
     def log_z_and_error(self) -> tuple[float, float]:
-        """Weighted mean of the runs' log Z and its error."""
+        """Weighted mean of the runs' log Z, and its standard error."""
         return weighted_mean_and_error([a.log_z for a in self.runs], [a.log_z_error for a in self.runs])
 
     @property
     def n_calls(self) -> int:
-        """Likelihood evaluations of its runs together."""
         return sum(each.n_calls for each in self.runs)
 
     def signed_distance_in_errors(self, run: NestedResult) -> float:
-        """Return a run's log Z minus this one, in combined standard errors; negative if it is below."""
+        """Return a run's log Z minus this estimate's, in combined standard errors."""
         log_z, error = self.log_z_and_error
         return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
     def disagrees_or_is_doubtful(self, run: NestedResult, most: float) -> bool:
-        """Return whether a run is more than `most` errors away, or this estimate is itself doubtful."""
+        """Return whether a run is more than `most` errors away, or the last run of this estimate has warnings."""
         return abs(self.signed_distance_in_errors(run)) > most or bool(self.runs[-1].warnings)
 
     def misses_part_of_curved_posterior(self, first: NestedResult, longer: NestedResult) -> bool:
-        """Return whether this estimate is too low: the posterior is curved, and two runs that agree lie above it.
+        """Return whether this estimate lies below two runs that agree with each other, of a curved posterior.
 
-        Along a curve the prior of a second pass is thin where the posterior is not, so it can miss a part. Chains of
-        `longer` are twice as long: if those of `first` were too short, the two would differ.
+        Along a curve the prior of a second pass can be thin where the posterior is not, so it misses a part. The chains
+        of run `longer` are twice as long as those of `first`: if `first` were biased by short chains, the two would
+        differ.
         """
         below = min(self.signed_distance_in_errors(run) for run in (first, longer))
         alike = abs(_SecondEstimate(self.route, (longer,), self.curved).signed_distance_in_errors(first)) < _ALIKE
@@ -170,30 +166,15 @@ def check_and_repeat(
     least_live: int,
     rng: np.random.Generator,
 ) -> NestedResult:
-    """Check a run, and repeat it with longer chains where the second estimate disagrees.
+    """Check a run that its stopping rule ended; repeat it with longer chains where the second estimate disagrees.
 
-    Parameters
-    ----------
-    first
-        The run, ended by its stopping rule.
-    problem, move
-        Its problem and its move.
-    search
-        Runs nested sampling once, without a check.
-    max_cost
-        Limit on all evaluations, in units of the first run's.
-    max_calls
-        Limit on all evaluations, or None.
-    least_live
-        Fewest live points allowed for the problem.
-    rng
-        Source of randomness.
+    `search` runs nested sampling once, without a check. Limits on all evaluations, those of `first` included:
+    `max_cost` times those of `first`, and `max_calls`, if not None. `least_live`: fewest live points allowed for the
+    problem.
 
-    Returns
-    -------
-    NestedResult
-        The first run, or one with longer chains if only that agrees with the second estimate. `check` holds the second
-        estimate. A warning is added if the two still disagree, or if the second does not end within the limits.
+    Return the first run, or a repetition: with hops between modes where `first` lost one, or with longer chains if only
+    that agrees with the second estimate. `check` holds the second estimate; None if it failed or did not end, which
+    adds a warning. A warning is also added if the two still disagree. `n_calls` counts all evaluations.
     """
     limit = max_cost * first.n_calls if max_calls is None else min(max_cost * first.n_calls, max_calls)
     budget = _CallBudget(search, limit, first.n_calls, rng)
@@ -239,7 +220,7 @@ def check_and_repeat(
 def _clusters_of_met_and_lost_modes(
     first: NestedResult, lost: Iterable[HillEstimate], problem: Samplable, rng: np.random.Generator
 ) -> Clusters:
-    """Return the clusters of a run's posterior and the modes it lost, in the sampling coordinates."""
+    """Return the clusters of a run's posterior samples, followed by the modes it lost, in the sampling coordinates."""
     space = space_of(problem.prior, getattr(problem, "periodic", ()))
     met = split_into_clusters(space.enter(first.samples(_N_SAMPLES, rng=rng)))
     return Clusters.from_groups([*met, *(space.enter(hill.theta) for hill in lost)])
@@ -248,9 +229,9 @@ def _clusters_of_met_and_lost_modes(
 def _route_and_second_estimate(
     now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _CallBudget
 ) -> tuple[_EvidenceRoute, _SecondEstimate | None]:
-    """Estimate the evidence by the first route that is confirmed, else by the last.
+    """Estimate the evidence by each route in turn until one has the expected mean log likelihood.
 
-    Returns that route and the estimate; None for the estimate if the route did not end.
+    Return the last route tried and its estimate; None for the estimate if its run did not end.
     """
     curved, second = False, None
     for route in _routes_to_second_estimate(now, problem, move, least_live, budget.rng):
@@ -265,9 +246,10 @@ def _route_and_second_estimate(
 def _second_estimate_with_more_live_points(
     second: _SecondEstimate, now: NestedResult, first: NestedResult, budget: _CallBudget
 ) -> _SecondEstimate:
-    """Add a run with more live points, at most as many as the first run has, to a second estimate.
+    """Repeat a second estimate with more live points, at most as many as `now` has, and combine the two runs.
 
-    It replaces a run that was doubtful. If the budget does not allow it, the estimate is returned as it was.
+    Where the first run of the estimate has warnings, the new one replaces it. If the budget does not allow more live
+    points, the estimate is returned as it was.
     """
     route, left, again_costs = second.route, budget.calls_left, _AGAIN * first.n_calls
     room = left - again_costs if left > again_costs else left
@@ -283,9 +265,9 @@ def _second_estimate_with_more_live_points(
 def _choose_agreeing_run_and_estimate(
     second: _SecondEstimate, now: NestedResult, again: NestedResult | None
 ) -> tuple[NestedResult, _SecondEstimate]:
-    """Return the run and the second estimate that agree, given a repetition of the run with longer chains.
+    """Return `again`, a run with longer chains, where it agrees with the second estimate, else `now`; and the estimate.
 
-    If none do, or there is no repetition without warnings, return them as they were.
+    Where the estimate missed a part of a curved posterior, `now` becomes the second estimate of `again`.
     """
     if again is None or again.warnings:
         return now, second
@@ -341,14 +323,14 @@ def _repartitioned_if_possible(problem: Samplable, theta: FloatArray, *, cluster
 
 
 def _information_of_second_pass(first: NestedResult, near: Repartitioned) -> float:
-    """Return the information of a second pass, nats: the mean of its log likelihood over the posterior, less log Z."""
+    """Return the nats by which a run from the prior `near` would compress, estimated from the first run's posterior."""
     possible = first.log_weight > -math.inf
     log_prior_ratio = near.prior.log_prior_ratio(first.theta[possible])
     return float(first.weight[possible] @ (first.log_likelihood[possible] + log_prior_ratio)) - first.log_z
 
 
 def _slice_move_of_longer_chains(move: Move) -> SliceMove:
-    """Double the length of the chains, to twice the default at least; other moves are replaced by slice sampling."""
+    """Double the chains' length, to twice the default at least; any other move is replaced by slice sampling."""
     least = SliceMove().with_twice_the_steps()
     if not isinstance(move, SliceMove):
         return least
@@ -367,7 +349,10 @@ def weighted_mean_and_error(log_z: Sequence[float], log_z_error: Sequence[float]
 
 
 def _with_check_stored(now: NestedResult, second: _SecondEstimate, n_check: int) -> NestedResult:
-    """Store the check in the result, with a warning where the estimates disagree."""
+    """Store the check in the result, with a warning where the estimates disagree or the second one has warnings.
+
+    If they agree, drop the warnings on few possible draws and on few lineages that the check has settled.
+    """
     (log_z, error), distance, name = second.log_z_and_error, second.signed_distance_in_errors(now), second.route.name
     warnings = now.warnings
     if abs(distance) > DISAGREE:

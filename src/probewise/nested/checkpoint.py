@@ -32,8 +32,8 @@ _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
 class BirthRecords:
     """How points were born; all arrays are (n,).
 
-    `log_birth`, `birth_label`: the bound above which each was drawn. `ident`: its number in order of birth; `parent`:
-    the number of the point at which its chain began, -1 for none.
+    `log_birth`, `birth_label`: log likelihood and label of the bound above which each was drawn. `ident`: its number in
+    order of birth; `parent`: `ident` of the point at which its chain began, -1 for a draw from the prior.
     """
 
     log_birth: FloatArray
@@ -47,7 +47,7 @@ class BirthRecords:
         return cls(np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
 
     def take_rows(self, rows: IntArray) -> BirthRecords:
-        """Select rows."""
+        """Select records by row number."""
         return BirthRecords(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
@@ -58,7 +58,7 @@ class BirthRecords:
 
 @dataclass(frozen=True, eq=False)
 class LivePoints:
-    """The live points and the log of the prior volume they fill."""
+    """The live points, their birth records, and the log of the prior volume that they fill."""
 
     points: Points
     births: BirthRecords
@@ -67,10 +67,10 @@ class LivePoints:
 
 @dataclass(frozen=True, eq=False)
 class DeadPointsOfRound:
-    """The points that one round removed, worst first, and the insertion ranks of their successors.
+    """The points that one round removed, worst first, and the insertion ranks of the points that replaced them.
 
-    `n_at_death`: number of points alive when each died, itself included. `rank`: how many of the
-    `n_ranked` points alive at a successor's insertion were worse than it.
+    `n_at_death`: number of points alive when each died, itself included. `rank`: how many of the `n_ranked` points
+    alive at the insertion of each new point were worse than it. All arrays are (n_replaced,).
     """
 
     points: Points
@@ -84,9 +84,10 @@ class DeadPointsOfRound:
 class RunState:
     """The state of the sampler after a round: everything that the rest of the run depends on.
 
-    `log_start`, `log_start_error`: log of the share of the prior with nonzero likelihood. `best`: greatest log
-    likelihood of the live points; `log_z_over_best`: log evidence of the dead points, minus `best`. `n_stuck`: chains
-    that never left their start; `last_cost`: evaluations of the last round; `ended`: the stop reason, if it is over.
+    `moving`: the move as tuned so far. `log_start`, `log_start_error`: log of the share of the prior with nonzero
+    likelihood, and its error. `best`: greatest log likelihood of the live points; `log_z_over_best`: log evidence of
+    the dead points, minus `best`. `n_stuck`: chains that never left their start, so far; `last_cost`: evaluations of
+    the last round; `ended`: the stop reason, None while the run goes on.
     """
 
     live: LivePoints
@@ -107,7 +108,7 @@ class RunState:
 def settings_of_run(
     names: tuple[str, ...], n_live: int, n_replaced: int, move: Move, stop: StopRule, seed_state: str
 ) -> dict[str, object]:
-    """Describe the settings that a resumed run must share with the interrupted one.
+    """Return the settings that a resumed run must share with the interrupted one, by name.
 
     Raises
     ------
@@ -136,7 +137,7 @@ def _value_as_text(value: object) -> str:
 class CheckpointFile:
     """The checkpoint file of a run: the run's state is written to `path` atomically, and read to resume the run.
 
-    `every_s`: least seconds between savings; `settings`: what a resumed run must share, from `settings_of_run`.
+    `every_s`: least seconds between two writes, 0 for every round; `settings`: see `settings_of_run`.
     """
 
     path: Path
@@ -160,12 +161,12 @@ class CheckpointFile:
             ) from error
 
     def save_if_due(self, now: RunState) -> None:
-        """Save at most every `every_s` seconds and every ten times the saving time; always if `every_s` is 0."""
+        """Save once `every_s` and ten times the duration of the last saving have passed; always if `every_s` is 0."""
         if self.every_s == 0 or time.monotonic() - self._last_saving >= max(self.every_s, 10.0 * self._saving_time_s):
             self.save(now)
 
     def save(self, now: RunState) -> None:
-        """Write the file unless it holds this state already; a failure only warns, as the run itself is sound."""
+        """Write the file unless it holds this state already; a failure only issues NotSavedWarning."""
         if now is self._state_in_file:
             return
         begun = time.monotonic()
@@ -206,7 +207,7 @@ class CheckpointFile:
         Raises
         ------
         FileError
-            If the file is damaged or of another run.
+            If the file is damaged, or of a run with other settings, prior or likelihood.
         """
         if not self.path.exists():
             return None
@@ -240,7 +241,7 @@ class CheckpointFile:
         return now
 
     def _error_for_other_settings(self, settings: dict[str, object]) -> FileError:
-        """Report the first setting in which the file differs from this run."""
+        """Return the error that names the first setting in which the file differs from this run."""
         name = next(n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n))
         if name == "seed_state":
             return FileError(
@@ -312,7 +313,7 @@ def _run_state_from_file(head: dict[str, object], arrays: dict[str, np.ndarray],
 
 
 def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
-    """Compare up to rounding: a row's last digits depend on how many rows are computed with it."""
+    """Return whether two arrays agree to 1e-6 of `scale`: a row's last digits depend on the size of its batch."""
     with np.errstate(invalid="ignore"):  # inf - inf
         return a.shape == b.shape and bool(((a == b) | (np.abs(a - b) <= _ROUNDING * scale)).all())
 
@@ -323,14 +324,14 @@ def _shortened_text(value: object) -> str:
 
 
 def _numeric_fields_of_move(move: Move) -> dict[str, float]:
-    """Return the numeric fields of a move, which hold what it has tuned."""
+    """Return the numeric fields of a move by name: they hold its tuned values; ParameterError if it is no dataclass."""
     if not is_dataclass(move):
         raise ParameterError("move", move, "a dataclass, whose numbers a checkpoint can keep")
     return {f.name: v for f in fields(move) if isinstance(v := getattr(move, f.name), int | float)}
 
 
 def _move_with_numeric_fields(move: Move, numbers: object) -> Move:
-    """Return a move with the tuned fields of the checkpoint; an error if it has no such fields."""
+    """Return a move with the numeric fields of a checkpoint; ValueError or TypeError if it has no such fields."""
     if not is_dataclass(move) or not isinstance(numbers, dict):
         raise ValueError("the move cannot be restored")
     restored: Move = replace(move, **numbers)

@@ -16,8 +16,8 @@ _N_REFINEMENTS = 4
 class Clusters:
     """Clusters of points, by mean and covariance; `assign` divides all space between them.
 
-    `mean` (n_clusters, n_params); `root` the Cholesky factors of the covariances and `inverse_root`
-    their inverses, (n_clusters, n_params, n_params); `log_det` of the factors and `size` in points, (n_clusters,).
+    `mean` (n_clusters, n_params); `root`, the Cholesky factors of the covariances, and `inverse_root`, their inverses,
+    (n_clusters, n_params, n_params); `log_det` of each factor and `size`, the number of points, (n_clusters,).
     """
 
     mean: FloatArray
@@ -30,7 +30,7 @@ class Clusters:
         return len(self.mean)
 
     def assign(self, u: FloatArray) -> IntArray:
-        """Assign each point to the cluster with the greatest Gaussian density there, (n, n_params) -> (n,)."""
+        """Return for each point the index of the cluster of greatest Gaussian density there, (n, n_params) -> (n,)."""
         if len(self) == 1:
             return np.zeros(len(u), dtype=np.int64)
         z = (u[None, :, :] - self.mean[:, None, :]) @ self.inverse_root.transpose(0, 2, 1)
@@ -46,9 +46,9 @@ class Clusters:
         return Clusters(mean, root, inverse, log_det, np.array([len(g) for g in groups]))
 
     def map_with_log_volume_ratio(self, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Map points of clusters `home` to clusters `goal`, affinely; also return the log of the volume ratio.
+        """Map points of clusters `home` to clusters `goal` by the affine map between the Gaussians.
 
-        Points are (n, n_params), clusters (n,).
+        Points are (n, n_params), cluster indices (n,). Return the points and log(goal volume / home volume), (n,).
         """
         z = np.matmul(self.inverse_root[home], (u - self.mean[home])[:, :, None])
         moved = self.mean[goal] + np.matmul(self.root[goal], z)[:, :, 0]
@@ -60,18 +60,9 @@ class Clusters:
         return Clusters(*map(np.concatenate, pairs))
 
     def home_clusters_without_each_point(self, u: FloatArray, home: IntArray) -> Clusters:
-        """Compute for each point the cluster that it belongs to, without the point itself.
+        """Recompute for each point, (n, n_params), its cluster `home`, (n,), with the point itself left out.
 
-        Parameters
-        ----------
-        u
-            Points that belong to the clusters, (n, n_params).
-        home
-            The cluster of each, (n,).
-
-        Returns
-        -------
-        One cluster per point, in the points' order.
+        Return one cluster per point, in the points' order.
         """
         n = self.size[home][:, None]
         off = u - self.mean[home]
@@ -90,14 +81,13 @@ class Clusters:
 
 
 def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
-    """Split points, (n, n_params), recursively while two Gaussians explain them better than one.
+    """Split points, (n, n_params), recursively into at most 32 clusters while two Gaussians fit better than one.
 
-    No part of a split has fewer points than `least`, by default enough for its covariance.
+    `least`: fewest points of a cluster; by default 2 n_params + 2.
 
-    The gain in log likelihood must exceed the number of additional parameters (Akaike's criterion),
-    plus 10 nats against chance, plus 0.15 nats per point: halving a uniform box gains only noise, while two
-    equal modes 5 sd apart gain a quarter of a nat per point. A false split costs little: the moves are exact
-    however space is divided.
+    The gain in log likelihood must exceed the number of additional parameters (Akaike's criterion), plus 10 nats
+    against chance, plus 0.15 nats per point: halving a uniform box gains less, two equal modes 5 sd apart gain 0.25
+    nats per point. A false split costs little: the moves are exact however space is divided.
     """
     least = _least_points_of_cluster(points.shape[1]) if least is None else least
     queue, done = [points], list[FloatArray]()
@@ -118,7 +108,7 @@ def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
 
 
 def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArray] | None:
-    """Split points, (n, n_params), where two Gaussians explain them better than one by enough; None where not."""
+    """Return the two groups of points, (n, n_params), where two Gaussians fit better by enough; None where not."""
     n, n_params = points.shape
     if n < 2 * least:
         return None
@@ -172,5 +162,5 @@ def _cholesky_of_covariance(points: FloatArray) -> FloatArray:
 
 
 def _log_det_of_covariance_cholesky(points: FloatArray) -> float:
-    """Log determinant of the Cholesky factor of the covariance: half of that of the covariance."""
+    """Log determinant of the Cholesky factor: half the log determinant of the covariance."""
     return float(np.log(np.diag(_cholesky_of_covariance(points))).sum())

@@ -18,11 +18,10 @@ from probewise.nested.dead_points import DeadPoints
 def to_anesthetic(result: DeadPoints) -> Any:
     """Convert to `anesthetic.NestedSamples`: parameters, `logL` and `logL_birth` of every dead point.
 
-    anesthetic recomputes the number of live points from births and deaths, and has no labels. On plateaus
-    of the likelihood the levels are therefore made distinct by single units in the last place, in
-    the order of the labels. It does not know impossible hypotheses (zero likelihood) either: where there
-    are some, `log_start` is added to every level, which restores the evidence, since anesthetic's prior
-    is that of the possible hypotheses only.
+    anesthetic recomputes the number of live points from births and deaths, and knows no labels. On a plateau of the
+    likelihood the levels are therefore made distinct by single units in the last place, in the order of the labels.
+    anesthetic does not know impossible hypotheses (zero likelihood) either: its prior is that of the possible ones. To
+    restore the evidence, `log_start` (log of the possible share of the prior) is added to every level.
 
     Raises
     ------
@@ -44,7 +43,7 @@ def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.ra
     result
         The dead points to draw from.
     attributes
-        Attributes of the container: the evidence, its error, versions.
+        Attributes of the container, for instance the evidence, its error and software versions.
     rng
         Source of randomness, for drawing the samples.
     n
@@ -54,13 +53,15 @@ def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.ra
     -------
     arviz.InferenceData, or xarray.DataTree from ArviZ 1.0 on
         Group `posterior` has a variable for each parameter. Group `sample_stats` has each sample's log likelihood
-        `log_l`, the level `log_l_birth` above which it was drawn, and its `row` in the result. All have
-        dimensions (chain, draw).
+        `log_l`, the level `log_l_birth` above which it was drawn, and its `row` in the result. All have dimensions
+        (chain, draw).
 
     Raises
     ------
     ImportError
         If arviz is not installed.
+    ParameterError
+        If the result has no parameters.
     """
     arviz = _import_optional("arviz")
     if not result.names:
@@ -81,7 +82,7 @@ def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.ra
 
 
 def _log_likelihoods_without_ties(result: DeadPoints) -> tuple[FloatArray, FloatArray]:
-    """Log likelihoods at death and birth, (n_dead,), with ties broken in the order of the labels."""
+    """Return log likelihoods at death and birth, (n_dead,) each, plus `log_start`; ties are broken by label."""
     order = np.lexsort((result.label, result.log_likelihood))
     strict = result.log_likelihood[order] + result.log_start
     for i in range(1, len(strict)):

@@ -17,7 +17,7 @@ COUNTS = ("parent", "n_at_death")
 
 
 def checked_array_of_length(name: str, values: FloatArray | IntArray, n: int, one: str) -> FloatArray | IntArray:
-    """Return an array after checking that it has shape (n,); `name` and `one`, what a row is, are for the message.
+    """Return an array after checking that it has shape (n,); `name` and `one` (a row's meaning) are for the message.
 
     Raises
     ------
@@ -84,7 +84,7 @@ class DeadPoints(WeightedSamples):
 
     @property
     def log_volume(self) -> FloatArray:
-        """Expected natural log of the prior share above each sample, ln X, (n_dead,)."""
+        """Expected natural log of the prior share (volume X) with a likelihood above each sample's, (n_dead,)."""
         return log_volumes(self.n_at_death, self.log_start)
 
     def mean(self, f: Callable[[FloatArray], FloatArray] | None = None, *, block: int | None = None) -> FloatArray:
@@ -93,10 +93,10 @@ class DeadPoints(WeightedSamples):
         Parameters
         ----------
         f
-            Function from rows of theta, (n, n_params), to values, (n, ...), for instance an SSF field
-            (n, n_v, n_u); by default the parameters themselves.
+            Function from rows of theta, (n, n_params), to values, (n, ...), for instance sensitivity fields
+            (n, n_v, n_u); by default the parameters themselves. ShapeError for another number of rows.
         block
-            Largest number of rows passed to `f` at a time, to bound memory; by default all.
+            Largest number of rows passed to `f` at a time, to bound memory; by default all. ParameterError below 1.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Replace repeated posterior samples by distinct ones with Metropolis-Hastings (paper, machine learning system)."""
+"""Replace repeated posterior samples by distinct ones with Metropolis-Hastings ("The Machine Learning System")."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _BLOCK = 100
 
 @dataclass(frozen=True)
 class DiversifyTally:
-    """Statistics of the steps.
+    """Statistics of the steps; all zero but `n_distinct` where there is nothing to move.
 
-    `acceptance`: share of accepted proposals. `n_distinct`: number of distinct samples at the end.
-    `mixing`: mean squared displacement over its value for independent samples, averaged over the
+    `n_calls`: likelihood evaluations. `acceptance`: share of accepted proposals. `n_distinct`: number of distinct
+    samples at the end. `mixing`: mean squared displacement over its value for independent samples, averaged over the
     parameters; near 1 when the samples no longer depend on their start.
     """
 
@@ -38,18 +38,17 @@ def diversify(
 ) -> tuple[FloatArray, DiversifyTally]:
     """Run a Metropolis-Hastings chain from every sample, all chains in parallel.
 
-    Every step proposes one of three symmetric moves to each sample: a Gaussian with the samples'
-    covariance, a difference of two samples (which can lead to another mode), or a change of
-    one parameter on the scale of its prior. The step size is drawn over orders of magnitude. The
-    proposals depend only on the samples as given, not on the chains' states, so the posterior
-    is left invariant.
+    Every step proposes one of three symmetric moves to each sample: a Gaussian with the samples' covariance, a
+    difference of two samples (which can lead to another mode), or a change of one parameter on the scale of its prior.
+    The step size is drawn over orders of magnitude. The proposals depend only on the samples as given, not on the
+    chains' states, so the posterior is left invariant.
 
     Parameters
     ----------
     theta
         Posterior samples, possibly repeated, (n_samples, n_params).
     problem
-        Prior and likelihood.
+        Prior, with `log_prob`, and likelihood.
     rng
         Source of randomness.
     n_steps
@@ -63,7 +62,9 @@ def diversify(
     Raises
     ------
     ParameterError
-        If a sample has zero posterior density.
+        If a sample has zero posterior density, or `n_steps` is negative.
+    ShapeError
+        If `theta` has another shape, or no rows.
     """
     require_rng(rng)
     start = np.array(floats(theta, "theta"))
@@ -105,7 +106,7 @@ def diversify(
 def _displacements_and_log_thresholds(
     cloud: FloatArray, prior_sd: FloatArray, n_steps: int, rng: np.random.Generator
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield for every step the proposed displacements, (n_samples, n_params), and log uniform numbers, (n_samples,)."""
+    """Yield per step the proposed displacements, (n_samples, n_params), and logs of uniform numbers, (n_samples,)."""
     n_samples, n_params = cloud.shape
     covariance = np.atleast_2d(np.cov(cloud, rowvar=False)) if n_samples > 1 else np.zeros((n_params, n_params))
     values, vectors = np.linalg.eigh(covariance / np.outer(prior_sd, prior_sd))

@@ -1,10 +1,9 @@
 """Dynamic allocation: add live points to a run where its posterior or its evidence needs them.
 
-A run spends as many points on shells that hold nothing as on those that hold the posterior. Live points may instead be
-added between any two levels of a run: a *thread* of new points starts at the lower level and ends at the upper one, and
-together they form a run with more points alive between the two (Higson, Handley, Hobson & Lasenby 2019, Stat. Comput.
-29, 891). Posterior samples come from the shells that hold the posterior's mass; the error of log Z comes from all
-shells from the start to those.
+A run spends as many points on shells without posterior mass as on those with it. Live points can be added between any
+two levels of a run: a *thread* of new points starts at the lower level and ends at the upper one, and more points are
+then alive between the two (Higson, Handley, Hobson & Lasenby 2019, Stat. Comput. 29, 891). More posterior samples need
+new points in the shells that hold the posterior's mass; a smaller error of log Z needs them from the start up to there.
 """
 
 from __future__ import annotations
@@ -70,9 +69,9 @@ def intensified(
     Returns
     -------
     NestedResult
-        The run with the new points. Its `n_live` is still the run's; `n_at_death` is the number of points alive at
-        each level. `memory` and `check` are the run's, `warnings` too, with one more if the new points' insertion
-        ranks are not uniform.
+        The run with the new points. `n_live` and `memory` are still the run's, `check` too, with its distance to the
+        new log Z; `n_at_death` counts the points alive at each level. If the new points' insertion ranks are not
+        uniform, DoubtfulResultWarning is issued and added to `warnings`.
 
     Raises
     ------
@@ -115,7 +114,10 @@ class _Thread:
 
 
 def _require_complete_run_of(result: NestedResult, evaluate: Evaluator) -> None:
-    """Raise unless a run is complete, of this problem, and has parameters: ShapeError for others, or ParameterError."""
+    """Raise ShapeError unless the problem has the run's parameters; ParameterError unless the run is complete.
+
+    ParameterError also for a run without parameters, or if the problem gives its last point another log likelihood.
+    """
     if evaluate.names != result.names:
         raise ShapeError(f"the problem has the parameters {evaluate.names}; allowed: those of the run, {result.names}")
     if not result.names:
@@ -133,7 +135,7 @@ def _require_complete_run_of(result: NestedResult, evaluate: Evaluator) -> None:
 
 
 def _first_and_last_row_to_intensify(result: NestedResult, goal: Goal) -> tuple[int, int]:
-    """Return the rows of the two deaths between which new points count most."""
+    """Return the rows (first, last) of the deaths between which new points count most."""
     weight = result.weight
     if goal == "posterior":
         ladder = np.cumsum(weight) / weight.sum()
@@ -156,7 +158,7 @@ def _draw_thread(
     max_calls: int | None,
     rng: np.random.Generator,
 ) -> _Thread:
-    """Draw new points above the level of row `first` and let them die up to that of row `last`."""
+    """Draw new points above the level of row `first` and replace the worst up to that of row `last` or `max_calls`."""
     end = (float(result.log_likelihood[last]), float(result.label[last]))
     bound = Bound(float(result.log_likelihood[first]), float(result.label[first]))
     above = _rows_alive_after(result, first)
@@ -192,7 +194,6 @@ def _draw_thread(
 
 
 def _rows_alive_after(result: NestedResult, row: int) -> IntArray:
-    """Return the rows of the points alive just after the death of row `row`, (n_alive,)."""
     level = (result.log_likelihood[row], result.label[row])
     born = (result.log_birth < level[0]) | ((result.log_birth == level[0]) & (result.birth_label <= level[1]))
     return np.flatnonzero(born & (np.arange(result.n_dead) > row))

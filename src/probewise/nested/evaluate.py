@@ -33,9 +33,9 @@ class Samplable(Protocol):
 class Points:
     """Evaluated points.
 
-    `u` in the sampling coordinates (see `nested.space`) and `theta` in parameters, both (n, n_params);
-    `log_density` of the prior in `u`, (n,); `log_likelihood`, (n,); `label`, (n,): uniform random
-    numbers that order points of equal likelihood.
+    `u` in the sampling coordinates (see `nested.space`) and `theta` in parameters, both (n, n_params); `log_density` of
+    the prior in `u`, (n,); `log_likelihood`, (n,); `label`, (n,): uniform random numbers that order points of equal
+    likelihood.
     """
 
     u: FloatArray
@@ -48,7 +48,7 @@ class Points:
         return len(self.u)
 
     def take_rows(self, rows: IntArray | BoolArray | slice) -> Points:
-        """Select rows."""
+        """Select points by row numbers, mask or slice."""
         return Points(
             self.u[rows], self.theta[rows], self.log_density[rows], self.log_likelihood[rows], self.label[rows]
         )
@@ -66,7 +66,7 @@ class Points:
         )
 
     def overwrite_rows(self, rows: IntArray | BoolArray, points: Points, which: IntArray) -> None:
-        """Overwrite `rows` with the rows `which` of `points`."""
+        """Overwrite these points' `rows` in place with the rows `which` of `points`."""
         self.u[rows], self.theta[rows] = points.u.take(which, axis=0), points.theta.take(which, axis=0)
         self.log_density[rows], self.label[rows] = points.log_density[which], points.label[which]
         self.log_likelihood[rows] = points.log_likelihood[which]
@@ -160,9 +160,9 @@ class Evaluator:
     def evaluate_mapped(
         self, u: FloatArray, theta: FloatArray, log_density: FloatArray, rng: np.random.Generator
     ) -> Points:
-        """Evaluate points whose parameters and prior density, `space.leave(u)`, are known; give each a new label.
+        """Evaluate points that are already mapped from `u` to parameters and log prior density; give each a new label.
 
-        Where the prior's density is zero the likelihood is not evaluated and the point counts as impossible.
+        Where the prior density is zero the log likelihood is -inf, without a call of the problem.
         """
         possible = np.isfinite(log_density)
         if possible.all():
@@ -175,9 +175,9 @@ class Evaluator:
     weigh = evaluate_mapped  # its earlier name
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Evaluate and count the likelihood of hypotheses, (n, n_params) -> (n,).
+        """Evaluate the log likelihood of hypotheses, (n, n_params) -> (n,), and count the calls.
 
-        Raises NotConvergedError where `__call__` does.
+        NotConvergedError if the likelihood raises, or returns the wrong shape, NaN or +inf.
         """
         if not len(theta):
             return np.empty(0)  # a likelihood need not take an empty batch
@@ -250,7 +250,7 @@ class Evaluator:
         return values
 
     def _failure_message(self, error: Exception, theta: FloatArray) -> str:
-        """Describe the failure of a batch, (n, n_params), and of which hypothesis in it."""
+        """Describe the failure of a batch, (n, n_params), and name a hypothesis that fails by itself, if any."""
         why = f"{type(error).__name__}: {error}"
         if self.executor is not None and "pickle" in why.lower():
             return (
@@ -265,7 +265,7 @@ class Evaluator:
         return f"the likelihood raised {why}; {batch}; {self._first_hypothesis_as_text(theta)}"
 
     def _find_failing_hypothesis(self, theta: FloatArray) -> FloatArray | None:
-        """Find by bisection a hypothesis that fails by itself; None where only the batch as a whole fails."""
+        """Find by bisection a hypothesis, (n_params,), that fails by itself; None where only the whole batch fails."""
         while len(theta) > 1:
             half = len(theta) // 2
             theta = theta[:half] if self._likelihood_fails(theta[:half]) else theta[half:]

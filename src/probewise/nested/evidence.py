@@ -19,7 +19,7 @@ _SIMULATED_AT_A_TIME = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """log Z, the information (nats), normalised log weights and Kish's effective sample size.
+    """log Z, the information (nats), normalised log weights, (n_dead,), and Kish's effective sample size.
 
     `spread`: sd of log Z from the random shrinkage alone; `log_start_error`: standard error of the log of the share of
     the prior with a likelihood above zero.
@@ -33,9 +33,10 @@ class Evidence:
     n_eff: float
 
     def log_z_error(self, memory: float) -> float:
-        """Return the standard error of log Z, where correlated chains multiply its variance from shrinkage by `memory`.
+        """Return the standard error of log Z.
 
-        `memory` comes from `probewise.nested.relative_lineage_variance`.
+        `memory`: factor by which correlated chains multiply its variance, from
+        `probewise.nested.relative_lineage_variance`.
         """
         return math.hypot(math.sqrt(memory) * self.spread, self.log_start_error)
 
@@ -62,8 +63,7 @@ def integrate(
     n_at_death
         Number of points alive when each died, itself included, (n_dead,).
     rng
-        Source of randomness for the error: the sd of log Z over 200 draws of the shrinkages
-        t ~ Beta(n, 1), which makes no assumption about the posterior.
+        Source of randomness for the `spread` of log Z: its sd over 200 draws of the shrinkages t = Beta(n, 1).
     log_start, log_start_error
         Log of the prior's share with a likelihood above zero, and its standard error.
     """
@@ -91,7 +91,7 @@ def integrate(
 
 
 def _log_shell_volumes(log_edges: FloatArray) -> FloatArray:
-    """Log of the volume between successive edges; the last shell reaches to zero volume."""
+    """Return the log volume between successive edges along the last axis; the last shell ends at zero volume."""
     before, after = log_edges[..., :-1], log_edges[..., 1:].copy()
     after[..., -1] = -np.inf
     with np.errstate(divide="ignore"):
@@ -101,18 +101,11 @@ def _log_shell_volumes(log_edges: FloatArray) -> FloatArray:
 def birth_rows(
     log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
 ) -> IntArray:
-    """Find the dead point above whose level each point was drawn.
+    """Find the row of the dead point above whose level each point was drawn, (n_dead,); -1 where there is none.
 
-    Parameters
-    ----------
-    log_likelihood, label
-        Levels of the deaths in order, (n_dead,); ties of likelihood are ordered by label.
-    log_birth, birth_label
-        Level above which each point was drawn, (n_dead,).
-
-    Returns
-    -------
-    Row of the last death at or below that level, -1 where there is none, (n_dead,).
+    It is the last death at or below the level of birth. `log_likelihood` and `label` of the deaths are in order, ties
+    of likelihood by label; `log_birth` and `birth_label` are the levels above which each point was drawn, all
+    (n_dead,).
     """
     n = len(log_likelihood)
     born = np.repeat([0, 1], n)  # a death comes before the births at its own level
@@ -153,9 +146,9 @@ def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.ran
 
 
 def _uniform_p_value(position: FloatArray) -> float:
-    """Test positions against the uniform distribution on 0 to 1 (Kolmogorov-Smirnov).
+    """Return the Kolmogorov-Smirnov p value of positions, (n,), against the uniform distribution on 0 to 1.
 
-    The limiting distribution with Stephens' (1970) correction for finite numbers: `scipy.stats` has the exact one, but
+    It is the limiting distribution with Stephens' (1970) correction for finite n: `scipy.stats` has the exact one, but
     takes a second to import.
     """
     n = len(position)

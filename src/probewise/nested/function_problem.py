@@ -157,7 +157,7 @@ Posed, pose = FunctionProblem, make_problem  # their earlier names
 
 
 def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
-    """Convert a prior in any of its forms to one with names."""
+    """Convert a prior in any form that `make_problem` takes to one with names; ParameterError for anything else."""
     if isinstance(names, str):
         raise ParameterError("names", names, "a list of names: names=['x', 'y']")
     given = None if names is None else tuple(str(name) for name in names)
@@ -211,7 +211,6 @@ def _as_marginal(name: str, one: Any) -> Marginal:
 
 
 def _is_scipy_distribution(one: Any) -> bool:
-    """Whether a value has the methods of a continuous distribution of scipy.stats."""
     quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
     return quantile and hasattr(one, "cdf") and hasattr(one, "logpdf") and not isinstance(one, type)
 
@@ -224,7 +223,10 @@ def as_problem(
     pass_dict: bool,
     periodic: Sequence[str],
 ) -> Samplable:
-    """Return a problem as it is, or make one of a log likelihood and its prior."""
+    """Return a problem as it is, or make one of a log likelihood and its prior by `make_problem`.
+
+    ParameterError if a problem comes with one of the other arguments, or a likelihood without a prior.
+    """
     if hasattr(problem, "log_likelihood") or isinstance(problem, type):
         if prior is not None or names is not None or vectorized or pass_dict or periodic:
             raise ParameterError(

@@ -1,11 +1,11 @@
 """The error of log Z from correlated chains, estimated from the genealogy of a run's points.
 
 Every new point is the end of a chain that begins at a surviving live point, its parent. If chains forget their start,
-all lineages have the same prospects and their sizes differ by chance alone. If not, a lineage in a favourable place
-grows: sizes differ by more, and log Z has a larger variance, since a handful of lineages then represent the remaining
-volume. Variance estimates from the genealogy of a single run are known from particle filters (Chan & Lai 2013; Lee &
-Whiteley 2018; Olsson & Douc 2019), of which nested sampling in rounds is one (Salomone, South, Johansen, Drovandi &
-Kroese 2018).
+the sizes of lineages (all descendants of one point) differ by chance alone. If not, lineages that start at high
+likelihood grow: sizes differ by more, a handful of lineages then represent the remaining volume, and log Z has a larger
+variance. Such variance estimates from a single run are known from particle filters (Chan & Lai 2013; Lee & Whiteley
+2018; Olsson & Douc 2019), of which nested sampling in rounds is one (Salomone, South, Johansen, Drovandi & Kroese
+2018).
 """
 
 from __future__ import annotations
@@ -23,14 +23,13 @@ _LEAST_LAG = 4
 def relative_lineage_variance(
     parent: IntArray, birth_row: IntArray, n_at_death: IntArray, log_weight: FloatArray
 ) -> float:
-    """Estimate the variance of log Z relative to a run whose new points are independent draws, 1 or more.
+    """Estimate the variance of log Z relative to that of a run whose new points are independent draws.
 
     Every point that dies after a given time descends from one of the n points alive then. Let s be the shares of these
-    n lineages in the evidence from there on. Two points drawn by weight belong to different lineages with probability
-    1 - sum s^2, and minus its log estimates a variance of the log evidence. For independent draws it grows by 2 / n^2
-    per birth, of which 1 / n^2 per death is the shrinkage of the volume (all of it if half of the points are replaced
-    at a time) and the rest the choice of parents; the excess is due to correlated chains. Lineages without weight in
-    the evidence, which split beyond the posterior's bulk, do not contribute.
+    n lineages in the evidence from there on. Two points drawn by weight belong to different lineages with probability 1
+    - sum s^2, and minus its log estimates a variance of the log evidence. For independent draws it grows by 2 / n^2 per
+    birth, of which 1 / n^2 per death is the shrinkage of the volume (all of it if half of the points are replaced at a
+    time) and the rest the choice of parents; the excess is due to correlated chains.
 
     Few lineages survive a whole run, so an estimate over all of it would be noisy. Windows of half and of a quarter of
     the run are less noisy but miss the correlations that began before them. The two are extrapolated linearly in the
@@ -46,6 +45,10 @@ def relative_lineage_variance(
         Number of points alive when each died, itself included, (n_dead,).
     log_weight
         Natural log of each point's share of the evidence, (n_dead,).
+
+    Returns
+    -------
+    The ratio of variances, 1 or more; 1 for a run of fewer than 17 rounds, too short for an estimate.
     """
     genealogy = _Genealogy(parent, birth_row, n_at_death, log_weight)
     ends = np.unique(birth_row)  # of rounds
@@ -73,7 +76,7 @@ class _Genealogy:
         self._chance = np.concatenate([[0.0], np.cumsum(2.0 * (self._left[self._births + 1] / n_alive) ** 2)])
 
     def relative_variance_from_windows(self, ends: IntArray, lag: int) -> float:
-        """Estimate the variance of log Z over that of independent draws, from windows of `lag` rounds.
+        """Estimate the variance of log Z over that of independent draws from up to 32 windows of `lag` rounds each.
 
         `ends` are the last rows of all rounds, in order.
         """
@@ -83,9 +86,10 @@ class _Genealogy:
         return 1.0 + float(excess / own)
 
     def _excess_and_shrinkage_variance(self, first: int, last: int) -> tuple[float, float]:
-        """Excess variance of log Z over that of independent draws, and the variance of the shrinkage, in a window.
+        """Return a window's excess variance of log Z over that of independent draws, and its variance from shrinkage.
 
-        Lineages are traced back from `last` to `first`; the points alive at `last` share the evidence beyond it.
+        Lineages are traced back from row `last` to row `first`; the points alive at `last` share the evidence beyond
+        it.
         """
         rows = np.arange(len(self._parent))
         row = np.flatnonzero((rows > first) & (self._birth_row <= last))

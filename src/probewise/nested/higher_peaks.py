@@ -1,9 +1,9 @@
-"""Look above where a run ended, for a narrow peak that no live point met.
+"""Look above the end of a run for a narrow peak that no live point met.
 
-A run ends where its live points can no longer raise log Z, if the likelihood goes on as it did. A narrow peak on a
-broad one (a change of phase, Skilling 2006) can hold most of the posterior and begin tens of nats further up, where no
-live point has been. Draws at the top of the broad peak cost no chains: where that peak is level, a direction towards a
-narrow one suffices to meet it. A draw that lies higher than the top belongs to another peak, which is climbed.
+A run ends where its live points can no longer raise log Z, if the likelihood goes on as before. A narrow peak on a
+broad one (a phase transition, Skilling 2006) can hold most of the posterior and rise above the broad peak only tens of
+nats further up, where no live point has been. Draws about the top of the broad peak need no chains and can meet the
+flank of the narrow one. A draw higher than the top belongs to another peak, which is climbed.
 """
 
 from __future__ import annotations
@@ -25,20 +25,10 @@ _MOST_PEAKS = 5
 def find_higher_peaks(
     run: NestedResult, top: GaussianAtPeak, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> list[GaussianAtPeak]:
-    """Look for peaks higher than the one on which a run ended; return the top of each, the highest last.
+    """Look for peaks higher than `top`, the peak on which a run ended; return the top of each, the highest last.
 
-    Parameters
-    ----------
-    run
-        The run.
-    top
-        Top of the peak on which it ended.
-    evaluate
-        Its problem, whose prior has `to_unit_cube` or coordinates of its own; it counts the evaluations.
-    max_calls
-        Limit of evaluations; without a higher peak at most an eighth of the run's are used.
-    rng
-        Source of randomness.
+    `evaluate`: the run's problem, whose prior has `to_unit_cube` or coordinates of its own; it counts the evaluations,
+    at most `max_calls`. Without a higher peak at most an eighth of the run's are used.
     """
     n_params, most = len(evaluate.names), evaluate.n_calls + max_calls
     wanted = run.n_live * max(_PER_LIVE * n_params**2, 1.0)

@@ -36,8 +36,8 @@ _MET = 0.5  # of the evidence of a hill: with more, the run has met it
 class HillEstimate:
     """A hill of the posterior, that is a mode and its surroundings, with samples and the log of its evidence.
 
-    `theta`: samples of it, (n, n_params). The ellipsoid of `shape`, a single cluster in coordinates of `space`, holds
-    most of it within `radius` sds.
+    `theta`: samples of the hill, (n, n_params). Within `radius` sds of the single cluster `shape`, in coordinates of
+    `space`, lies 90 % of the hill's evidence.
     """
 
     log_z: float
@@ -48,14 +48,14 @@ class HillEstimate:
 
     @classmethod
     def from_draws(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> HillEstimate:
-        """Make the estimate from weighted draws on a hill."""
+        """Make the estimate from weighted draws on a hill; `space` holds the coordinates of its ellipsoid."""
         theta = drawn.samples(_N_SAMPLES, rng=rng)
         x = space.enter(theta)
         shape = Clusters.from_groups([x])
         return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance_in_sds(x, shape), _INSIDE)))
 
     def is_met_by(self, run: Posterior) -> bool:
-        """Return whether a run has at least half of this hill's evidence within its ellipsoid."""
+        """Return whether a run's posterior has, within this hill's ellipsoid, more than half of the hill's evidence."""
         inside = _distance_in_sds(self.space.enter(run.theta), self.shape) <= self.radius
         near = float(run.weight[inside].sum())
         return near > 0 and run.log_z + math.log(near) > self.log_z + math.log(_MET * _INSIDE)
@@ -76,12 +76,12 @@ def _n_points_on_hill(n_params: int) -> int:
 
 
 def calls_for_hill_evidence(n_params: int) -> float:
-    """Return about how many evaluations it takes to weigh a hill: two or three rounds of chains."""
+    """Return about how many evaluations the evidence of a hill takes: two or three rounds of chains."""
     return 2.5 * _n_points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
 
 
 def draw_uniformly_near_hilltop(top: GaussianAtPeak, evaluate: Evaluator, rng: np.random.Generator) -> Points:
-    """Draw points uniformly from where the log likelihood is within (n_params + 2) / 2 of a hill's highest.
+    """Draw points uniformly where the log likelihood is within (n_params + 2) / 2 of a hill's highest (slice sampling).
 
     On a normal hill these points have the covariance of the whole hill.
     """
@@ -106,9 +106,9 @@ def draw_uniformly_near_hilltop(top: GaussianAtPeak, evaluate: Evaluator, rng: n
 
 
 def estimate_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> HillEstimate | None:
-    """Compute a hill's evidence by draws from a Student t about points on it; None where no Student t fits.
+    """Estimate a hill's evidence by draws from a Student t about points on the hill; None where no Student t fits.
 
-    Where there are too few effective samples, the Student t is fitted anew to the weighted draws.
+    Where there are too few effective samples, the Student t is fitted anew to the weighted draws, up to five times.
     """
     space = unbounded_space_of(evaluate.problem.prior)
     x, n_params = space.enter(settled.theta), settled.theta.shape[1]

@@ -20,9 +20,9 @@ class HoppingMove:
     """A move that hops between modes, then runs the chains of `chains`.
 
     A hop takes a point to its counterpart in another mode, by the affine map between their covariances, and is accepted
-    with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes in which there are enough live
-    points for a covariance; here `modes` are those of the posterior, in the sampling coordinates. Level sets of a mode
-    have about its shape far below its top too, so the maps serve from where modes separate.
+    with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes with enough live points for a
+    covariance; here `modes` are clusters of the posterior, in the sampling coordinates. Level sets of a mode keep about
+    the same shape far below its top, so the maps serve from where modes separate.
     """
 
     chains: SliceMove
@@ -31,7 +31,7 @@ class HoppingMove:
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
-        """Return the ends of one chain from each start; see `Move`."""
+        """Return the ends of one chain from each start, and the tally; see `Move`."""
         n_before, now = evaluate.n_calls, start.copy()
         for _ in range(_HOPS):
             self._hop_in_place(now, bound, evaluate, rng)
@@ -40,7 +40,7 @@ class HoppingMove:
         return new, Tally(tally.n_evaluated + n_hops, tally.n_accepted, tally.n_stuck, tally.n_tried)
 
     def _hop_in_place(self, now: Points, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
-        """Try one hop of each point to another mode, chosen at random; those that succeed are overwritten."""
+        """Try one hop of each point to a mode chosen at random from the others; overwrite the points that succeed."""
         modes, space = self.modes, evaluate.space
         home = modes.assign(now.u)
         goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)

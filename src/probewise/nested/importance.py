@@ -1,10 +1,10 @@
 """Importance sampling: weighted draws for `refine`, and `update` of a posterior with new readings.
 
-Nested sampling locates the posterior; the error of its log evidence is sqrt(H / n_live). Importance
-sampling from a density fitted to its samples estimates the same evidence and posterior independently,
-often with a hundredth of the error for a few thousand more evaluations (Cameron & Pettitt 2014; Lange
-2023 does it with neural networks). The reliability of the weights is measured by the Pareto k of
-their tail (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
+Nested sampling locates the posterior; the error of its log evidence is sqrt(H / n_live), with H the information in
+nats. Importance sampling from a density fitted to its samples estimates the same evidence and posterior independently,
+often with a hundredth of the error for a few thousand more evaluations (Cameron & Pettitt 2014; Lange 2023 with neural
+networks). The Pareto k of the weights' tail tells whether they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry
+2024).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Weighted(WeightedSamples):
     lost
         Share of the posterior that the run may have lost undetected, see `refine`; the error includes it.
     inherited
-        Doubts about the refined run, and a disagreement with it.
+        Doubts about the refined run, and about a disagreement with it, in words.
     """
 
     names: tuple[str, ...]
@@ -96,7 +96,7 @@ class Weighted(WeightedSamples):
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons not to trust the error, in words; empty if there are none."""
+        """Reasons not to trust the error, in words, or the warnings of the fallback run; empty if there are none."""
         if self.run is not None:
             return self.run.warnings
         reasons = (
@@ -111,7 +111,7 @@ class Weighted(WeightedSamples):
         return (*(words for so, words in reasons if so), *self.inherited)
 
     def mean(self, f: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
-        """Posterior mean of the parameters, (n_params,), or of `f(theta)` (n, ...), of the trailing shape."""
+        """Posterior mean of the parameters, (n_params,), or of `f(theta)`, (n, ...), of the trailing shape."""
         values = self.theta if f is None else np.asarray(f(self.theta))
         return np.asarray(np.tensordot(self.weight, values, axes=(0, 0)))
 
@@ -134,7 +134,10 @@ Posterior: TypeAlias = NestedResult | Weighted
 
 
 def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
-    """Return the doubts about `result`, which `found` refines, and one for each log Z of it that disagrees."""
+    """Return the doubts about `result`, which `found` refines, in words.
+
+    For a run also where its log Z, or that of its check, is more than four errors from that of `found`.
+    """
     if isinstance(result, Weighted):
         return result.doubts
     routes = [("the run", result.log_z, result.log_z_error)]
@@ -159,11 +162,10 @@ def update(
 ) -> Weighted:
     """Update a posterior with new readings by importance sampling.
 
-    The previous samples are reweighted by the new readings' likelihood, and a proposal is fitted to them.
-    Draws from a mixture of the proposal and the prior are weighted against the whole new problem, so the
-    evidence is absolute and errors do not accumulate from reading to reading. Where the new readings
-    are surprising (too few effective samples or too heavy a tail of the weights), `fall_back` starts
-    from scratch.
+    The previous samples are reweighted by the new readings' likelihood, and a proposal is fitted to the samples. Draws
+    from a mixture of the proposal and the prior are weighted against the whole new problem, so the evidence is absolute
+    and errors do not accumulate from reading to reading. Where the new readings are surprising (too few effective
+    samples or too heavy a tail of the weights), `fall_back` starts from scratch.
 
     Parameters
     ----------
@@ -178,13 +180,18 @@ def update(
     n_draws
         Number of draws; the cost is this many evaluations plus one per old sample, at most 1000.
     prior_share
-        Share of the draws that come from the prior: they cover what the old posterior had no samples of, and
-        bound the weights.
+        Share of the draws that come from the prior, 0 to below 1: they cover regions without samples of the old
+        posterior, and bound the weights.
 
     Returns
     -------
     Weighted
         With the samples and `run` of the fallback where it was used.
+
+    Raises
+    ------
+    ParameterError
+        If `previous` has other parameters, or `prior_share` is out of range.
     """
     require_rng(rng)
     if not 0 <= prior_share < 1:
@@ -226,9 +233,10 @@ def update(
 
 @dataclass(frozen=True, eq=False)
 class HeldOutSamples:
-    """Posterior samples held out from the fit, and their effective number.
+    """Posterior samples held out from the fit.
 
-    `x` (n, n_params) in unbounded coordinates; the prior's log density there and the log likelihood, (n,).
+    `x` (n, n_params) in unbounded coordinates; the prior's log density there and the log likelihood, (n,);
+    `n_independent`: their effective number.
     """
 
     x: FloatArray
@@ -243,10 +251,11 @@ class HeldOutSamples:
 
 
 def effective_lineages(found: Posterior) -> float:
-    """Return the number of independent samples that would give the shares of the posterior's parts as precisely.
+    """Return the number of independent samples that would give the posterior mass of a mode as precisely.
 
-    Many samples of a run descend from one live point. The log evidence of a part has the error sqrt(H memory / n_live);
-    a share estimated from n independent samples has the relative error 1 / sqrt(n). So n is n_live / (H memory).
+    Many samples of a run descend from one live point. The log evidence of a mode has the error sqrt(H memory / n_live),
+    with H the information and `memory` the variance factor of correlated chains; a share estimated from n independent
+    samples has the relative error 1 / sqrt(n). So n is n_live / (H memory); for `Weighted` without a run it is `n_eff`.
     """
     if isinstance(found, Weighted):
         return found.n_eff if found.run is None else effective_lineages(found.run)
@@ -256,7 +265,10 @@ def effective_lineages(found: Posterior) -> float:
 def split_off_held_out(
     found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
 ) -> tuple[FloatArray, HeldOutSamples]:
-    """Split samples at random into those for fitting a density, (n, n_params), and held-out ones."""
+    """Split samples at random, two to one, into those for fitting a density and held-out ones.
+
+    The first are (n, n_params), in coordinates of `space`, resampled by weight. `n_lineages`: effective number of all.
+    """
     lot = rng.random(len(found.theta)) < _HELD_OUT
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
@@ -267,10 +279,10 @@ def split_off_held_out(
 
 
 def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
-    """Resample for fitting a density: about the effective sample size, so that few samples are repeated.
+    """Resample for fitting a density; return distinct samples in coordinates of `space`, (n, n_params).
 
-    A third more is drawn with the square root of the weights: a proposal must have wider tails than
-    the posterior.
+    As many are drawn by weight as the effective sample size, at most 2000, and a third as many by the square root of
+    the weights: a proposal must have wider tails than the posterior.
     """
     weight = np.exp(log_weight - log_weight.max())
     n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
@@ -279,7 +291,10 @@ def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, r
 
 
 def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
-    """Add to the error the share of the posterior that a run of `n_lineages` effective samples may have lost."""
+    """Set `lost`, the share of the posterior that a run of `n_lineages` effective samples may have lost.
+
+    It is added to `log_z_error` in quadrature.
+    """
     if not found.n_eff > 1:
         return found
     n = int(min(found.n_eff, 1000))
@@ -302,7 +317,8 @@ def draw_and_weigh(
 ) -> Weighted:
     """Draw from a mixture of a proposal and the prior, evaluate, and weight the draws.
 
-    `held`: posterior samples that correct the evidence by bridge sampling; `tail` as for `pareto_k`.
+    `prior_share`: share of the `n_draws` from the prior. `held`: posterior samples that correct the evidence by bridge
+    sampling. `tail` as for `pareto_k`. If no draw is possible, log Z is -inf.
     """
     # At least one draw is the proposal's: a share below 1, such as 0.9999 of 2000, may round to all of them.
     n_prior = min(round(prior_share * n_draws), n_draws - 1)
@@ -346,20 +362,10 @@ def _bridge_sampling_estimate(
 ) -> tuple[float, float, float, FloatArray]:
     """Estimate the evidence from draws and posterior samples by bridge sampling (Meng & Wong 1996).
 
-    Parameters
-    ----------
-    log_ratio
-        Log of target over proposal density at the draws with nonzero target, (n_alive,).
-    n_draws
-        Number of draws, those with zero target included.
-    held_ratio
-        The same at held-out posterior samples, (n_samples,); without any this is plain importance sampling.
-    n_held
-        Effective number of these samples.
-
-    Returns
-    -------
-    log Z, its error, the share of the posterior that the draws miss, and the draws' log weights, (n_alive,).
+    `log_ratio`: log of target over proposal density at the draws with nonzero target, (n_alive,), of `n_draws` in all.
+    `held_ratio`: the same log at held-out posterior samples, (n_samples,), of effective number `n_held`; empty for
+    plain importance sampling. Return log Z, its error, the share of the posterior that the draws miss, and the draws'
+    log weights, (n_alive,).
     """
     log_z = float(logsumexp(log_ratio)) - math.log(n_draws)
     missed, kept_error, cut = 0.0, 0.0, log_ratio
@@ -379,12 +385,12 @@ def _bridge_sampling_estimate(
 
 
 def pareto_k(log_weight: FloatArray, tail: float = 3.0) -> float:
-    """Estimate the shape of the tail of importance weights, (n,) log weights of any scale.
+    """Estimate the Pareto shape k of the tail of importance weights, from log weights of any scale, (n,).
 
-    A generalised Pareto distribution is fitted to the largest weights, `tail` sqrt(n) of them but at most a
-    fifth, with the estimator of Zhang & Stephens (2009), as in Vehtari et al. (2024). Below 0.5 the
-    weights have a finite variance; above 0.7 their mean converges too slowly to be used. It is infinite for fewer than
-    25 weights, and minus infinity where fewer than five of the tail stand out.
+    A generalised Pareto distribution is fitted to the largest weights, `tail` sqrt(n) of them but at most a fifth, with
+    the estimator of Zhang & Stephens (2009), as in Vehtari et al. (2024). Below 0.5 the weights have a finite variance;
+    above 0.7 their mean converges too slowly to be used. k is infinite for fewer than 25 weights, and minus infinity
+    where fewer than five of the tail exceed the rest.
     """
     n = len(log_weight)
     n_tail = int(min(0.2 * n, tail * math.sqrt(n)))

@@ -82,16 +82,16 @@ class Kernels:
 class KernelMove:
     """A move that draws above a bound by independent proposals from kernels about the live points.
 
-    Every chain starts at a live point and accepts or rejects its proposals in turn, so the uniform
-    density above the bound is left invariant; with `moves` accepted on average it forgets its start.
-    Suited to few parameters, where many proposals lie above the bound. Where fewer than one in
-    `patience` is accepted, chains of `otherwise` take over.
+    Every chain starts at a live point and accepts or rejects its proposals in turn, so the uniform density above the
+    bound is left invariant; with `moves` accepted on average it forgets its start. Suited to few parameters, where many
+    proposals lie above the bound. Where fewer than one in `patience` is accepted, the chains of `otherwise` go on from
+    the ends.
 
     Parameters
     ----------
     moves
-        Target number of accepted proposals per chain, on average. A chain with none stays where it
-        is, which is valid; about exp(-moves) of them do.
+        Target number of accepted proposals per chain, on average. A chain with none stays at its start, which is valid;
+        about exp(-moves) of the chains do.
     n_proposals
         Number of proposals per chain, tuned to that target.
     patience
@@ -116,7 +116,7 @@ class KernelMove:
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
-        """Return the ends of one chain from each start; see `Move`."""
+        """Return the ends of one chain from each start, and the tally; see `Move`."""
         n_chains = len(start)
         space = evaluate.space
         kernels = Kernels.at_points(live, rng=rng)
@@ -162,8 +162,9 @@ def _accept_in_turn(
 ) -> _LastAcceptedProposals:
     """Let every chain accept or reject its proposals in turn (Metropolis-Hastings, independent proposals).
 
-    `possible` and `log_target`, the log of target over proposal density, have one entry per proposal,
-    (n_steps * n_chains,), steps first; `log_now` (n_chains,) is that of the starts.
+    `possible`, whether each proposal lies above the bound, and `log_target`, the log of target over proposal density,
+    are (n_steps * n_chains,), steps first; `log_now` is that log at the starts, (n_chains,). `log_odds`: logs of
+    uniform numbers, (n_steps, n_chains).
     """
     n_steps, n_chains = log_odds.shape
     log_target = np.where(possible, log_target, -np.inf).reshape(n_steps, n_chains)

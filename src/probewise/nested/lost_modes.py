@@ -1,10 +1,10 @@
 """Look for a mode of the posterior that died out among the live points before its evidence counted.
 
-Two modes shrink at the same rate until their tops are near, over tens of nats, and all that while the number of live
-points in each drifts. A narrow mode that begins with a few of them may lose them all: neither the run nor anything that
-starts from its posterior can know of it. But points in it are among those that died early. Where the likelihood has a
-dip on the straight line from an early dead point to the nearest sample of the posterior, the point lies apart. Few
-points of a problem with one mode do. Some of those that do climb; the hills that they end on are candidates.
+Two modes shrink at the same rate until their tops are near, and over these tens of nats the number of live points in
+each drifts. A narrow mode that begins with a few points may lose them all: neither the run nor anything that starts
+from its posterior can know of the mode. But some of the points that died early lie in it. Where the likelihood has a
+dip on the straight line from an early dead point to the nearest posterior sample, the point lies apart; in a problem
+with one mode few points do. Some of the points apart are climbed from; the peaks reached are candidates.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NEAREST = 3
 
 
 def _n_early_dead_points(run: NestedResult) -> int:
-    """Count the dead points that hold the first tenth of the posterior's mass."""
+    """Count the early dead points: those that hold the first tenth of the posterior's mass."""
     return int(np.searchsorted(np.cumsum(run.weight), _BULK))
 
 
@@ -50,9 +50,9 @@ def sds_after_early_dead_points(run: NestedResult, space: Space) -> FloatArray:
 def peaks_climbed_from_early_points(
     first: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> list[GaussianAtPeak]:
-    """Climb from early dead points that a dip separates from the posterior; return peaks that are high and apart.
+    """Climb from early dead points that a dip separates from the posterior; return the peaks that are high and apart.
 
-    At most `max_calls` evaluations, counted by `evaluate`, are used for lines to the posterior, and some for climbs.
+    At most `max_calls` evaluations, counted by `evaluate`, are used for lines to the posterior; the climbs come on top.
     """
     n_params = len(evaluate.names)
     n_starts = int(min(max_calls, _SHARE * first.n_calls) / len(_ON_LINE))
@@ -84,7 +84,8 @@ def _climb_along_random_lines(
 ) -> tuple[Points, FloatArray]:
     """Move points to higher places on random lines; steps grow where they succeed and shrink where they fail.
 
-    `root`: a root of each point's covariance, (n, n_params, n_params). Also return the scales of the steps, (n,).
+    `root`: a root of each point's covariance, (n, n_params, n_params). Return the points and the last step scales,
+    (n,).
     """
     space, now, scale = evaluate.space, start.copy(), np.ones(len(start))
     for _ in range(_SWEEPS * max(now.u.shape[1], _FEWEST_STEPS)):
@@ -112,9 +113,10 @@ def _climb_along_random_lines(
 def separated_by_dip_mask(
     points: Points, known: Points, scale: FloatArray, n_nearest: int, evaluate: Evaluator, rng: np.random.Generator
 ) -> BoolArray:
-    """Return a mask, (n,), of points with a dip of the likelihood on the straight line to each of their nearest known.
+    """Return a mask, (n,), of points with a dip of the likelihood on the line to each of their nearest `known` points.
 
-    `scale`, (n_params,), is the unit of distance along each coordinate. The evaluations on the lines are counted.
+    A dip is 1 nat or more. `scale`, (n_params,), is the unit of distance along each coordinate. `evaluate` counts the
+    evaluations on the lines.
     """
     from scipy.spatial import cKDTree  # slow to import, and needed by runs only
 
@@ -133,7 +135,7 @@ def separated_by_dip_mask(
 
 
 def _rows_far_apart(x: FloatArray, height: FloatArray) -> IntArray:
-    """Return rows of points (n, n_params) that lie far apart: the highest, then the furthest from those before it."""
+    """Return rows of at most 8 points (n, n_params) far apart: the highest, then the furthest from those before it."""
     chosen = [int(height.argmax())]
     square = ((x - x[chosen[0]]) ** 2).sum(axis=1)
     while len(chosen) < _MOST_HILLS and square.max() > 0:

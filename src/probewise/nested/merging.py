@@ -26,11 +26,11 @@ _LEAST_ERROR = 1e-12
 def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
     """Merge independent runs of the same problem into one run with the live points of all.
 
-    A point is alive between the level above which it was drawn and its own. Sorted by level, the points
-    of all runs form a run whose number of live points at each level is the sum of theirs (Higson,
-    Handley, Hobson & Lasenby 2019, section 4). The runs may differ in their numbers of live points and in
-    where they stop. The labels make the count exact on plateaus. Merged runs may be merged again. The error of
-    ln Z falls as one over the root of the number of runs.
+    A point is alive between the level above which it was drawn and its own. Sorted by level, the points of all runs
+    form a run whose number of live points at each level is the sum over the runs (Higson, Handley, Hobson & Lasenby
+    2019, section 4). The runs may differ in their numbers of live points and in where they stop. The labels make the
+    count exact on plateaus. Merged runs may be merged again. The error of ln Z falls as one over the root of the number
+    of runs.
 
     Parameters
     ----------
@@ -49,8 +49,8 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     Raises
     ------
     ParameterError
-        If there are fewer than two runs, or their parameters differ, or they share a seed or lack a
-        complete record of births and deaths.
+        If there are fewer than two runs, or their parameters differ, or they share a seed or lack a complete record of
+        births and deaths.
     """
     parts = tuple(results)
     seeds = _seed_states_of_mergeable_runs(parts)
@@ -105,7 +105,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
 def _error_and_doubts(
     agreement: Agreement, check: Check | None, p_value: float, log_z: float, error: float
 ) -> tuple[float, list[str]]:
-    """Return the error of the runs together, widened where they disagree, and the doubts about them in words."""
+    """Return the error of the joint log Z, widened where the runs disagree, and the doubts about the runs in words."""
     doubts = list[str]()
     if agreement.p_value < _DISAGREE:
         doubts.append(
@@ -128,7 +128,7 @@ def _error_and_doubts(
 def agreement_of(results: Iterable[NestedResult]) -> Agreement:
     """Compare the evidences of independent runs by chi-square; a merged run counts as its single runs.
 
-    Raises ParameterError for fewer than two runs.
+    ParameterError for fewer than two runs.
     """
     log_z, log_z_error = list[float](), list[float]()
     for result in results:
@@ -160,7 +160,7 @@ class JoinedRecord:
 
     @classmethod
     def from_records(cls, parts: Sequence[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]) -> JoinedRecord:
-        """Join the records of all runs: log likelihood, label, log birth and birth label, (n_dead of the run,) each."""
+        """Join the runs' records: of each log likelihood, label, log birth and birth label, (n_dead of the run,)."""
         together = [np.concatenate(each) for each in zip(*parts, strict=True)]
         order = np.lexsort((together[1], together[0]))
         log_likelihood, label, log_birth, birth_label = (each[order] for each in together)
@@ -168,7 +168,7 @@ class JoinedRecord:
         return cls(order, log_likelihood, label, log_birth, birth_label, n_at_death)
 
     def parents_in_joined_order(self, parent: IntArray) -> IntArray:
-        """Convert rows of parents in the concatenated records, -1 for none, to rows in order of death, (n_dead,)."""
+        """Convert parents' rows in the concatenated records, -1 for none, to rows in order of death, (n_dead,)."""
         place = np.argsort(self.order)
         return np.asarray(np.where(parent >= 0, place[parent], -1)[self.order])
 
@@ -244,7 +244,7 @@ def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object
 
 
 def generator_states_of(result: NestedResult) -> list[object]:
-    """Return the states of all generators that a result began with."""
+    """Return the states of the random generators that a result began with: one per run or addition joined in it."""
     state = json.loads(result.seed_state)
     return state if isinstance(state, list) else [state]
 
@@ -266,6 +266,6 @@ def _pooled_log_possible_share(parts: Sequence[NestedResult]) -> tuple[float, fl
 
 
 def combined_p_value(p_values: Sequence[float]) -> float:
-    """Combine independent p values (Fisher)."""
+    """Combine independent p values into one (Fisher's method)."""
     statistic = -2.0 * float(np.log(np.maximum(p_values, 1e-300)).sum())
     return float(chdtrc(2 * len(p_values), statistic))

@@ -1,10 +1,10 @@
 """Look for parts of the posterior that a run has missed, from its last live points and its dead ones.
 
 Candidates come from three searches. Early dead points climb to modes that died out (`lost_modes`). Draws about the last
-live points climb to the top of their peak (`ascent`): a top far above all points of the run means that the run ended
-beside the bulk of its posterior, on the arm of a heavy tail along which its chains hardly moved. Draws about that top
-meet narrow peaks above the end (`higher_peaks`). Each hill is weighed by importance sampling, and held against the
-share of the run's posterior at the same place (`hills`).
+live points climb to the top of their peak (`ascent`): a top far above all points of the run means that the run ended on
+the arm of a heavy tail, along which its chains hardly moved, beside the bulk of its posterior. Draws about that top
+meet narrow peaks above the end (`higher_peaks`). The evidence of each hill is estimated by importance sampling and
+compared with that of the run in the same region (`hills`).
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ _MISSING = 1.0  # errors by which a part that has no live points raises log Z, a
 
 @dataclass(frozen=True, eq=False)
 class MissedHills:
-    """Hills that a run has missed: parts `lost` by its live points, and narrow peaks `above` its end.
+    """Hills that a run has missed: hills `lost` by its live points, and narrow peaks `above` its end.
 
-    `n_calls`: evaluations that were used to look for them.
+    `n_calls`: evaluations that were used to look for the hills.
     """
 
     lost: tuple[HillEstimate, ...] = ()
@@ -86,21 +86,8 @@ def find_missed_hills(
 ) -> MissedHills:
     """Look for parts of the posterior that a run has missed; nothing is found for a prior without an inverse.
 
-    Parameters
-    ----------
-    run, problem
-        A run and its problem.
-    max_calls
-        Limit of evaluations; about a third of the run's are used.
-    rng
-        Source of randomness.
-    lost
-        Parts that are known already, from the run that this one repeats; no others are then looked for.
-
-    Raises
-    ------
-    NotConvergedError
-        If the likelihood fails.
+    `max_calls`: limit of evaluations; about a third of the run's are used. `lost`: parts that are known already, from
+    the run that this one repeats; no others are then looked for. NotConvergedError if the likelihood fails.
     """
     if not run.names or not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
         return MissedHills()
@@ -125,7 +112,10 @@ def find_missed_hills(
 def _weigh_hills_and_keep_unmet(
     tops: Iterable[GaussianAtPeak], run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> tuple[HillEstimate, ...]:
-    """Weigh the hills below these tops, each once and the highest first; return those that a run has not met."""
+    """Estimate the evidence of the hill under each top, the highest first; return the hills that a run has not met.
+
+    Tops that no dip separates from a hill already estimated are skipped.
+    """
     hills, most = list[HillEstimate](), evaluate.n_calls + max_calls
     rest = sorted(tops, key=lambda top: top.highest_log_likelihood)
     scale = sds_after_early_dead_points(run, evaluate.space)

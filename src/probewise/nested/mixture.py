@@ -17,8 +17,8 @@ _PER_PARAMETER = 1.0  # samples for each parameter of a component, at least
 def fit_mixture(x: FloatArray, weight: FloatArray | None = None, *, rng: np.random.Generator) -> Proposal:
     """Fit a mixture to samples, (n_samples, n_params), of equal weight or with weights, (n_samples,).
 
-    The number of components with the greatest held-out likelihood (fit to one half, score on the other) is fitted
-    to all samples.
+    The number of components, 1 to 40, with the greatest held-out likelihood (fit to one half, score on the other) is
+    fitted to all samples.
     """
     order = rng.permutation(len(x))
     x, weight = x[order], np.ones(len(x)) if weight is None else weight[order]
@@ -39,7 +39,7 @@ def fit_mixture(x: FloatArray, weight: FloatArray | None = None, *, rng: np.rand
 def _fit_components(
     x: FloatArray, weight: FloatArray, n_components: int, n_iterations: int, rng: np.random.Generator
 ) -> Proposal:
-    """Fit a mixture of `n_components` Student t by `n_iterations` steps of expectation maximisation."""
+    """Fit up to `n_components` Student t by expectation maximisation; components with too few samples are dropped."""
     n_params = x.shape[1]
     centre = weight @ x / weight.sum()
     off = x - centre
@@ -68,7 +68,7 @@ def _fit_components(
 
 
 def single_student_t(mean: FloatArray, covariance: FloatArray) -> Proposal:
-    """Return one Student t distribution of this mean (n_params,) and covariance (n_params, n_params) of its kernel."""
+    """Return one Student t distribution of this mean, (n_params,), and scale matrix, (n_params, n_params)."""
     return _mixture_as_proposal(mean[None], _cholesky_factors(covariance[None]), np.ones(1))
 
 
@@ -94,7 +94,7 @@ def _initial_components_by_kmeans(
     n_components: int,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return components from k-means++ (Arthur & Vassilvitskii 2007) to start from.
+    """Return components to start from, by k-means++ (Arthur & Vassilvitskii 2007).
 
     Shares (k,), means (k, n_params) and roots of covariances (k, n_params, n_params).
     """
@@ -121,7 +121,7 @@ def _initial_components_by_kmeans(
 def _log_densities_and_square_distances(
     x: FloatArray, share: FloatArray, mean: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Log of share times density up to a constant, and squared distance, of every component, both (k, n)."""
+    """Return log(share times density) up to a constant and the squared distance in sds, per component, (k, n) each."""
     n_params = x.shape[1]
     white = (x[None] - mean[:, None]) @ np.linalg.inv(root).transpose(0, 2, 1)
     square = (white**2).sum(axis=2)

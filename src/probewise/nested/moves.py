@@ -79,7 +79,7 @@ class PriorRejection:
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
-        """Return `len(start)` points; see `Move`."""
+        """Return `len(start)` points and the tally; see `Move`."""
         wanted, found, parts, n_evaluated = len(start), 0, [], 0
         while found < wanted:
             batch = int(1.1 * (wanted - found) / self.volume) + 1
@@ -99,27 +99,26 @@ class PriorRejection:
 class SliceMove:
     """A move by chains of slice-sampling steps (Neal 2003), all chains advancing together.
 
-    A step draws a line through the chain's point, a bracket of fixed width placed at random about
-    the point, and candidates within it; a rejected candidate becomes the bracket's new end. There is
-    no stepping out: with a width that does not depend on the point the step is reversible without
-    it (Neal's limit m = 1), which saves evaluations. Each chain proceeds to its next step as soon as a
-    candidate is accepted, so the batches stay full.
+    A step draws a line through the chain's point, a bracket of fixed width placed at random about the point, and
+    candidates within the bracket; a rejected candidate becomes the bracket's new end. There is no stepping out: with a
+    width that does not depend on the point the step is reversible without (Neal's limit m = 1), which saves
+    evaluations. Each chain goes on to its next step once a candidate is accepted, so the batches stay full.
 
-    Where the prior is not uniform in the sampling space, a step first draws a level below its
-    density at the point, and candidates must lie above that too (Neal's auxiliary height): a
-    rejection for that reason costs no likelihood.
+    Where the prior is not uniform in the sampling space, a step first draws a level below the prior density at the
+    point; the density at candidates must exceed that level too (Neal's auxiliary height). A rejection for that reason
+    costs no likelihood.
 
     Four kinds of steps, each reversible by itself:
 
     - along the axes of the space, each on a scale drawn between the conditional and the marginal
       sd of the live points: a parameter uncorrelated with the others moves far in one step;
     - along random orthonormal directions in the metric of the live points, so that n_params
-      successive steps cover every direction. Where the live points form clusters, each has its own
-      metric and such a step stays within its cluster's part of space;
+      successive steps cover every direction. Where the live points form clusters, each has its own metric and such a
+      step stays within its cluster's part of space;
     - along the difference of two live points, within and between clusters;
     - a hop, where there are clusters: the affine map between two clusters takes the point to its
-      counterpart in the other, accepted with the ratio of their volumes. Hops keep the share of
-      live points in each mode from drifting.
+      counterpart in the other, accepted with the ratio of their volumes. Hops keep the share of live points in each
+      mode from drifting.
 
     Parameters
     ----------
@@ -130,7 +129,7 @@ class SliceMove:
     axes
         Share of the steps along axes.
     differences
-        Share of the steps along differences of live points.
+        Share of the steps along differences of live points; the rest are along random directions.
     hops
         Number of hops per chain, where there are clusters.
     target
@@ -160,7 +159,7 @@ class SliceMove:
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
-        """Return the ends of one chain from each start; see `Move`."""
+        """Return the ends of one chain from each start, and the tally; see `Move`."""
         n_chains, n_params = start.u.shape
         space = evaluate.space
         walls = _bounds_of_coordinates(space)
@@ -185,7 +184,7 @@ class SliceMove:
         n_evaluated = n_tried = n_taken = 0
 
         def begin_step(rows: IntArray) -> None:
-            """Set up the next step's line, bracket and level."""
+            """Set up the line, the bracket and the level of the next step of the chains `rows`."""
             at = step[rows]
             kinds, measure = kind[rows, at], metrics.covariance_row_of_each_chain(rows, home[rows])
             toward = np.zeros((rows.size, n_params))
@@ -281,7 +280,7 @@ class SliceMove:
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
     def _draw_kinds_of_steps(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
-        """Draw the kind of every step of every chain, (n_chains, n_steps)."""
+        """Draw the kind of every step (`_FRAME`, `_AXIS`, `_DIFFERENCE` or `_HOP`), (n_chains, n_steps)."""
         lot = rng.random((n_chains, n_steps))
         kind = np.where(lot < self.axes, _AXIS, np.where(lot < self.axes + self.differences, _DIFFERENCE, _FRAME))
         kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = _HOP
@@ -302,10 +301,11 @@ class SliceMove:
 def _draw_candidates_ahead(
     low: FloatArray, high: FloatArray, n_ahead: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Draw the next candidates on each line as if all before were rejected, (n, n_ahead), and the bracket if all are.
+    """Draw the next candidates on each line as if all before were rejected, in units of the line, (n, n_ahead).
 
-    A rejection shrinks the bracket whatever the likelihood was, so candidates can be drawn ahead and
-    evaluated together: the chain is the same, at the cost of a few evaluations for full batches.
+    Also return the ends of the bracket if all are rejected, (n,) each. A rejection shrinks the bracket whatever the
+    likelihood was, so candidates can be drawn ahead and evaluated together: the chain is the same, at the cost of a few
+    evaluations for full batches.
     """
     t = np.empty((len(low), n_ahead))
     for k in range(n_ahead):
@@ -316,7 +316,7 @@ def _draw_candidates_ahead(
 
 
 def _count_candidates_used(ok: BoolArray) -> tuple[IntArray, BoolArray]:
-    """Count the candidates, of (n, n_ahead), that each step used; also whether one was accepted, both (n,)."""
+    """Count the candidates each step used, given which are accepted, (n, n_ahead); also whether any is, (n,) each."""
     delivered = np.asarray(ok.any(axis=1))
     return np.where(delivered, np.argmax(ok, axis=1) + 1, ok.shape[1]), delivered
 
@@ -324,8 +324,8 @@ def _count_candidates_used(ok: BoolArray) -> tuple[IntArray, BoolArray]:
 def _random_orthonormal_directions(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
     """Draw rows of random orthogonal matrices where `needed`, (n_chains, n_steps), is true.
 
-    Returns (n_chains, n_steps rounded up to whole matrices, n_params). Matrices of which no row is needed are not
-    orthogonalised, which is the costly part.
+    Return (n_chains, n_steps rounded up to whole matrices, n_params). A matrix of which no row is needed is left as
+    drawn, not orthogonalised, which saves time.
     """
     n_chains, n_steps = needed.shape
     first = np.arange(0, n_steps, n_params)
@@ -336,7 +336,7 @@ def _random_orthonormal_directions(needed: BoolArray, n_params: int, rng: np.ran
 
 
 def _axis_numbers_in_random_order(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
-    """Draw axes, (n_chains, n_steps), in random order without repetition until all were used."""
+    """Draw axis numbers, (n_chains, n_steps), in random order without repetition until all were used."""
     n_turns = -(-n_steps // n_params)
     return np.argsort(rng.random((n_chains, n_turns, n_params)), axis=2).reshape(n_chains, -1)[:, :n_steps]
 
@@ -345,11 +345,11 @@ def _axis_numbers_in_random_order(n_chains: int, n_steps: int, n_params: int, rn
 class _ClusterCovariancesByChain:
     """The clusters' covariances for each chain: its own cluster is computed without the chain's starting point.
 
-    A covariance that includes the start stretches the lines through it and shrinks the others; with
-    150 live points in 20 dimensions that alone raised log Z by more than one.
+    A covariance that includes the start stretches the lines through it and shrinks the others; with 150 live points in
+    20 dimensions that alone raised log Z by more than one.
 
-    The rows are the clusters, then each chain's version of its starting cluster: `each`, and for every axis the
-    conditional sd and the ratio of the marginal sd to it.
+    `each`: the clusters, followed by each chain's version of its starting cluster. `conditional` and `widening`: for
+    each of these rows and every axis the conditional sd, and the ratio of the marginal sd to it.
     """
 
     each: Clusters
@@ -363,7 +363,7 @@ class _ClusterCovariancesByChain:
     def from_clusters(
         cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray
     ) -> _ClusterCovariancesByChain:
-        """Compute those of chains that start at `u`, (n_chains, n_params), in clusters `home`, (n_chains,)."""
+        """Compute the covariances for chains that start at `u`, (n_chains, n_params), in clusters `home`."""
         same = np.logical_and.reduce(
             [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]
         )
@@ -381,13 +381,16 @@ class _ClusterCovariancesByChain:
         )
 
     def covariance_row_of_each_chain(self, rows: IntArray, home: IntArray) -> IntArray:
-        """Return for chains `rows` the row of the covariance of cluster `home`; of their own, without their start."""
+        """Return the row of `each` for cluster `home` of the chains `rows`, (n,).
+
+        For the cluster in which a chain began it is the version without the chain's start.
+        """
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
     def map_with_log_volume_ratio(
         self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Map points to their counterparts in other clusters; also return the log of the volume ratio."""
+        """Map points of chains `rows` from clusters `home` to `goal`; also return the log of the volume ratio, (n,)."""
         return self.each.map_with_log_volume_ratio(
             u, self.covariance_row_of_each_chain(rows, home), self.covariance_row_of_each_chain(rows, goal)
         )
@@ -405,7 +408,7 @@ class _PeriodicAxes:
 
     @classmethod
     def cut_where_empty(cls, periodic: tuple[int, ...], live: FloatArray) -> _PeriodicAxes | None:
-        """Cut each circle in the middle of the widest gap between live points, (n_live, n_params)."""
+        """Cut each circle in the middle of the widest gap between live points, (n_live, n_params); None without any."""
         if not periodic:
             return None
         columns = np.array(periodic)
@@ -432,7 +435,7 @@ Walls: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 def _bounds_of_coordinates(space: Space) -> Walls | None:
-    """Bounds of each coordinate, infinite for periodic ones; None if no coordinate is bounded."""
+    """Return the lower and upper bounds, (n_params,), infinite for periodic coordinates; None if none is bounded."""
     low, high = space.low.copy(), space.high.copy()
     low[list(space.periodic)], high[list(space.periodic)] = -np.inf, np.inf
     return (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
@@ -441,7 +444,10 @@ def _bounds_of_coordinates(space: Space) -> Walls | None:
 def _random_bracket(
     u: FloatArray, rows: IntArray, line: FloatArray, walls: Walls | None, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Place a bracket of length one at random about each point `u[rows]`, truncated where the line leaves the space."""
+    """Place a bracket of length one at random about each point `u[rows]`, truncated where the line leaves the space.
+
+    Return its ends in units of `line`, (n,) each; the point is at zero.
+    """
     low = -rng.random(rows.size)
     if walls is None:
         return low, low + 1.0

@@ -25,8 +25,8 @@ _LINKS = 10
 class Proposal:
     """A mixture of Student-t kernels, of one shape within each cluster.
 
-    `centres` in each cluster's whitened frame, one array (n_kernels, n_params) per cluster; `width` of the
-    kernels there; `share` of the draws for each cluster, (n_clusters,).
+    `centres` in each cluster's whitened frame, one array (n_kernels, n_params) per cluster; `width` of the kernels in
+    that frame; `share` of the draws for each cluster, (n_clusters,).
     """
 
     clusters: Clusters
@@ -81,10 +81,11 @@ def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) 
 
 
 def find_disconnected_clusters(x: FloatArray) -> Clusters:
-    """Find the parts of a set of samples, (n_samples, n_params): its disconnected pieces, and their clusters.
+    """Split samples, (n_samples, n_params), into disconnected pieces, each piece into clusters; return all clusters.
 
     Pieces are the connected components of the nearest-neighbour graph, so they are found at any scale and in any number
-    (a lattice of modes, which no pair of Gaussians explains). Pieces too small for a covariance join the nearest one.
+    (also a lattice of modes, which pairs of Gaussians do not split). Pieces too small for a covariance join the
+    nearest.
     """
     # Imported here: they take a quarter of a second, and most runs of the program do not need them.
     from scipy.sparse import coo_array
@@ -116,12 +117,12 @@ def _concatenated_clusters(parts: Sequence[Clusters]) -> Clusters:
 
 
 def fit_wide_and_narrow_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal, ...]:
-    """Fit two proposals to samples, (n_samples, n_params): the best wide form and the best narrow form.
+    """Fit two proposals to samples, (n_samples, n_params): the best wide form, then the best narrow form.
 
-    Wide: one kernel per cluster, as wide as the cluster. Narrow: kernels at the samples, of Silverman's
-    width or less. Either with or without clusters. Of each form the variant with the greatest held-out
-    likelihood (fit to one half, score on the other) is fitted to all samples. The caller decides between
-    the two by weighted draws: the likelihood favours a close fit, the weights a wide one.
+    Wide: one kernel per cluster, as wide as the cluster. Narrow: kernels at the samples, of Silverman's width or less.
+    Either with or without clusters. Of each form the variant with the greatest held-out likelihood (fit to one half,
+    score on the other) is fitted to all samples. The caller decides between the two by weighted draws: the likelihood
+    favours a close fit, the weights a wide one. Fewer than 80 samples give one wide kernel only.
     """
     x = x[rng.permutation(len(x))]
     half = len(x) // 2
@@ -137,7 +138,10 @@ def fit_wide_and_narrow_proposals(x: FloatArray, *, rng: np.random.Generator) ->
 
 
 def _fit_kernels(x: FloatArray, split: bool, scale: float | None) -> Proposal:
-    """Fit one form of proposal: by cluster if `split`; one kernel each if `scale` is None, else at samples."""
+    """Fit one form of proposal: by cluster if `split`; one kernel per cluster if `scale` is None, else at samples.
+
+    `scale`: width of the kernels in units of Silverman's.
+    """
     clusters = find_disconnected_clusters(x) if split else Clusters.from_groups([x])
     home = clusters.assign(x)
     n_params = x.shape[1]

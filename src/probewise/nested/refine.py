@@ -38,33 +38,33 @@ def refine(
 ) -> Weighted:
     """Reduce the error of a run's evidence and posterior by importance sampling.
 
-    Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot
-    round a few draws of each are weighted; the form with the larger effective sample size gets the larger
-    share of the mixture, and its weighted draws are added to the samples for the next fit. Finally
-    `n_draws` points are drawn. Only these count, so they are independent.
+    Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot round a few
+    draws of each are weighted; the form with the larger effective sample size gets the larger share of the mixture, and
+    its weighted draws are added to the samples for the next fit. Finally `n_draws` points are drawn. Only these count,
+    so they are independent.
 
-    The error includes three corrections. The held-out third of the samples is combined with the draws by
-    bridge sampling (Meng & Wong 1996), which estimates the share of the posterior that the proposal
-    misses. A heavy tail of the weights, which slows the convergence of their mean, increases the error. And
-    the run may have lost a part of the posterior: with n_live points and information H it knows the
-    shares of the posterior's parts as precisely as n_live / H independent samples. So a part of share s is
-    lost with probability exp(-s n_live / H); the sum of s times that over the parts found is added.
+    The error includes three corrections. The held-out third of the samples is combined with the draws by bridge
+    sampling (Meng & Wong 1996), which estimates the share of the posterior that the proposal misses. A heavy tail of
+    the weights, which slows the convergence of their mean, increases the error. And the run may have lost a mode: with
+    n_live points and information H (nats) it knows the shares of modes as precisely as n_live / H independent samples.
+    So a mode of share s is lost with probability exp(-s n_live / H); the sum of s times that over the modes found is
+    added.
 
     Parameters
     ----------
     result
-        A run of the same problem.
+        A run of the same problem, or an earlier refinement.
     problem
         Prior and likelihood.
     rng
         Source of randomness.
     n_draws
-        Number of final draws; every pilot round takes a quarter of that in addition.
+        Number of final draws, 100 or more; every pilot round takes a quarter of that in addition.
     n_pilots
         Number of pilot rounds, 1 or more.
     look
-        Whether to look for parts of the posterior that the run has missed, if the run has not looked itself (it was
-        made with `max_cost=1`): about a quarter of its evaluations. A part that matters is a doubt.
+        Whether to look for parts of the posterior that the run has missed, if the run has no check (it was made with
+        `max_cost=1`): about a quarter of its evaluations. A part that matters is added to the doubts.
 
     Returns
     -------

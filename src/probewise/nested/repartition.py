@@ -2,10 +2,10 @@
 
 Evidence and posterior depend only on the product of prior and likelihood, so any density may replace the prior if the
 likelihood compensates for it (Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29, 835; Petrosyan & Handley 2023,
-Phys. Sci. Forum 5, 51). From a density near the posterior there are few nats of compression, which lowers the cost
-and the error of a run. Live points climb to regions that the density undersamples, where importance sampling
-(`probewise.nested.importance`) would depend on a few weights. A distant part of the posterior without any sample
-is not searched for again.
+Phys. Sci. Forum 5, 51). From a density near the posterior there are few nats of compression, which lowers the cost and
+the error of a run. Live points climb to regions that the density undersamples, where importance sampling
+(`probewise.nested.importance`) would depend on a few weights. A distant part of the posterior without any sample stays
+unseen.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class _StudentMixture:
     """A mixture of products of Student t in unbounded coordinates x, one part per cluster of samples.
 
     Part k has the probability `share` (n_parts,); in it x = `center` (n_parts, n_params) + `root` (n_parts, n_params,
-    n_params) e, where the coordinates e along its principal axes are independent Student t.
+    n_params) e, where the coordinates e along its principal axes are independent Student t of 5 degrees of freedom.
     """
 
     share: FloatArray
@@ -52,12 +52,10 @@ class _StudentMixture:
 
     @cached_property
     def inverse_root(self) -> FloatArray:
-        """Inverses of the roots, (n_parts, n_params, n_params)."""
         return np.asarray(np.linalg.inv(self.root))
 
     @cached_property
     def log_det_of_roots(self) -> FloatArray:
-        """Log absolute determinants of the roots, (n_parts,)."""
         return np.asarray(np.linalg.slogdet(self.root)[1])
 
     def to_principal_axes(self, x: FloatArray, part: int) -> FloatArray:
@@ -110,7 +108,7 @@ class _PriorNearPosterior:
 
     @property
     def coordinates(self) -> _PriorNearPosterior:
-        """Itself: it maps parameters to the coordinates of chains."""
+        """The prior itself: it maps parameters to the coordinates of chains."""
         return self
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -129,7 +127,7 @@ class _PriorNearPosterior:
         return self.space.leave(self.parts.x_from_principal_axes(e, part))[0]
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Return the place in the cube that leads to theta by way of the part that is densest there."""
+        """Map theta to points of the unit cube, (n, n_params), by way of the part that is densest at theta."""
         x = self.space.enter(theta)
         part = np.argmax(self.parts.log_densities(x), axis=0)
         e = np.stack([self.parts.to_principal_axes(x, k) for k in range(len(self.parts))])[part, np.arange(len(x))]

@@ -109,7 +109,7 @@ def warning_of_few_possible_draws(log_start: float, log_start_error: float, n_li
 
 
 def warning_of_few_lineages(memory: float) -> str | None:
-    """Return a warning if a run's `memory` is so large that the error derived from it is uncertain, else None."""
+    """Return a warning if the lineage variance exceeds 10, so that the error from it is uncertain; else None."""
     if memory <= _MOST_MEMORY:
         return None
     return (
@@ -188,10 +188,10 @@ class NestedResult(DeadPoints):
 
     @property
     def calls_per_live_point_and_nat(self) -> float:
-        """Likelihood evaluations per live point and nat of information.
+        """Likelihood evaluations per live point and nat of information; infinite without information.
 
-        At least one: n_live deaths compress the volume by one nat, and each dead point is replaced.
-        The excess is the cost of drawing above a bound.
+        At least one: n_live deaths compress the volume by one nat, and each dead point is replaced. The excess is the
+        cost of drawing above a bound.
         """
         return self.n_calls / (self.n_live * self.information) if self.information > 0 else math.inf
 
@@ -276,7 +276,7 @@ class NestedResult(DeadPoints):
         Raises
         ------
         FileError
-            If the file is damaged, or is not a result in this version of the format.
+            If there is no such file, or it is damaged, or not a result in this version of the format.
         """
         path = checked_path("path", path)
         try:

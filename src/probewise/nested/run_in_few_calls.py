@@ -1,13 +1,14 @@
 """`run_in_few_calls`: few evaluations, for likelihoods that take seconds.
 
 The chains of a nested run spend most evaluations far from the posterior. Here draws from the prior are weighted by a
-small power of the likelihood, a density is fitted to them, and more are drawn from it. The power rises to one as the
-weights allow (adaptive multiple importance sampling; Cornuet, Marin, Mira & Robert 2012). All draws count at every
-power, as draws from the mixture of all densities so far.
+small power of the likelihood, a density is fitted to the weighted draws, and more are drawn from that density. The
+power rises to one as the weights allow (adaptive multiple importance sampling; Cornuet, Marin, Mira & Robert 2012). All
+draws count at every power, as draws from the mixture of all densities so far.
 
-Such draws do not show what they undersample. So a short nested run follows, from a prior near the posterior that they
-found (`probewise.nested.repartition`). Its live points climb to what the densities left out, and a third of its samples
-corrects the evidence by bridge sampling (`probewise.nested.importance`). Where no density fits, its evidence is used.
+Such draws do not show which regions they undersample. So a short nested run follows, from a prior near the posterior
+found so far (`probewise.nested.repartition`). Its live points climb to undersampled regions, and a third of its samples
+corrects the evidence by bridge sampling (`probewise.nested.importance`). Where no density fits, that run's evidence is
+used.
 """
 
 from __future__ import annotations
@@ -175,7 +176,7 @@ def run_in_few_calls(
 
 
 def _weighted_from_run(run: NestedResult, log_likelihood: FloatArray, n_calls: int, k: float = math.inf) -> Weighted:
-    """Return a nested run's samples and evidence, in place of those of draws whose Pareto k is `k`."""
+    """Return a nested run's samples and evidence as `Weighted`; `k`: Pareto k of the draws that they replace."""
     return Weighted(
         run.names,
         run.theta,
@@ -200,7 +201,10 @@ def _draw_until_error_is_reached(
     max_calls: int,
     rng: np.random.Generator,
 ) -> Weighted:
-    """Draw from a density fitted to the explored draws and the second run's samples, until the error is as wanted."""
+    """Draw from a density fitted to the explored draws and the second run's samples, until the error is `wanted`.
+
+    At most three fits; the draws end before `max_calls` evaluations.
+    """
     n_params = len(evaluate.names)
     fitted, held = split_off_held_out(second, effective_lineages(second), space, rng)
     n_known = int(n_effective(explored.log_weight))
@@ -269,7 +273,7 @@ def _draw_at_rising_powers(
 
 
 class _DrawsOfAllSources:
-    """All draws so far, with the log density of every source at each of them, (n, n_sources)."""
+    """All draws so far, with the log density there of the prior and of every fit drawn from, (n, n_sources)."""
 
     def __init__(self, evaluate: Evaluator, space: Space) -> None:
         self._evaluate, self._space = evaluate, space
@@ -322,7 +326,7 @@ def _log_density_of_source(source: Proposal | None, x: FloatArray, log_density: 
 
 
 def _fit_mixture_with_wider_component(x: FloatArray, log_weight: FloatArray, rng: np.random.Generator) -> Proposal:
-    """Fit a mixture to weighted draws, and one component wider than all of them."""
+    """Fit a mixture to weighted draws, (n, n_params); a quarter of it is one component wider than all draws."""
     # Weights are cut at their mean times sqrt(n) (Ionides 2008), lest one draw take the fit.
     alive = np.flatnonzero(np.isfinite(log_weight))
     cut = np.minimum(log_weight[alive], float(logsumexp(log_weight)) - 0.5 * math.log(alive.size))

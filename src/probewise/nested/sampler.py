@@ -62,7 +62,7 @@ def least_live(n_params: int) -> int:
 
 
 def move_at_volume(move: Move, log_volume: float) -> Move:
-    """Return draws from the whole prior while more than a twentieth of its volume is left, then the move itself."""
+    """Return a move that draws from the whole prior while more than a twentieth of its volume is left, then `move`."""
     volume = math.exp(log_volume)
     return move if volume <= _PRIOR_VOLUME else PriorRejection(volume)
 
@@ -70,12 +70,12 @@ def move_at_volume(move: Move, log_volume: float) -> Move:
 def replace_worst_live_points(
     live: LivePoints, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
 ) -> tuple[LivePoints, DeadPointsOfRound, Tally]:
-    """Replace the `n_replaced` worst live points by new ones above the best of them.
+    """Replace the `n_replaced` worst live points by new ones above the best of the replaced.
 
-    Returns the new live points, the dead ones, and the statistics of the move.
+    Return the new live points, the dead ones, and the statistics of the move.
 
-    The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is
-    counted exactly; their successors are drawn together.
+    The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is counted
+    exactly; the new points are drawn together.
     """
     n_live = len(live.points)
     order = live.points.rows_by_rising_likelihood()
@@ -208,7 +208,7 @@ class _RunUnderWay:
         return _final_result(self.evaluate, noted, self.n_live, reason, self.seed_state, summing)
 
     def run_to_end(self, max_calls: int | None, progress: Callable[[RoundSummary], None] | None) -> NestedResult:
-        """Do rounds until the rule ends them, or the next one might exceed `max_calls` evaluations."""
+        """Do rounds until the rule ends the run or the next round might exceed `max_calls`; return the result."""
         while self.now.ended is None:
             # A round can cost twice the last one: the volume halves while points are drawn from the prior.
             if max_calls is not None and self.evaluate.n_calls + 2 * self.now.last_cost > max_calls:
@@ -316,9 +316,9 @@ def _initial_run_state(
 ) -> RunState:
     """Draw the first live points from the part of the prior with nonzero likelihood; return the run's first state.
 
-    Impossible hypotheses (zero likelihood) are counted and discarded; the initial volume is the share
-    m / n of possible ones. Where these are rare, chains supply the missing live points, and go on until all have
-    forgotten the few that they began at.
+    Impossible hypotheses (zero likelihood) are counted and discarded; the initial volume is the share m / n of possible
+    ones. Where fewer than `n_live` are found in 100 `n_live` draws or more, chains supply the others, and go on until
+    all have forgotten their few starts. NotConvergedError if no draw is possible.
     """
     most = max(100 * n_live, 20_000) if max_calls is None else min(max(100 * n_live, 20_000), max_calls)
     n_params = len(evaluate.names)
@@ -425,7 +425,7 @@ def _final_result(
 
 
 def _result_of_problem_without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> NestedResult:
-    """Evaluate the single hypothesis of a problem without free parameters."""
+    """Return the result of a problem without free parameters; NotConvergedError if its likelihood is zero."""
     theta = np.empty((1, 0))
     log_likelihood = evaluate.log_likelihood(theta)
     if not np.isfinite(log_likelihood[0]):

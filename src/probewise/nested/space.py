@@ -17,7 +17,7 @@ _EDGE = 1e-15
 
 
 class Space(Protocol):
-    """The coordinates in which chains move, with the prior's density in them."""
+    """The coordinates in which chains move, with the prior's density in the coordinates."""
 
     @property
     def periodic(self) -> tuple[int, ...]:
@@ -138,7 +138,7 @@ class _PriorWithCoordinates(Protocol):
 
 @runtime_checkable
 class _CoordinatesWithDraw(Protocol):
-    """Coordinates that draw from the prior themselves, because some of them match no parameters."""
+    """Coordinates with a draw from the prior of their own, because some coordinates match no possible parameters."""
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...
 

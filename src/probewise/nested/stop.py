@@ -14,10 +14,11 @@ from probewise.errors import ParameterError
 class RoundSummary:
     """Summary of a run after a round, passed to `progress` and to the stopping rule.
 
-    `log_z` counts the dead points only. `log_z_remaining` is the log of an upper bound on the live
-    points' evidence, the best likelihood times the remaining volume; `log_ratio_remaining` is the log of
-    its ratio to the evidence so far. `last_change` is the increase of `log_z` by the last dead point;
-    `log_volume` the log of the remaining share of the prior; `level` whether all live points have the same likelihood.
+    `n_dead`, `n_calls`: dead points and likelihood evaluations so far. `log_z` counts the dead points only.
+    `log_z_remaining` is the log of an upper bound on the live points' evidence: the best likelihood times the remaining
+    volume; `log_ratio_remaining` is the log of that bound over the evidence so far. `last_change` is the increase of
+    `log_z` by the last dead point; `log_volume` the log of the remaining share of the prior; `level` whether all live
+    points have the same likelihood.
     """
 
     n_dead: int

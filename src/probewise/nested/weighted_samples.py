@@ -55,7 +55,7 @@ class WeightedSamples(ShowsItself):
         return np.asarray((centred * self.weight[:, None]).T @ centred)
 
     def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
-        """Weighted quantiles of each parameter, (n_q,) -> (n_q, n_params)."""
+        """Weighted quantiles of each parameter at levels 0 to 1, (n_q,) -> (n_q, n_params); ParameterError outside."""
         return weighted_quantiles(self.theta, self.weight, q)
 
     def interval(self, mass: float = 0.95) -> FloatArray:

@@ -25,7 +25,8 @@ def power_bracket(
 ) -> tuple[float, float]:
     """Bracket by bisection the largest power whose log weights have an effective sample size of `wanted` or more.
 
-    Returns the ends of the bracket: the weights of the lower one have enough, those of the upper one too few.
+    Return the ends of the bracket: the weights of the lower one have enough, those of the upper one too few. `low` and
+    `high` must be such ends; `log_weight_at` maps a power, or its log, to log weights, (n,).
     """
     for _ in range(n_steps):
         middle = (low + high) / 2
@@ -34,7 +35,10 @@ def power_bracket(
 
 
 def resampled_rows(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
-    """Draw rows by weight with systematic resampling, (n_weights,) -> (n,): counts are n w rounded up or down."""
+    """Draw rows by weight with systematic resampling, (n_weights,) -> (n,): counts are n w rounded up or down.
+
+    The rows are sorted; w are the weights divided by their sum.
+    """
     ladder = np.cumsum(weight)
     rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
     return np.asarray(np.minimum(rows, len(ladder) - 1))

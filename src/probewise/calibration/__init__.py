@@ -1,7 +1,8 @@
-"""Calibrate a sensor's SSF from a recording: its number of Gaussians by evidence, its field as posterior mean.
+"""Calibrate a sensor's spatial sensitivity function (SSF) from a recording.
 
-Paper, sections "Estimating SSF MoG Model Parameters" and "Light Sensor SSF MoG Model": eqs. "Evidence1"
-and "studentT", the table of log evidences, and the weighted mean of sampled SSF fields.
+The evidence gives its number of Gaussians N (the order), the posterior mean its field. Paper, sections "Estimating SSF
+MoG Model Parameters" and "Light Sensor SSF MoG Model": eqs. "Evidence1" and "studentT", the table of log evidences, and
+the weighted mean of sampled SSF fields.
 """
 
 from probewise.calibration.fields import choose_pixel_mm, mixture_moments, posterior_mean_ssf_field

@@ -1,8 +1,8 @@
-"""A start density for the part of a posterior where all Gaussians are bright: a Student-t fitted to the order below.
+"""A start density for the part of a posterior where all N Gaussians are bright: a Student-t fitted to N - 1 Gaussians.
 
-Where N Gaussians share the light of one footprint, its moments are those that N - 1 Gaussians have. The readings
-contain little information on the rest: each Gaussian's share, place and width. Such a part of the posterior is broad,
-far from that of N - 1 Gaussians with a faint one more, and has no peak of its own.
+N Gaussians that share the light of one footprint have the same moments as a whole as N - 1 Gaussians. The readings
+contain little information on each Gaussian's own share, centre and width. Such a part of the posterior is broad, has no
+peak of its own, and lies far from that of N - 1 Gaussians with a faint one added.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _WIDENED = 2.0
 
 @dataclass(frozen=True, eq=False)
 class AllGaussiansBrightDensity:
-    """A Student-t in `WholeFootprintCoordinates`: a `ReferenceDensity`."""
+    """A Student-t `one` in the coordinates `space` of N Gaussians, usable as a `ReferenceDensity`."""
 
     space: WholeFootprintCoordinates
     one: StudentTDensity
 
     @classmethod
     def from_samples_below(cls, space: WholeFootprintCoordinates, fewer: FloatArray) -> AllGaussiansBrightDensity:
-        """Make the density of N Gaussians from samples `fewer` of N - 1 in such coordinates, (n, 6 N - 4)."""
+        """Make the density of N Gaussians from samples `fewer` of N - 1, (n, 6 N - 4), in coordinates like `space`."""
         d = fewer.shape[1] + 6
         own, last = np.r_[: d - 8, d - 2, d - 1], np.arange(d - 8, d - 2)
         mean, covariance = fewer.mean(axis=0), _WIDENED**2 * np.cov(fewer, rowvar=False)
@@ -53,12 +53,12 @@ class AllGaussiansBrightDensity:
         return self.space.prior
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
-        """Return the log of this density divided by the prior's (of sorted Gaussians), (n, 6 N + 2) -> (n,)."""
+        """Log of this density over the prior's, Gaussians sorted by mass: (n, 6 N + 2) -> (n,)."""
         x = self.space.enter(theta)
         return np.asarray(self.one.log_density(x) - self.space.leave(x)[1])
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw one for each row of `rest`, (n, 6 N + 2); nan where outside the prior."""
+        """Draw as many parameters as `rest` has rows, (n, 6 N + 2); nan where outside the prior."""
         theta, log_prior = self.space.leave(self.one.draw(len(rest), rng))
         theta[~np.isfinite(log_prior)] = np.nan
         return theta

@@ -1,8 +1,9 @@
 """Check by one search of the whole prior that an SMC run missed no peak: nested sampling with few live points.
 
-An SMC run (climb) starts at the peaks that least squares found, so it may miss a peak with a small basin. A search
-needs no start. With few live points its evidence is rough, but its samples show where the posterior lies: where many of
-them are far from all samples of the climb, or its evidence is higher than the errors allow, the climb missed a part.
+An SMC run (sequential Monte Carlo, a climb) starts at the peaks that least squares found, so it may miss a peak with a
+small basin. A search needs no start. With few live points its evidence is rough, but its samples show where the
+posterior lies. The SMC run missed a part if many samples of the search lie far from all of its own, or if the search's
+evidence is higher than the errors allow.
 """
 
 from __future__ import annotations
@@ -29,20 +30,9 @@ _N_SAMPLES, _N_OWN, _N_OTHERS = 300, 500, 2000
 def missed_part_in_words(
     problems: ProblemsByOrder, n: int, climbed: SMCResult, *, rng: np.random.Generator, progress: Progress | None = None
 ) -> str:
-    """Search the prior, and describe in words what an SMC run missed; empty if nothing.
+    """Search the prior of `n` Gaussians, and describe in words what the SMC run `climbed` missed; "" if nothing.
 
-    Parameters
-    ----------
-    problems
-        Problems of the recording, by order.
-    n
-        Number of Gaussians.
-    climbed
-        The SMC run that is checked.
-    rng
-        Source of randomness.
-    progress
-        Called after each round of the search.
+    `progress` is called after each round of the search.
     """
     problem = problems.problem(n)
     n_live = max(_LEAST_LIVE, _LIVE_PER_PARAM * len(problem.prior.names))
@@ -73,16 +63,10 @@ def _missed_part_by_comparison_in_words(
 
 
 def share_far_from_known(known: FloatArray, asked: FloatArray, *, rng: np.random.Generator) -> float:
-    """Return the share of samples that lie further from known ones than the known ones from each other.
+    """Return the share of samples `asked`, (m, d), that lie far from the samples `known`, (n, d), ordered by cloud.
 
-    Parameters
-    ----------
-    known
-        Samples in coordinates, (n, d), cloud after cloud: the first 500 are held against 2,000 of the others.
-    asked
-        The samples of which the share is returned, (m, d).
-    rng
-        Source of randomness.
+    Distances are to the nearest of 2,000 known samples, in the known ones' covariance. Far is further than each of the
+    first 500 known samples, which are not among the 2,000.
     """
     from scipy.spatial.distance import cdist  # slow to import, and needed by calibrations only
 

@@ -40,7 +40,7 @@ _LOG_ROOT_2PI = 0.5 * float(np.log(2.0 * np.pi))
 class CompensatingShift:
     """Shift of the other Gaussians' coordinates that compensates for one Gaussian more, and that one's share of light.
 
-    `shift`: per share of the light, (n, d). `mean`, `sd`: of the share's first-order posterior, (n,) each; the sd is
+    `shift`: per unit of that share, (n, d). `mean`, `sd`: of the share's first-order posterior, (n,) each; the sd is
     widened by 1.2.
     """
 
@@ -50,7 +50,7 @@ class CompensatingShift:
 
     @classmethod
     def concatenate(cls, parts: Sequence[CompensatingShift]) -> CompensatingShift:
-        """Concatenate the rows of several."""
+        """Concatenate the rows of several shifts."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
 
     def select_rows(self, rows: IntArray) -> CompensatingShift:
@@ -58,7 +58,7 @@ class CompensatingShift:
         return CompensatingShift(self.shift[rows], self.mean[rows], self.sd[rows])
 
     def with_rows_replaced(self, rows: IntArray, other: CompensatingShift) -> CompensatingShift:
-        """Return a copy in which `rows` are those of `other`."""
+        """Return a copy in which the rows of `other` stand at `rows`."""
         out = self.select_rows(np.arange(len(self.mean)))
         out.shift[rows], out.mean[rows], out.sd[rows] = other.shift, other.mean, other.sd
         return out
@@ -88,9 +88,9 @@ class CompensatingShift:
         return np.asarray(-0.5 * z * z - _LOG_ROOT_2PI - np.log(self.sd) - log_mass)
 
     def _light_share_bounds_in_sds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Bounds of the share, 0 and `most`, in sds from its mean, (n,) each; and the rows that are mirrored, (n,).
+        """Return the bounds 0 and `most` in sds from the mean, (n,) each; and the mask of mirrored rows, (n,).
 
-        Where both bounds lie above the mean, they change places and signs.
+        Where both bounds lie above the mean, they change places and signs (mirrored).
         """
         low, high = -self.mean / self.sd, (most - self.mean) / self.sd
         mirrored = low > 0
@@ -107,11 +107,11 @@ class _LinearisedPosterior:
         Problem of one Gaussian.
     response
         Matrix that multiplies a change of the readings in noise sds, (n_used, 1 + d). Column 0 gives the product with
-        the mean residual, the others give minus the shift of the coordinates. The masses do not shift.
+        the mean residual, the others give minus the shift of the coordinates. The light's shares do not shift.
     inverse
         Inverse covariance of the coordinates that shift, with zeros for the others, (d, d).
     dark, bright
-        Mean prediction less the dark level, mean difference of the levels, in noise sds, (n_used,).
+        Mean prediction minus I_min, and mean of I_max - I_min, both in noise sds, (n_used,).
     """
 
     alone: SensorProblem
@@ -128,7 +128,7 @@ class _LinearisedPosterior:
         alone: SensorProblem,
         theta: FloatArray,
     ) -> _LinearisedPosterior:
-        """Compute means and covariances from posterior samples of N - 1 Gaussians, (n, 6 N - 4)."""
+        """Compute means and covariances from samples `theta`, (n, 6 N - 4), of the posterior of problem `below`."""
         recording = below.recording
         used = recording.usable
         predicted = below.model.predict(theta, recording.plan)[:, used]
@@ -156,7 +156,7 @@ class _LinearisedPosterior:
         )
 
     def compensating_shift(self, gaussian: FloatArray) -> CompensatingShift:
-        """Return the shifts that compensate for Gaussians, (n, 6); their amplitude does not matter."""
+        """Return the shifts that compensate for one Gaussian more per row, (n, 6); its amplitude does not matter."""
         blocks = np.array_split(gaussian, max(1, -(-len(gaussian) // _AT_ONCE)))
         parts = [self._compensating_shift_of_block(block) for block in blocks]
         return CompensatingShift.concatenate(parts)
@@ -175,9 +175,10 @@ class _LinearisedPosterior:
 
 @dataclass(frozen=True, eq=False)
 class CompensatedShapeProposal:
-    """A proposal of one Gaussian more: its shape (place and widths), and how the other N - 1 shift to compensate.
+    """A proposal of one Gaussian more: its shape (centre and widths), and how the other N - 1 shift to compensate.
 
-    Shapes are drawn from a large pool of draws from the prior, by their first-order evidence; some by the prior alone.
+    Shapes are drawn from a large pool of draws from the prior, nine tenths by their first-order evidence, the rest
+    evenly.
 
     Attributes
     ----------
@@ -188,11 +189,11 @@ class CompensatedShapeProposal:
     pool
         Gaussians drawn from the prior, (n_pool, 6).
     answers
-        Shifts for the Gaussians of the pool.
+        Compensating shifts for the Gaussians of the pool, n_pool rows.
     most
-        Share of the light up to which first-order evidences are integrated.
+        Share of the light up to which first-order Bayes factors are integrated.
     log_norm
-        Log of the mean of their power 0.8 over the pool.
+        Log of the mean over the pool of the Bayes factors to the power 0.8.
     """
 
     coordinates: MomentCoordinates | WholeFootprintCoordinates
@@ -215,18 +216,9 @@ class CompensatedShapeProposal:
     ) -> CompensatedShapeProposal:
         """Linearise a problem of N - 1 Gaussians about its posterior samples, and draw at most `n_pool` shapes.
 
-        Parameters
-        ----------
-        below, alone
-            Problems of N - 1 Gaussians and of one, over one recording.
-        coordinates
-            Coordinates of N - 1 Gaussians.
-        theta
-            Posterior samples of `below`, (n, 6 N - 4).
-        rng
-            Source of randomness.
-        n_pool
-            Largest number of shapes; fewer are drawn if 4,000 of them are effective.
+        `below`, `alone`: problems of N - 1 Gaussians and of one, over one recording. `coordinates`: of N - 1 Gaussians.
+        `theta`: posterior samples of `below`, (n, 6 N - 4). Fewer shapes than `n_pool` are drawn once 4,000 are
+        effective.
         """
         linear = _LinearisedPosterior.from_samples(below, coordinates, alone, theta)
         prior = coordinates.prior
@@ -244,12 +236,12 @@ class CompensatedShapeProposal:
         return cls(coordinates, linear, np.concatenate(pools), CompensatingShift.concatenate(answers), most, log_norm)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, CompensatingShift]:
-        """Draw shapes, (n, 6) with amplitudes to be replaced, and the shifts that compensate for them."""
+        """Draw `n` shapes, (n, 6) with amplitudes to be replaced; also return the shifts that compensate for them."""
         log_weight = self.log_density_over_prior(self.answers)
         rows = rng.permutation(resampled_rows(np.exp(log_weight - log_weight.max()), n, rng))
         return self.pool[rows], self.answers.select_rows(rows)
 
     def log_density_over_prior(self, answer: CompensatingShift) -> FloatArray:
-        """Log of the density from which `draw` draws, over the prior's, (n,)."""
+        """Log of the density from which `draw` draws, over the prior's, of shapes with the shifts `answer`, (n,)."""
         asked = _TEMPERED * answer.log_bayes_factor(self.most) - self.log_norm
         return np.asarray(np.logaddexp(math.log(_PLAIN), math.log(1.0 - _PLAIN) + asked))

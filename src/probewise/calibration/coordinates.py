@@ -1,4 +1,4 @@
-"""Sampling coordinates for calibration: moments of the SSF instead of A, B and C."""
+"""Sampling coordinates for calibration: moments of the SSF instead of A, B and C (entries of precision matrices)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probewise.priors import Prior
 
 
 class MixturePrior(Prior, Protocol):
-    """A prior of a mixture's parameters with what the coordinates need beside its density."""
+    """A prior of a mixture's parameters with all that `MomentCoordinates` needs beside the density."""
 
     @property
     def n_gaussians(self) -> int:
@@ -21,11 +21,14 @@ class MixturePrior(Prior, Protocol):
         ...
 
     def amplitude_at_unit_mass(self, determinant: FloatArray) -> FloatArray:
-        """Return the unit of a: the amplitude at the prior's unit of mass, for a Gaussian's A B - C^2; any shape."""
+        """Return the amplitude at the prior's unit of mass, for a Gaussian's `determinant` A B - C^2, of any shape."""
         ...
 
     def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
-        """Return the log density of parameters by kind, (6, N, n_samples), and levels, (n_samples,) each."""
+        """Return the log density, (n_samples,), of parameters `g` by kind (a, u, v, A, B, C), (6, N, n_samples).
+
+        `i_min`, `i_max`: levels, (n_samples,) each.
+        """
         ...
 
 
@@ -33,14 +36,14 @@ class MixturePrior(Prior, Protocol):
 class MomentCoordinates:
     """Moments of a mixture as sampling coordinates, each determined by few readings (`probewise.priors.Coordinates`).
 
-    A scan across an edge determines the variance along its direction, which is a nonlinear combination of
-    A, B and C. Here the coordinates of each Gaussian are its centre, the log variances along x' and y',
-    and the inverse hyperbolic tangent of its correlation. The first Gaussian also has its log
-    amplitude in the prior's unit and, instead of its own centre, that of the whole footprint; the others
-    have the log ratio of their mass to the first one's. I_min and I_max follow.
+    A scan across an edge determines the variance along its direction, which is a nonlinear combination of A, B and C.
+    Here the coordinates of each Gaussian are its centre, the log variances along x' and y', and the inverse hyperbolic
+    tangent of its correlation. The first Gaussian also has its log amplitude in the prior's unit and, instead of its
+    own centre, that of the whole footprint; the others have the log ratio of their mass to the first one's. I_min and
+    I_max follow.
 
-    The Gaussians are sorted by mass, greatest first, and the prior's density is multiplied by N!: the
-    readings do not depend on the labels, so N! equal modes become one and the evidence is unchanged.
+    The Gaussians are sorted by mass, greatest first, and the prior's density is multiplied by N!: the readings do not
+    depend on the labels, so N! equal modes become one and the evidence is unchanged.
     """
 
     prior: MixturePrior
@@ -70,7 +73,7 @@ class MomentCoordinates:
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates to parameters, (n_samples, 6 N + 2); also return the log prior density, (n_samples,).
 
-        It is the density of the coordinates, -inf where the Gaussians are not sorted.
+        It is the density in the coordinates, -inf where the Gaussians are not sorted.
         """
         n = self.prior.n_gaussians
         # One contiguous row per kind of coordinate, for speed.
@@ -108,7 +111,7 @@ class MomentCoordinates:
 
 
 def view_by_kind_and_gaussian(columns: FloatArray) -> FloatArray:
-    """View the Gaussians' parameters or coordinates, (n_samples, 6 N + 2), as (6 kinds, N, n_samples)."""
+    """View the Gaussians' columns, in (n_samples, 6 N + 2), as (6 kinds, N, n_samples), without a copy."""
     return columns[:, :-2].reshape(len(columns), columns.shape[1] // 6, 6).transpose(2, 1, 0)
 
 

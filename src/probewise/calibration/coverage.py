@@ -56,14 +56,17 @@ class TrueSensor:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often the 95 % interval of each quantity contained the truth, in `n_recordings` recordings."""
+    """How often the 95 % interval of each quantity contained the truth, in `n_recordings` recordings.
+
+    `held`: the count by quantity. `n_live`: live points of each fit.
+    """
 
     n_recordings: int
     held: dict[str, int]
     n_live: int
 
     def to_json(self, **about: object) -> str:
-        """Return the counts with their Wilson intervals as JSON; `about` is added to it, such as the command."""
+        """Return the counts with their Wilson intervals as JSON text; `about` is added, such as the command."""
         rows = {}
         for name, k in self.held.items():
             within = binomtest(k, self.n_recordings).proportion_ci(method="wilson")
@@ -115,7 +118,7 @@ def simulate_coverage(
     Parameters
     ----------
     n_recordings
-        Number of recordings.
+        Number of recordings, 1 or more; else ParameterError.
     rng
         Source of randomness for truths, noise and fits; spawned for each recording.
     n_live
@@ -166,7 +169,7 @@ def interval_holds_truth_by_quantity(truth: TrueSensor, samples: FloatArray) -> 
 def simulate_log_z_lead_of_one_gaussian(
     truth: TrueSensor, *, rng: np.random.Generator, n_live: int = 300, quick: bool = False
 ) -> tuple[float, float]:
-    """Simulate a single-Gaussian recording; return log Z of one Gaussian minus that of two, and its error."""
+    """Simulate a recording of `truth`; return log Z of one Gaussian minus that of two, and its error."""
     recording = simulate_paper_recording(truth, rng=rng)
     one, two = calibrate(recording, orders=(1, 2), n_live=n_live, quick=quick, rng=rng).orders
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
@@ -229,7 +232,7 @@ def main() -> None:
 
 
 def _true_quantities(truth: TrueSensor) -> dict[str, float]:
-    """Return what `mixture_moments` and the levels are of a sensor, by the same names."""
+    """Return a sensor's moments and levels by quantity, named as by `mixture_moments`, and "I_min" and "I_max"."""
     return {
         "centre x'": truth.center_mm[0],
         "centre y'": truth.center_mm[1],
@@ -242,7 +245,6 @@ def _true_quantities(truth: TrueSensor) -> dict[str, float]:
 
 
 def _central_interval(samples: FloatArray) -> tuple[float, float]:
-    """Lower and upper end of the central 95 % interval."""
     low, high = np.quantile(samples, [0.5 - _MASS / 2, 0.5 + _MASS / 2])
     return float(low), float(high)
 

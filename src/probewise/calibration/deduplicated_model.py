@@ -13,7 +13,7 @@ from probewise.sensor import COMMANDED, SensorModel
 class DeduplicatedModel:
     """Wrapper of a model that predicts repeated rows of one plan only once.
 
-    The model's predictions may depend only on a row's place, orientation, pattern, and commanded height and LED, as
+    The model's predictions may depend only on a row's position, orientation, pattern, and commanded height and LED, as
     those of a chain without effects do. The wrapper predicts only the plan that it was made for.
     """
 

@@ -1,7 +1,7 @@
-"""A start density of N Gaussians: a part of the posterior of N - 1 with one more, faint Gaussian.
+"""A start density of N Gaussians: samples of a part of the posterior of N - 1, with one faint Gaussian added to each.
 
-The new one is added to the others as they are; or added while the others shift to compensate for it; or split off a
-bright one so that light, centre and covariance of the two stay (split and merge moves: Richardson & Green 1997).
+The others stay; or they shift to compensate for the new one; or the new one is split off a bright one so that light,
+centre and covariance of the two stay (split and merge moves: Richardson & Green 1997).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _TINY = float(np.finfo(float).tiny)
 
 
 def has_uniform_prior_of_light(prior: SSFPrior) -> bool:
-    """Return whether the prior of a Gaussian's light is uniform from 0, as `FaintGaussianReferenceDensity` requires."""
+    """Return whether a Gaussian's light has a uniform prior from 0, as `FaintGaussianReferenceDensity` requires."""
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
 
 
@@ -63,7 +63,7 @@ class AddedGaussianProposal:
     share
         Share of the draws.
     draw
-        Adds one Gaussian to each sample, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible.
+        Adds one Gaussian to each sample, (n, 6 N - 4) -> (n, 6 N + 2); nan where that is impossible.
     back
         Inverse of `draw`, (n, 6 N + 2) -> (n, 6 N - 4). It also returns the log of the density over the prior's, (n,),
         without the likelihood of N - 1 Gaussians and the factor 1 / N.
@@ -78,25 +78,25 @@ class AddedGaussianProposal:
 class FaintGaussianReferenceDensity:
     """A part of the posterior of N - 1 Gaussians with one more, lighter than each of them, and faint.
 
-    Gaussians have no labels, so they are sorted by mass here as in `MomentCoordinates`, the lightest last. With p_N
-    the prior of N unsorted Gaussians, L the likelihood and Z the evidence of the part of N - 1, the density mixes three
+    Gaussians have no labels, so they are sorted by mass here as in `MomentCoordinates`, the lightest last. With p_N the
+    prior of N unsorted Gaussians, L the likelihood and Z the evidence of the part of N - 1, the density mixes three
     ways:
 
-    - One is added. With m the most mass that it may have (the least of the N - 1, or `FAINT` of the greatest), in the
-      prior's unit, and r the new one's density over its prior's below m: N! p_N L r / (N m Z). r mixes Gaussians of the
-      prior, light ones more often, and some near one of the others.
+    - One is added. With m the most mass that it may have (that of the lightest of the N - 1, or if less, a tenth
+      of the heaviest's), in the prior's unit, and r the new one's density over its prior's below m: N! p_N L r / (N m
+      Z). r mixes Gaussians of the prior, light ones more often, and some near one of the others.
     - One is added and the others shift, by an amount that depends on the new one and the masses alone, so that volumes
       stay; see `CompensatedShapeProposal`.
     - A bright one is split. Its moments (mass, mass times centre, mass times second moment) lose those of
       the new one, which lies near it; at a fixed new one that is a shift, so volumes of moments stay.
 
-    All integrate to one, so that the evidence of N over that of N - 1 is the mean of posterior density over
-    reference, both without their Z, over draws from the reference.
+    All integrate to one, so that the evidence of N over that of N - 1 is the mean of posterior density over reference,
+    both without their Z, over draws from the reference.
 
     Parameters
     ----------
     prior
-        Prior of N Gaussians, 2 or more, with uniform mass; see `has_uniform_prior_of_light`.
+        Prior of N Gaussians, 2 or more, with uniform mass (see `has_uniform_prior_of_light`); else ParameterError.
     below
         Problem of N - 1 Gaussians.
     compensation
@@ -116,7 +116,7 @@ class FaintGaussianReferenceDensity:
 
     @cached_property
     def proposals(self) -> tuple[AddedGaussianProposal, ...]:
-        """The proposals that the density mixes."""
+        """The proposals that the density mixes: a split per bright Gaussian, an addition, a compensated addition."""
         return (
             *(
                 AddedGaussianProposal(
@@ -157,7 +157,7 @@ class FaintGaussianReferenceDensity:
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Replace one faint Gaussian: the others shift to compensate, or the new one is split off a bright one.
 
-        Returns the new parameters, (n, 6 N + 2), nan where there are none; and the log of the density over the prior's
+        Return the new parameters, (n, 6 N + 2), nan where there are none; and the log of the density over the prior's
         at the old parameters, minus that at the new ones, (n,); -inf where the move is impossible.
         """
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
@@ -172,11 +172,10 @@ class FaintGaussianReferenceDensity:
     def _propose_faint_gaussian_replaced(
         self, here: FloatArray, *, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """Take away any Gaussian but the first, undo the shift of the others, add another one and shift them for it.
+        """Take away any one faint Gaussian, undo the shift of the others, add another one and shift them for it.
 
-        The new one may be as heavy as the first, so that all others are moved, not the lightest alone. `here` is
-        sorted; returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new,
-        both over the prior's, (n,); -inf where the move is impossible.
+        The new one may be heavier than other faint ones, so that each of these is moved, not the lightest alone. `here`
+        is sorted; the new one comes last. Return as `propose` does.
         """
         m, n = len(here), self.prior.n_gaussians
         g = here[:, :-2].reshape(m, n, 6)
@@ -201,7 +200,7 @@ class FaintGaussianReferenceDensity:
         return np.concatenate([theta[:, :-8], theta[:, -2:]], axis=1)
 
     def with_drawn_gaussian(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Add a Gaussian, drawn from the class's r, to N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2)."""
+        """Add a Gaussian, drawn from the density r of the class, to N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2)."""
         n = len(rest)
         near = rng.random(n) < _NEAR
         last = self.prior.from_unit_cube(rng.random((n, len(self.prior.names))))[:, :6]
@@ -213,7 +212,7 @@ class FaintGaussianReferenceDensity:
         return _insert_gaussian_before_levels(rest, last)
 
     def log_density_of_drawn_gaussian(self, theta: FloatArray) -> FloatArray:
-        """Log of the class's r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
+        """Log of r / m, as defined for the class, at the last Gaussian, (n, 6 N + 2) -> (n,)."""
         mass = self._masses(theta)
         least = self._greatest_faint_mass(mass[:, :-1], last_of_all=True)
         near = self._log_density_near_others(theta[:, -8:-2], self.without_last_gaussian(theta))
@@ -233,9 +232,9 @@ class FaintGaussianReferenceDensity:
     def _draw_gaussian_and_compensate(
         self, rest: FloatArray, last_of_all: bool, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, CompensatingShift]:
-        """Draw a Gaussian and shift N - 1 others, sorted by mass, to compensate for it.
+        """Draw a Gaussian and shift N - 1 others, sorted by mass, to compensate; `last_of_all`: it is the lightest.
 
-        Returns the others, (n, 6 N - 4), the new one, (n, 6), and its compensating shift.
+        Return the others, (n, 6 N - 4), nan where impossible, the new one, (n, 6), and its compensating shift.
         """
         last, answer = self.compensation.draw(len(rest), rng=rng)
         near = np.flatnonzero(rng.random(len(rest)) < _NEAR)
@@ -275,7 +274,7 @@ class FaintGaussianReferenceDensity:
         return before, np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
 
     def _draw_gaussians_near_others(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Draw Gaussians near one of the others, their mass to be replaced, (n, 6 N - 4) -> (n, 6)."""
+        """Draw Gaussians, (n, 6), each near one of the others, (n, 6 N - 4); their masses are to be replaced."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
         centre, width = self._cube_places_and_kernel_widths(rest)
@@ -284,7 +283,7 @@ class FaintGaussianReferenceDensity:
         return self.prior.from_unit_cube(u)[:, :6]
 
     def _log_density_near_others(self, last: FloatArray, rest: FloatArray) -> FloatArray:
-        """Log density of shapes, (n, 6), near one of the others, over the prior's, (n,)."""
+        """Log density of shapes, (n, 6), near one of the others, (n, 6 N - 4), over the prior's, (n,)."""
         centre, width = self._cube_places_and_kernel_widths(rest)
         at = self._cube_places_and_kernel_widths(_insert_gaussian_before_levels(rest[:, -2:], last))[0]
         return np.asarray(
@@ -292,7 +291,7 @@ class FaintGaussianReferenceDensity:
         )
 
     def split_gaussian_off_bright_one(self, rest: FloatArray, label: int, *, rng: np.random.Generator) -> FloatArray:
-        """Split a Gaussian off a bright one, (n, 6 N - 4) -> (n, 6 N + 2); nan where nothing of that one is left."""
+        """Split one off the bright Gaussian `label`, (n, 6 N - 4) -> (n, 6 N + 2); nan where no Gaussian is left."""
         last = self._draw_gaussian_near_bright_one(
             rest, label, self._greatest_faint_mass(self._masses(rest), last_of_all=True), rng
         )
@@ -305,7 +304,7 @@ class FaintGaussianReferenceDensity:
         return rest, self._log_density_of_split(rest, self.without_last_gaussian(theta), label, theta[:, -8:-2], most)
 
     def _propose_merge_and_split(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Merge a faint Gaussian into a bright one, and split another off a bright one; returns as `propose`."""
+        """Merge a faint Gaussian into a bright one, and split another off a bright one; return as `propose` does."""
         m, n = len(here), self.prior.n_gaussians
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         label = rng.integers(self.n_bright, n, size=m)
@@ -335,7 +334,7 @@ class FaintGaussianReferenceDensity:
     def _draw_gaussian_near_bright_one(
         self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw a Gaussian near a bright one, (n, 6), of a mass up to `most`."""
+        """Draw a Gaussian near the bright one number `label`, (n, 6), of a mass up to `most`, (n,)."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
         centre, width = self._cube_places_and_kernel_widths(rest)
@@ -345,7 +344,7 @@ class FaintGaussianReferenceDensity:
         return last
 
     def _split_gaussian_off(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
-        """Subtract a Gaussian's moments from those of a bright one, and append it; nan where nothing would be left."""
+        """Subtract the moments of `last` from those of Gaussian `label`, and append it; nan where none is left."""
         own = slice(6 * label, 6 * label + 6)
         left = self._gaussian_from_moments(self._moments_of_gaussian(rest[:, own]) - self._moments_of_gaussian(last))
         out = _insert_gaussian_before_levels(rest, last)
@@ -353,7 +352,7 @@ class FaintGaussianReferenceDensity:
         return np.where(np.isfinite(left).all(axis=1, keepdims=True), out, np.nan)
 
     def _merge_gaussian_into_bright_one(self, others: FloatArray, label: int, last: FloatArray) -> FloatArray:
-        """Add a Gaussian's moments to those of a bright one, keeping light, centre and covariance of the two."""
+        """Add the moments of `last` to those of Gaussian `label`: light, centre and covariance of the two stay."""
         own = slice(6 * label, 6 * label + 6)
         out = others.copy()
         out[:, own] = self._gaussian_from_moments(
@@ -409,7 +408,7 @@ class FaintGaussianReferenceDensity:
         return np.where(real[:, None], g, np.nan)
 
     def _greatest_faint_mass(self, masses: FloatArray, *, last_of_all: bool) -> FloatArray:
-        """Greatest mass of a faint Gaussian beside others, (n, N - 1) -> (n,); `last_of_all`: as the lightest one."""
+        """Return a tenth of the heaviest of the masses, (n, N - 1) -> (n,); with `last_of_all` at most the lightest."""
         most = FAINT * masses.max(axis=1)
         return np.asarray(np.minimum(most, masses.min(axis=1)) if last_of_all else most)
 
@@ -423,7 +422,10 @@ class FaintGaussianReferenceDensity:
         return np.asarray(g[..., 0] / self._amplitude_at_unit_mass(g))
 
     def _cube_places_and_kernel_widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Place of each Gaussian in the prior's cube, without its mass, (n, N', 5), and the widths of kernels there."""
+        """Return the coordinates of each Gaussian in the prior's cube, without its mass, and the sds of kernels there.
+
+        Both are (n, N', 5): centre along x' and y', A, B, correlation.
+        """
         prior = self.prior
         g = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
         a, b = g[..., 3], g[..., 4]
@@ -451,7 +453,7 @@ def _insert_gaussian_before_levels(rest: FloatArray, last: FloatArray) -> FloatA
 
 
 def _draw_mass_ratios(n: int, rng: np.random.Generator) -> FloatArray:
-    """Draw ratios of a new mass to the greatest that it may have, (n,)."""
+    """Draw `n` ratios of a new mass to the greatest that it may have, (n,)."""
     ratio = 1.0 - rng.random(n)
     light = rng.random(n) >= _EVEN_MASS
     ratio[light] = _LEAST_RATIO ** (1.0 - ratio[light])
@@ -465,7 +467,7 @@ def _log_density_of_mass_ratio(ratio: FloatArray) -> FloatArray:
 
 
 def _draw_truncated_normal(centre: FloatArray, width: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw from normal kernels truncated at the unit cube, (n, 5)."""
+    """Draw from normal kernels of mean `centre` and sd `width`, truncated at the unit cube, (n, 5)."""
     low, high = ndtr(-centre / width), ndtr((1.0 - centre) / width)
     return np.asarray((centre + width * ndtri(low + rng.random(centre.shape) * (high - low))).clip(1e-9, 1.0 - 1e-9))
 

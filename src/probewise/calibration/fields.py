@@ -1,4 +1,7 @@
-"""The posterior mean SSF field, on a grid chosen for the footprint (paper, section on MoG estimation)."""
+"""The posterior mean of the spatial sensitivity function (SSF) as a field, on a grid chosen for the footprint.
+
+Paper, section on MoG estimation.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +36,8 @@ def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray
 
     Returns
     -------
-    "centre x'", "centre y'" (mm), "log width along x'", "log width along y'" (of mm), and
-    "correlation of x' and y'", each of shape (n_samples,).
+    A dict of arrays (n_samples,): "centre x'", "centre y'" (mm), "log width along x'", "log width along y'" (natural
+    log of the sd in mm), and "correlation of x' and y'".
     """
     f = _footprint_of_samples(theta, n_gaussians)
     u, v = (f.weight * f.u_mm).sum(axis=-1), (f.weight * f.v_mm).sum(axis=-1)
@@ -66,11 +69,11 @@ def gaussians_sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> float:
-    """Choose the pixel size of the mean field: 1 mm, or finer where scan step or footprint require it.
+    """Choose the pixel size of the mean field in mm: 1, or finer where scan step or footprint require it.
 
-    It is at most the scan step and 1/4.5 of the sd of the narrowest Gaussian that holds a twentieth
-    of the mass (median over the samples), so that the sum over pixels errs by at most a thousandth of
-    I_max - I_min; rounded down to 1, 0.5, 0.2 or 0.1 times a power of ten.
+    It is at most the scan step and 1/4.5 of the sd of the narrowest Gaussian that holds a twentieth of the mass (median
+    over the samples), so that the sum over pixels errs by at most a thousandth of I_max - I_min; rounded down to 1,
+    0.5, 0.2 or 0.1 times a power of ten.
 
     Parameters
     ----------
@@ -99,7 +102,7 @@ def posterior_mean_ssf_field(
     weight: FloatArray | None = None,
     max_pixels: int = _MAX_PIXELS_A_SIDE,
 ) -> SSFField:
-    """Average the SSF fields of weighted samples on square pixels, one of them centred on the mechanical origin.
+    """Average the SSF fields of weighted samples on square pixels, centred on multiples of their width.
 
     Parameters
     ----------
@@ -110,15 +113,15 @@ def posterior_mean_ssf_field(
     pixel_mm
         Width of a pixel; enlarged for a footprint that would need more than `max_pixels` per side.
     weight
-        Posterior weights, (n_samples,); by default equal.
+        Posterior weights, (n_samples,); by default equal. The samples with the last thousandth are left out.
     max_pixels
         Largest number of pixels per side, 3 or more.
 
     Returns
     -------
     SSFField
-        The mean of the fields, not the field of the mean parameters. It extends five sds beyond all
-        centres except the outermost thousandth of the mass.
+        The mean of the fields, not the field of the mean parameters. It extends five sds beyond all centres except the
+        outermost thousandth of the mass.
     """
     if not (pixel_mm > 0 and math.isfinite(pixel_mm)):
         raise ParameterError("pixel_mm", pixel_mm, "greater than 0")
@@ -152,7 +155,7 @@ def _pixel_centres(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray
 
 
 def _footprint_bounds_along_axis(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
-    """Bounds along one axis, mm: five sds beyond all centres but those with the outermost thousandth of the mass."""
+    """Return the bounds along one axis, mm: five sds beyond all centres, without the outermost 0.001 of the mass."""
     return -_mass_quantile_999(_SIGMAS * sd - center, mass), _mass_quantile_999(center + _SIGMAS * sd, mass)
 
 

@@ -44,7 +44,7 @@ _UNINFORMED = 0.7
 
 @dataclass(frozen=True, eq=False)
 class OrderFit:
-    """The fit of an SSF of `n_gaussians` Gaussians: prior, evidence and posterior samples, fitted sensor."""
+    """The fit of an SSF of `n_gaussians` Gaussians: its prior, evidence and posterior `found`, and fitted sensor."""
 
     n_gaussians: int
     prior: SSFPrior
@@ -53,7 +53,7 @@ class OrderFit:
 
     @property
     def result(self) -> NestedResult | SMCResult:
-        """The posterior samples: of a nested sampling run, or of the SMC run (climb) of a quick calibration."""
+        """The posterior samples: a nested sampling run, or the SMC run of a quick calibration."""
         return self.found.result
 
     @property
@@ -81,7 +81,7 @@ class Calibration(ShowsItself):
 
     @property
     def chosen(self) -> OrderFit:
-        """The order of greatest evidence."""
+        """The fit of the order of greatest evidence."""
         return max(self.fits, key=lambda fit: fit.log_z)
 
     @property
@@ -91,7 +91,7 @@ class Calibration(ShowsItself):
 
     @property
     def orders(self) -> tuple[OrderEvidence, ...]:
-        """The paper's table: log evidence with its error, and parameter counts, one row per order."""
+        """The paper's table: one row per order, with log evidence, its error and parameter counts."""
         return self.sensor.orders
 
     @property
@@ -101,11 +101,11 @@ class Calibration(ShowsItself):
 
     @property
     def priors(self) -> tuple[PriorRow, ...]:
-        """The table of priors."""
+        """The table of priors of the chosen order, one row per kind of parameter."""
         return self.chosen.prior.table_rows()
 
     def order_probabilities(self) -> dict[int, float]:
-        """Posterior probability of each order, with equal prior probabilities."""
+        """Return the posterior probability by order, with equal prior probabilities."""
         log_z = np.array([fit.log_z for fit in self.fits])
         weight = np.exp(log_z - log_z.max())
         return {fit.n_gaussians: float(w) for fit, w in zip(self.fits, weight / weight.sum(), strict=True)}
@@ -142,13 +142,13 @@ def calibrate(
     orders
         Numbers of Gaussians to try.
     n_live
-        Live points of nested sampling, 2 or more; with `quick`, of the orders that are searched in full alone.
+        Live points of nested sampling, at least two per parameter; with `quick`, of orders searched in full alone.
     rng
         Source of randomness; spawned for each order.
     quick
-        Whether to reach each order by sequential Monte Carlo, from the peak of its likelihood or from the order
-        below (a climb); one search of the prior checks the chosen order. An order whose climb is doubtful is searched
-        by nested sampling, and a note says so. `probewise.calibrate` does this by default.
+        Whether to reach each order by sequential Monte Carlo, from the peak of its likelihood or from the order below
+        (a climb); one search of the prior checks the chosen order. An order whose climb is doubtful is searched by
+        nested sampling, and a note says so. `probewise.calibrate` does this by default.
     progress
         Called with the order and a `RoundSummary` after every round of nested sampling, or a `TemperatureSummary` after
         every temperature of a climb; not with a process pool.
@@ -177,6 +177,8 @@ def calibrate(
     ParameterError
         If `orders` is empty, the recording has no contrast (see `scan_geometry`), a name in it cannot be written to a
         file, a value is out of its range, or `quick` is asked with `refined=False`.
+    ShapeError
+        If `data_sets` has not one number per row.
 
     Warns
     -----
@@ -245,7 +247,10 @@ def _fit_order(
     pixel_mm: float | None,
     n_samples: int,
 ) -> OrderFit:
-    """Fit one order, searching it if it is not found yet; at module level, so that another process can run it."""
+    """Fit one order; search its prior if it is not `found` yet, with `why` among the notes.
+
+    At module level, so that another process can run it.
+    """
     recording = problems.recording
     geometry = scan_geometry(recording)
     n_usable = int(recording.usable.sum())
@@ -323,7 +328,7 @@ def _sensor_from_posterior(
 
 
 def _names_of_unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:
-    """Names of the moments (centre, widths, correlation) that the recording did not constrain."""
+    """Return the names of the moments (centre, widths, correlation) whose posterior sd exceeds 0.7 of the prior's."""
     before = mixture_moments(prior.from_unit_cube(rng.random((2000, len(prior.names)))), prior.n_gaussians)
     after = mixture_moments(samples, prior.n_gaussians)
     return tuple(
@@ -332,7 +337,7 @@ def _names_of_unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: n
 
 
 def _notes_on_close_evidences(table: tuple[OrderEvidence, ...]) -> tuple[str, ...]:
-    """Return one note if the evidences of the two best orders agree within their errors, else none."""
+    """Return one note if the evidences of the two best orders agree within two errors, else none."""
     if len(table) < 2:
         return ()
     first, second = sorted(table, key=lambda order: -order.log_z)[:2]

@@ -1,4 +1,4 @@
-"""Responses of readings to single Gaussians of an SSF: those to a mixture are their mean, weighted by light."""
+"""Responses of readings to single Gaussians of an SSF: a mixture's response is their mean, weighted by light."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ from probewise.inference import SensorProblem
 
 @dataclass(frozen=True, eq=False)
 class SingleGaussianResponses:
-    """Responses of the usable readings, between 0 over black and 1 over white, to one Gaussian.
+    """Responses of the usable readings, 0 over black to 1 over white, to one Gaussian.
 
-    Parameters
-    ----------
-    alone
-        Problem of one Gaussian over the recording.
+    `alone`: problem of one Gaussian over the recording.
     """
 
     alone: SensorProblem

@@ -1,4 +1,4 @@
-"""Coordinates of a mixture in which Gaussians have no order: they change their labels without a change of volume.
+"""Coordinates of a mixture without an order of the Gaussians: a change of their labels leaves volumes unchanged.
 
 Each Gaussian has the log of its light, its centre, the log variances along x' and y' and the inverse hyperbolic tangent
 of its correlation; then the levels. Readings depend on ratios of light alone, so the sum of the logs is left out and
@@ -38,7 +38,7 @@ class LabelSymmetricCoordinates:
 
     @cached_property
     def label_permutations(self) -> tuple[tuple[IntArray, FloatArray], ...]:
-        """The N! permutations of labels.
+        """The N! permutations of labels, for `apply_label_permutation`.
 
         Each has the order of the columns of shapes and levels, (5 N + 2,), and the matrix that turns the contrasts,
         (N - 1, N - 1).
@@ -72,18 +72,11 @@ class LabelSymmetricCoordinates:
         )
 
     def leave(self, y: FloatArray, sum_of_logs: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters; also return the prior's log density in them, each labelling by itself.
+        """Map coordinates to parameters; also return the prior's log density in them, of each labelling by itself.
 
-        Parameters
-        ----------
-        y
-            Coordinates, (n, 6 N + 1).
-        sum_of_logs
-            Uniform numbers, (n,), by which the light of all is drawn; default: the heaviest holds a unit.
-
-        Returns
-        -------
-        Parameters, (n, 6 N + 2), and log density, (n,); -inf outside the prior's support.
+        `y`: coordinates, (n, 6 N + 1). `sum_of_logs`: uniform numbers, (n,), by which the light of all is drawn; by
+        default the heaviest holds one unit. Return parameters, (n, 6 N + 2), and log density, (n,); -inf outside the
+        prior's support.
         """
         n = self.prior.n_gaussians
         log_light = (y[:, : n - 1] @ self._contrast_matrix).clip(-_MOST_LOG, _MOST_LOG)

@@ -1,9 +1,9 @@
 """The evidence of N Gaussians over that of N - 1, by taking one of the N away or adding one, its light integrated out.
 
 With one Gaussian's light at zero, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
-posterior estimate the ratio: from N, one faint Gaussian is taken away; from N - 1, one drawn from the prior is added.
-Residuals are linear in its share of the light, so one predicted curve suffices to integrate the light out. A bridge
-combines both kinds of samples (Bennett 1976).
+posterior estimate the ratio: from samples of N, one faint Gaussian is taken away; to samples of N - 1, one drawn from
+the prior is added. Residuals are linear in its share of the light, so one predicted curve suffices to integrate the
+light out. A bridge combines both kinds of samples (Bennett 1976).
 """
 
 from __future__ import annotations
@@ -36,16 +36,10 @@ _N_ROOT, _ROOT = 60, 1e-7
 
 @dataclass(frozen=True, eq=False)
 class FaintGaussianLikelihoodRatio:
-    """Mean likelihood over the light of one faint Gaussian, divided by the likelihood without it.
+    """Mean likelihood over the light of one faint Gaussian, divided by the likelihood without the Gaussian.
 
-    Parameters
-    ----------
-    prior
-        Prior of N Gaussians, 2 or more, with uniform light; see `has_uniform_prior_of_light`.
-    alone
-        Problem of one Gaussian over the same recording.
-    n_bright
-        Number of bright Gaussians, below N.
+    `prior`: of N Gaussians, 2 or more, with uniform light; see `has_uniform_prior_of_light`. `alone`: problem of one
+    Gaussian over the same recording. `n_bright`: number of bright Gaussians, below N.
     """
 
     prior: SSFPrior
@@ -64,7 +58,7 @@ class FaintGaussianLikelihoodRatio:
         )
 
     def log_likelihood_ratio_of_added_gaussian(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
-        """Log of the ratio for a Gaussian `gaussian`, (n, 6), of any light, added to samples of N - 1, (n, 6 N - 4)."""
+        """Log of the ratio, (n,), for `gaussian`, (n, 6), of any light, added to samples of N - 1, (n, 6 N - 4)."""
         if not len(rest):
             return np.empty(0)
         at_once = max(1, _AT_ONCE // (self.prior.n_gaussians * self._usable_readings.size))
@@ -96,10 +90,11 @@ class FaintGaussianLikelihoodRatio:
     def _log_likelihood_ratio_of_gaussian(
         self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray
     ) -> FloatArray:
-        """Log of the ratio for one Gaussian with responses `one` beside `others`, which have `light`.
+        """Log of the ratio, (n,), for a Gaussian of responses `one` beside `others`, (n, n_used) each.
 
-        With t the light over that of the brightest of the others, whose own scale is integrated out, the ratio is
-        (N - 1) / N times the integral of the likelihood over t from 0, times min(1, t^-N), over that at t = 0.
+        `light` of the others, (n, N - 1). With t the Gaussian's light over that of the brightest other, whose own scale
+        is integrated out, the ratio is (N - 1) / N times the integral of the likelihood over t from 0 to `FAINT`, over
+        the likelihood at t = 0.
         """
         sums = self._residual_sums_by_data_set(others, one, levels)
         return self._log_integral_over_light(*sums, light.sum(axis=-1) / light.max(axis=-1))
@@ -107,7 +102,7 @@ class FaintGaussianLikelihoodRatio:
     def _residual_sums_by_data_set(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> _Sums:
         """Sum residual squared, residual times change, and change squared within data sets, (..., n_sets) each.
 
-        The residual is that without the Gaussian; the change is that of the prediction if the Gaussian held all light.
+        The residual is without the Gaussian; the change is that of the prediction if the Gaussian held all light.
         """
         span = levels[..., 1:] - levels[..., :1]
         off = self._usable_readings - levels[..., :1] - span * others
@@ -121,9 +116,9 @@ class FaintGaussianLikelihoodRatio:
     def _log_integral_over_light(
         self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray
     ) -> FloatArray:
-        """Log of the integral over t, over the likelihood at t = 0.
+        """Log of the ratio, (...,), from the sums of `_residual_sums_by_data_set`.
 
-        `whole`: light of all others over that of the brightest.
+        `whole`: light of all others over that of the brightest, (...,).
         """
         n = self.prior.n_gaussians
         low, high = self._integration_limits(square, both, own, FAINT / (FAINT + whole))
@@ -181,10 +176,10 @@ class FaintGaussianLikelihoodRatio:
 
     @cached_property
     def _log_likelihood_tables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """First log sum of squares of each data set's table and one over its step, (n_sets,) each; and the tables.
+        """Tables of the log likelihood over the log sum of squares, per data set.
 
-        A table holds log integrals over sigma, a straight line except near the bounds of sigma, so linear interpolation
-        suffices.
+        First log and one over the step, (n_sets,) each; then the log integrals over sigma, concatenated. They follow a
+        straight line except near the bounds of sigma, so linear interpolation suffices.
         """
         likelihood = self._student_t_likelihood
         sizes, of = np.unique(likelihood.group_sizes, return_inverse=True)
@@ -215,14 +210,10 @@ def _mixture_response(seen: FloatArray, light: FloatArray) -> FloatArray:
 
 
 def bridge_log_z_ratio(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
-    """Estimate by a bridge the log of Z of N over Z of N - 1; also return the effective share of the samples.
+    """Estimate by a bridge the log of Z of N over Z of N - 1; also return the lesser effective share of samples.
 
-    Parameters
-    ----------
-    added
-        `FaintGaussianLikelihoodRatio.log_likelihood_ratio_of_added_gaussian` at samples of N - 1, (n_below,).
-    taken
-        `FaintGaussianLikelihoodRatio.log_likelihood_ratios_of_faint_gaussians` at samples of N, (n, N - n_bright).
+    `added`: `log_likelihood_ratio_of_added_gaussian` at samples of N - 1, (n_below,). `taken`:
+    `log_likelihood_ratios_of_faint_gaussians` at samples of N, (n, N - n_bright); see `FaintGaussianLikelihoodRatio`.
     """
     each, added = taken.ravel(), np.where(added > -np.inf, added, -1e300)
     real = np.concatenate([added[added > -1e300], each])
@@ -245,5 +236,5 @@ def bridge_log_z_ratio(added: FloatArray, taken: FloatArray) -> tuple[float, flo
 
 
 def _effective_sample_fraction(weight: FloatArray) -> float:
-    """Effective share of weighted samples, (n,)."""
+    """Return Kish's effective sample size of weights, (n,), divided by n."""
     return float(weight.sum() ** 2 / (weight @ weight) / len(weight)) if weight.any() else 0.0

@@ -1,7 +1,7 @@
 """A start density that mixes another one, such as that from the order below, with densities about peaks.
 
-The other density covers most of a posterior, but its draws may leave out a peak that is narrow. A part of the particles
-starts about the peaks that least squares found, so that each is represented where it holds a part of the evidence.
+The other density covers most of a posterior, but its draws may leave out a narrow peak. So three tenths of the
+particles start about the peaks that least squares found.
 """
 
 from __future__ import annotations
@@ -22,16 +22,11 @@ _SHARE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class MixedReferenceDensity:
-    """A reference mixed with densities about peaks: a `ReferenceDensity`.
+    """A reference density mixed with densities about peaks, usable as a `ReferenceDensity`.
 
-    Parameters
-    ----------
-    reference
-        The density that is mixed with them, of N Gaussians.
-    peaks
-        Densities about the highest peaks of the likelihood of N, one or more.
-    log_z_below
-        What `reference` adds to its log density: natural log of the evidence of N - 1, or 0.
+    `reference`: of N Gaussians, seven tenths of the mixture. `peaks`: densities about the highest peaks of the
+    likelihood of N, one or more. `log_z_below`: constant in the log density of `reference`, ln of the evidence of N - 1
+    or 0.
     """
 
     reference: ReferenceDensity
@@ -44,7 +39,7 @@ class MixedReferenceDensity:
         return self.reference.prior
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
-        """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
+        """Log of the density over the prior's, plus ln Z of N - 1; Gaussians sorted by mass, (n, 6 N + 2) -> (n,)."""
         each = math.log(_SHARE / len(self.peaks)) + self.log_z_below
         parts = [each + peak.log_density_over_prior(theta) for peak in self.peaks]
         return np.asarray(
@@ -66,7 +61,7 @@ class MixedReferenceDensity:
         return there, log_drawn
 
     def _assign_rows_to_densities(self, n: int, rng: np.random.Generator) -> list[tuple[ReferenceDensity, IntArray]]:
-        """Assign each of `n` rows to one of the densities at random: pairs of a density and its rows."""
+        """Assign each of `n` rows at random to one of the densities: return pairs of a density and its rows."""
         which = np.minimum((rng.random(n) * len(self.peaks) / _SHARE).astype(np.int64), len(self.peaks))
         densities: tuple[ReferenceDensity, ...] = (*self.peaks, self.reference)
         return [(density, np.flatnonzero(which == k)) for k, density in enumerate(densities)]

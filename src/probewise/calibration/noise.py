@@ -70,7 +70,7 @@ def draw_sd(
 def draw_pooled_sd(
     residuals: FloatArray, *, sd_floor: float, sd_ceiling: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw one noise sd per sample from the residuals of all scans: the noise of a new scan.
+    """Draw one noise sd per sample, (n_samples,), from the residuals of all scans: the noise of a new scan.
 
     Parameters
     ----------
@@ -97,14 +97,14 @@ def noise_by_scan(
     sd_ceiling: float,
     rng: np.random.Generator,
 ) -> tuple[ScanNoise, ...]:
-    """Summarise the posterior of every scan's noise sd, in the order of the scans; those without rows are left out.
+    """Summarise the posterior of every scan's noise sd, in the order of the scans; scans without rows are left out.
 
     Parameters
     ----------
     residuals
         Reading minus prediction of the usable rows, shape (n_samples, n_points).
     scan
-        Data set of each row, an index into `scan_names`, shape (n_points,).
+        Data set of each row, an index into `scan_names`, shape (n_points,); ShapeError for another.
     scan_names
         Names of the data sets.
     sd_floor, sd_ceiling

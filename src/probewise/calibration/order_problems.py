@@ -19,21 +19,24 @@ from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
 @dataclass(frozen=True, eq=False)
 class ProblemsByOrder:
-    """A recording, the prior of each order, and which readings share a noise sd."""
+    """A recording, the prior of each order, and which readings share a noise sd.
+
+    `data_sets`: of each row, see `problem_for`; None for one per scan.
+    """
 
     recording: Recording
     prior: Callable[[Recording, int], SSFPrior]
     data_sets: IntArray | None = None
 
     def prior_of(self, n_gaussians: int) -> SSFPrior:
-        """Return the prior of an order."""
+        """Return the prior of an order; ParameterError if it is no `SSFPrior`."""
         found = self.prior(self.recording, n_gaussians)
         if not isinstance(found, SSFPrior):
             raise ParameterError("prior", found, "an SSFPrior")
         return found
 
     def problem(self, n_gaussians: int, *, n_nodes: int = FAST_NODES) -> SensorProblem:
-        """Return the inference problem of an order, with so many quadrature nodes over curved edges."""
+        """Return the inference problem of an order, with `n_nodes` quadrature nodes over curved edges."""
         return problem_for(self.recording, self.prior_of(n_gaussians), data_sets=self.data_sets, n_nodes=n_nodes)
 
 
@@ -49,7 +52,7 @@ def problem_for(
     prior
         Prior of the order's parameters.
     data_sets
-        Data set of each row, (n_points,) from 0; default: its scan.
+        Data set of each row, (n_points,) from 0, else ShapeError; default: its scan.
     n_nodes
         Quadrature nodes over curved edges. By default the error there, 1e-4 of I_max - I_min, is below a tenth of the
         least noise sd of the prior.

@@ -23,7 +23,8 @@ _DISAGREE = 4.0
 class OrderPosterior:
     """Posterior samples and evidence of an order, before a sensor is made of them.
 
-    `result` is a nested sampling run or an SMC run; `refined` the evidence of a nested run by importance sampling.
+    `result` is a nested sampling run or an SMC run; `refined` the evidence of a nested run by importance sampling, or
+    None.
     """
 
     result: NestedResult | SMCResult
@@ -32,7 +33,7 @@ class OrderPosterior:
 
     @property
     def evidence_result(self) -> NestedResult | SMCResult | Weighted:
-        """The result whose log Z is used: the refined one if it is reliable."""
+        """The result whose log Z is used: `refined` if its error is reliable (`Weighted.sound`), else `result`."""
         return self.refined if self.refined is not None and self.refined.sound else self.result
 
     evidence = evidence_result  # its earlier name
@@ -67,7 +68,10 @@ def search_prior_of_order(
 
 
 def _notes_on_disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
-    """Return one note if the two estimates of an evidence disagree by more than four errors, else none."""
+    """Return one note if two estimates of an evidence are more than four errors apart, else none.
+
+    Also none if the refined estimate has doubts of its own.
+    """
     apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
     if apart <= _DISAGREE or not set(refined.doubts) <= set(refined.inherited):
         return ()

@@ -1,4 +1,4 @@
-"""Evidence of an order from the peak of its likelihood: importance sampling with a Student-t about it.
+"""Evidence of an order from the peak of its likelihood: importance sampling with a Student-t about the peak.
 
 The first density has the peak's curvature (Laplace); its weighted draws shape the next (population Monte Carlo, Cappé,
 Guillin, Marin & Robert 2004). Gaussians have no labels, so the density is averaged over their orders.
@@ -61,7 +61,7 @@ class StudentTDensity:
 
 @dataclass(frozen=True, eq=False)
 class PeakDensity:
-    """A Student-t about a peak, averaged over the labels of the Gaussians: a `ReferenceDensity`.
+    """A Student-t about a peak, averaged over the labels of the Gaussians, usable as a `ReferenceDensity`.
 
     `one`: the Student-t for one order of the labels, in the coordinates `space`.
     """
@@ -77,14 +77,14 @@ class PeakDensity:
     def draw_and_keep_within_prior(
         self, n: int, *, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Make `n` draws; return those within the prior: coordinates, parameters, log density over the prior's."""
+        """Make `n` draws; return coordinates, parameters and log density over the prior's of those within the prior."""
         y = self.one.draw(n, rng)
         theta, log_prior = self.space.leave(y, rng.random(n))
         inside = np.isfinite(log_prior)
         return y[inside], theta[inside], self._log_density_in_coordinates(y[inside]) - log_prior[inside]
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw one for each row of `rest`, (n, 6 N + 2); nan where outside the prior."""
+        """Draw as many parameters as `rest` has rows, (n, 6 N + 2); nan where outside the prior."""
         y = self.one.draw(len(rest), rng)
         theta, log_prior = self.space.leave(y, rng.random(len(rest)))
         theta[~np.isfinite(log_prior)] = np.nan
@@ -97,7 +97,7 @@ class PeakDensity:
     def fitted_to(self, theta: FloatArray) -> PeakDensity:
         """Fit a density to samples, (n, 6 N + 2), each with the labels that are most probable under this one.
 
-        It is wider than they are: its sds are 1.27 times theirs.
+        The new density's sds are 1.27 times those of the samples.
         """
         y = self.space.enter(theta)
         labelled = np.stack([self.space.apply_label_permutation(y, change) for change in self.space.label_permutations])
@@ -135,22 +135,10 @@ class PeakDensity:
 def fit_density_about_peak(
     problem: SensorProblem, peak: FloatArray, *, rng: np.random.Generator, n_pilots: int = _N_PILOTS
 ) -> tuple[PeakDensity, int]:
-    """Fit a density to the posterior about a peak.
+    """Fit a density to the posterior about a peak of the likelihood `peak`, (6 N + 2,), in four rounds of draws.
 
-    Parameters
-    ----------
-    problem
-        Has an `SSFPrior` of uniform light and a `StudentT` likelihood.
-    peak
-        Parameters at which the likelihood is greatest, (6 N + 2,).
-    rng
-        Source of randomness.
-    n_pilots
-        Draws of each round of fitting.
-
-    Returns
-    -------
-    The density, and the number of likelihood evaluations.
+    `problem` has an `SSFPrior` of uniform light and a `StudentT` likelihood, else ParameterError. `n_pilots`: draws of
+    each round. Return the density, and the number of likelihood evaluations.
     """
     prior = problem.prior
     if not isinstance(prior, SSFPrior):
@@ -179,22 +167,11 @@ def share_missed_about_peak(
     n_draws: int,
     rng: np.random.Generator,
 ) -> float:
-    """Estimate the share of the evidence that lies about a peak but has no samples, minus two standard errors.
+    """Estimate the share of the evidence that lies about a peak but has no samples; 0 or more.
 
-    Parameters
-    ----------
-    problem
-        Has an `SSFPrior` of uniform light.
-    density
-        A density about the peak.
-    theta
-        Samples of the posterior, (n, 6 N + 2).
-    log_z
-        Natural log of the evidence according to these samples.
-    n_draws
-        Number of draws by which the evidence about the peak is estimated.
-    rng
-        Source of randomness.
+    Two standard errors are subtracted. `problem` has an `SSFPrior` of uniform light; `density` is about the peak.
+    `theta`: samples of the posterior, (n, 6 N + 2), according to which ln of the evidence is `log_z`. `n_draws`: draws
+    from `density`.
     """
     y, drawn, log_density = density.draw_and_keep_within_prior(n_draws, rng=rng)
     near = density.near_peak_mask(y)
@@ -206,7 +183,7 @@ def share_missed_about_peak(
 
 
 def _laplace_density(problem: SensorProblem, space: LabelSymmetricCoordinates, peak: FloatArray) -> StudentTDensity:
-    """Make a density of the peak's curvature, and of the prior's width where there is little information."""
+    """Make a density of the peak's curvature, with the prior's width along coordinates of little information."""
     prior, likelihood, recording = space.prior, problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):
         raise ParameterError("problem.likelihood", likelihood, "a StudentT")
@@ -233,7 +210,7 @@ def _temper_log_weights_to_n_effective(log_weight: FloatArray, least: float) -> 
 
 
 def _refitted_density(y: FloatArray, log_weight: FloatArray, before: StudentTDensity) -> StudentTDensity:
-    """Fit a density to weighted draws; the fewer are effective, the more of the former covariance is kept."""
+    """Fit a density to weighted draws; the fewer are effective, the more of the covariance of `before` is kept."""
     weight = np.exp(log_weight - logsumexp(log_weight))
     mean = weight @ y
     off = y - mean

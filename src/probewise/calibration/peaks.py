@@ -37,7 +37,10 @@ _SAME, _HARDLY_LOWER, _N_OTHERS = 0.05, 6.0, 3
 
 @dataclass(frozen=True, eq=False)
 class HighestPeak:
-    """The likelihood's highest peak found, (n_params,), ln L there, and others hardly lower, (n_others, n_params)."""
+    """The highest peak found: parameters, (n_params,), ln L there, and at most three others, (n_others, n_params).
+
+    The others are less than 6 nats lower, highest first.
+    """
 
     theta: FloatArray
     log_likelihood: float
@@ -47,16 +50,9 @@ class HighestPeak:
 def find_highest_likelihood_peak_by_order(
     problem: Callable[[int], SensorProblem], highest: int, *, rng: np.random.Generator
 ) -> dict[int, HighestPeak]:
-    """Find the highest peak of the likelihood of each order from 1; return them by order.
+    """Find the highest peak of the likelihood of each order from 1 to `highest`; return a dict by order.
 
-    Parameters
-    ----------
-    problem
-        Function from an order to its problem, with an `SSFPrior` of uniform light and a `StudentT` likelihood.
-    highest
-        Greatest number of Gaussians.
-    rng
-        Source of randomness.
+    `problem`: function from an order to its problem, with an `SSFPrior` of uniform light and a `StudentT` likelihood.
     """
     found: dict[int, HighestPeak] = {}
     responses = SingleGaussianResponses(problem(1))
@@ -89,7 +85,7 @@ def _checked_ssf_prior(problem: SensorProblem) -> SSFPrior:
 
 
 def _split_gaussian(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Split one Gaussian of each into two that keep its light, centre and covariance, (n, 6 N + 2) -> (n, 6 N + 8)."""
+    """Split one random Gaussian per row into two of its light, centre and covariance, (n, 6 N + 2) -> (n, 6 N + 8)."""
     m = len(theta)
     g = theta[:, :-2].reshape(m, -1, 6)
     rows, which = np.arange(m), rng.integers(g.shape[1], size=m)
@@ -127,7 +123,7 @@ def _with_light_gaussian_added(
 
 
 def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianResponses, starts: FloatArray) -> HighestPeak:
-    """Ascend from each start, (n_starts, n_params), the worse half for a few steps only; return what is reached."""
+    """Ascend from each start, (n_starts, n_params), the worse half for a few steps only; return the best reached."""
     prior, likelihood, recording = _checked_ssf_prior(problem), problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):
         raise ParameterError("problem.likelihood", likelihood, "a StudentT")
@@ -178,7 +174,7 @@ def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianRespons
 def _prediction_slopes(prior: SSFPrior, responses: SingleGaussianResponses, z: FloatArray) -> FloatArray:
     """Differentiate the predictions by the logits `z` of the prior's cube, (n, d) -> (n, d, n_used).
 
-    A change of one Gaussian leaves the responses to the others as they are, so one kind of parameter is changed for all
+    A change of one Gaussian leaves the responses to the others unchanged, so one kind of parameter is changed for all
     Gaussians at once; a change of light needs no new response.
     """
     n, n_gaussians = len(z), prior.n_gaussians

@@ -1,7 +1,8 @@
 """Parts of a posterior, by how many of its Gaussians are bright.
 
-One Gaussian that holds nearly all of the light, beside faint ones, and several that share it, are far apart: moves
-rarely lead from the one to the other. So each such part is sampled, and its evidence estimated, by itself.
+Mixtures with one Gaussian of nearly all light, beside faint ones, and mixtures of several that share the light lie far
+apart: moves rarely lead from the former to the latter. So each such part is sampled, and its evidence estimated, by
+itself. Bright: more than a tenth of the heaviest one's light.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ _COUNTS = 0.1
 
 @dataclass(frozen=True)
 class FootprintPlaceAndSize:
-    """Place and size of the whole footprint: `centre_mm`, and `size_mm2`, the trace of its covariance."""
+    """Centre and size of the whole footprint: `centre_mm` (x', y'), and `size_mm2`, the trace of its covariance."""
 
     centre_mm: tuple[float, float]
     size_mm2: float
 
     @classmethod
     def from_gaussian(cls, theta: FloatArray) -> FootprintPlaceAndSize:
-        """Take place and size from the parameters of an SSF of one Gaussian, (8,)."""
+        """Take centre and size from the parameters of an SSF of one Gaussian, (8,)."""
         _, u, v, a, b, c = theta[:6]
         return cls((float(u), float(v)), float(0.5 * (a + b) / (a * b - c * c)))
 
@@ -47,7 +48,7 @@ class FootprintPlaceAndSize:
 
 @dataclass(frozen=True, eq=False)
 class PosteriorPart:
-    """Equally weighted samples of a part, (n, 6 N + 2), cloud after cloud, sorted by mass, and its evidence.
+    """Equally weighted samples of a part, (n, 6 N + 2), cloud after cloud, Gaussians sorted by mass; and its evidence.
 
     `log_z_of_clouds`, (n_clouds,), and `start_error` are those of an `SMCResult`.
     """
@@ -68,7 +69,7 @@ class PosteriorPart:
 
 
 def evidence_shares(parts: dict[int, PosteriorPart]) -> dict[int, float]:
-    """Return the share of the evidence that each part holds."""
+    """Return the share of the evidence that each part holds, by number of bright Gaussians."""
     return dict(zip(parts, _normalised_evidences(parts.values()).tolist(), strict=True))
 
 
@@ -81,7 +82,10 @@ def _normalised_evidences(each: Iterable[PosteriorPart | SMCResult]) -> FloatArr
 def split_posterior_by_n_bright(
     found: SMCResult | NestedResult | Weighted, rng: np.random.Generator
 ) -> dict[int, PosteriorPart]:
-    """Split a posterior's samples by their number of bright Gaussians, and its evidence by the samples' shares."""
+    """Split a posterior's samples by their number of bright Gaussians, and its evidence by the samples' shares.
+
+    Return a dict by that number, without parts of fewer than 40 samples.
+    """
     if isinstance(found, SMCResult):
         theta, log_z, error = found.theta, found.log_z_of_clouds, found.start_error
     else:
@@ -99,9 +103,9 @@ def split_posterior_by_n_bright(
 
 
 def join_smc_results_of_parts(made: dict[int, SMCResult], rng: np.random.Generator) -> SMCResult:
-    """Join SMC runs to the parts of a posterior, given by number of bright Gaussians.
+    """Join SMC runs to the parts of a posterior, given by number of bright Gaussians, into one result.
 
-    Each part contributes samples by its share of the evidence.
+    Each part contributes samples by its share of the evidence. If a run did not reach its part, it is returned alone.
     """
     climbs = list(made.values())
     share = _normalised_evidences(climbs)

@@ -31,13 +31,13 @@ def predict(
 ) -> Prediction:
     """Compute the predictive distribution of every row of a plan, and score its readings if there are any.
 
-    Mean and sd are those of a new reading that is not lost, with parameter uncertainty and noise. The
-    density is a mixture over the posterior samples of each sample's noise distribution: normal with the
-    pooled sd, modified by the sensor's effects on the noise (outliers, losses, signal dependence). If
-    the plan declares a rounding step, or else the sensor's calibration did, the density is the mass of the
-    reading's cell divided by the step. Each row is scored by its marginal density. New patterns, scans and angles are
-    predicted like any other; effects of single scans are left out (see `FittedSensor.chain`). Where the plan declares
-    another height than the calibration, its readings are those at its own.
+    Mean and sd are those of a new reading that is not lost, with parameter uncertainty and noise. The density is a
+    mixture over the posterior samples of each sample's noise distribution: normal with the pooled sd, modified by the
+    sensor's effects on the noise (outliers, losses, signal dependence). If the plan declares a rounding step, or else
+    the sensor's calibration did, the density is the mass of the reading's cell divided by the step. Each row is scored
+    by its marginal density. New patterns, scans and angles are predicted like any other; effects of single scans are
+    left out (see `FittedSensor.chain`). Where the plan declares another height than the calibration, the readings are
+    predicted at the plan's height.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def predict(
     readings
         Measured readings, shape (n_points,), NaN where missing; `None` for a plan or a recording.
     progress
-        Called with the number of posterior samples done.
+        Called with "predicting", the number of posterior samples done, and their number.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def predict(
 
 
 def _doubt_of_height_in_words(sensor: FittedSensor, plan: Plan) -> str:
-    """Say why a plan's heights may not be those at which its readings are predicted; "" if they are."""
+    """Say why the readings may be predicted for other heights than the plan's; "" if they are not."""
     if plan.instrumentation.height_mm is not None:
         return ""
     calibrated_mm, column = sensor.instrumentation.height_mm, plan.covariates.get("height_mm", np.empty(0))

@@ -1,12 +1,11 @@
 """Priors of the SSF and the levels: proper, with bounds from scan step, span and range of the readings.
 
-The paper assigns uniform priors and prints no bounds. A uniform prior of A and B puts almost all of its
-mass on footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a uniform A lies within a factor
-1.4 of the smallest sd), and the evidence of an order then depends on the bounds. Here the order of magnitude
-of a width is unknown, so A and B are log-uniform, with bounds from what the scans can resolve and
-contain. Likewise, with a uniform amplitude a, a narrow Gaussian has almost no mass, so a superfluous
-Gaussian is hidden there at little cost in evidence; here the mass of a Gaussian,
-a pi / sqrt(A B - C^2), is uniform. `paper_prior` is uniform in A, B and a.
+The paper assigns uniform priors and prints no bounds. A uniform prior of A and B puts almost all of its mass on
+footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a uniform A lies within a factor 1.4 of the smallest
+sd), and the evidence of an order then depends on the bounds. Here the order of magnitude of a width is unknown, so A
+and B are log-uniform, with bounds from what the scans can resolve and contain. Likewise, with a uniform amplitude a, a
+narrow Gaussian has almost no mass, so a superfluous Gaussian can be narrow at little cost in evidence; here the mass of
+a Gaussian, a pi / sqrt(A B - C^2), is uniform. `paper_prior` is uniform in A, B and a.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
 
 @dataclass(frozen=True)
 class PriorRow:
-    """One row of the report's table of priors."""
+    """One row of the report's table of priors, in words: parameter, unit, distribution and reason of the bounds."""
 
     parameter: str
     unit: str
@@ -46,9 +45,9 @@ class PriorRow:
 class SSFPrior:
     """Independent, identical priors of `n_gaussians` Gaussians, and priors of the two levels (paper, 6 N + 2).
 
-    The Gaussians are exchangeable: no ordering is imposed, and the evidence of the order counts all
-    N! labellings of a footprint, as it must. C = r sqrt(A B) with r uniform on
-    (-max_correlation, max_correlation), so every draw is positive definite.
+    The Gaussians are exchangeable: no ordering is imposed, and the evidence of the order counts all N! labellings of a
+    footprint, as it must. C = r sqrt(A B) with r uniform on (-max_correlation, max_correlation), so every draw is
+    positive definite.
 
     Parameters
     ----------
@@ -68,7 +67,12 @@ class SSFPrior:
     max_correlation
         Largest abs(C) / sqrt(A B), below 1.
     reasons
-        Why each bound is as it is, for the report: pairs of `offset_mm`, `precision` or `levels` and words.
+        Why each bound has its value, for the report: pairs of "offset_mm", "precision" or "levels" and words.
+
+    Raises
+    ------
+    ParameterError
+        If `n_gaussians`, `max_correlation` or `unit_mass_mm2` is out of range.
     """
 
     n_gaussians: int
@@ -136,7 +140,7 @@ class SSFPrior:
         return self.log_prob_by_kind(np.ascontiguousarray(view_by_kind_and_gaussian(theta)), theta[:, -2], theta[:, -1])
 
     def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
-        """Return `log_prob` for `view_by_kind_and_gaussian`, (6, N, n_samples), and levels, (n_samples,) each."""
+        """Return `log_prob`, (n_samples,), of parameters by kind (a, u, v, A, B, C), (6, N, n_samples), and levels."""
         precisions = np.maximum(g[3:5], 0.0)
         product, c = precisions[0] * precisions[1], g[5]
         scale = np.sqrt(product)
@@ -198,9 +202,10 @@ class SSFPrior:
 class ScanGeometry:
     """Lengths and ranges that bound what a recording can resolve and contain.
 
-    `step_mm` is the median step within scans, at most a fiftieth of `span_mm`; that is the median length of the scans
-    that move, or the diagonal of all places if none does; `low`, `high` are the extreme readings, `albedo_low`,
-    `albedo_high` the extreme albedo at the commanded places; `inverted` is True if dark places give high readings.
+    `span_mm` is the median length of the scans that move, or the diagonal of all positions if none does; `step_mm` is
+    the median step within scans, at most a fiftieth of the span. `low`, `high` are the extreme readings, `albedo_low`,
+    `albedo_high` the extreme albedo at the commanded positions; `inverted` is True if dark positions give high
+    readings.
     """
 
     step_mm: float
@@ -213,7 +218,7 @@ class ScanGeometry:
 
 
 def scan_geometry(recording: Recording) -> ScanGeometry:
-    """Measure step, span, reading and albedo range of a recording's usable rows, and whether black reads higher.
+    """Measure a recording's `ScanGeometry` from its usable rows.
 
     Raises
     ------
@@ -259,12 +264,11 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
 def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
     """Make the prior of an SSF of `n_gaussians` from the recording's step, span and range of readings.
 
-    Centres lie within a quarter of the span from the mechanical origin, so that a scan centred on
-    an edge contains the transition. Conditional sds range from half a step (nothing finer is
-    resolved) to a quarter of the span (nothing wider is contained). Each level lies within half the range
-    of the readings from its estimate, the readings extrapolated to albedo 0 and 1. The mass of each
-    Gaussian is uniform. In directions without information, such as along a single edge, the
-    posterior equals this prior.
+    Centres lie within a quarter of the span from the mechanical origin, so that a scan centred on an edge contains the
+    transition. Conditional sds range from half a step (nothing finer is resolved) to a quarter of the span (nothing
+    wider is contained). The levels are estimated by extrapolating the readings to albedo 0 and 1; each prior reaches
+    half of their difference to either side. The mass of each Gaussian is uniform. In directions without information,
+    such as along a single edge, the posterior equals this prior.
 
     Raises
     ------
@@ -350,7 +354,7 @@ def blind_axis_rad(recording: Recording) -> float | None:
 
 
 def _albedo_at_commanded_places(recording: Recording) -> FloatArray:
-    """Albedo at the commanded places, (n_points,)."""
+    """Return the albedo of the known patterns at the commanded positions, (n_points,)."""
     plan = recording.plan
     regions = KnownScene(plan.patterns).regions(np.empty((1, 0)))
     out = np.empty(len(plan))

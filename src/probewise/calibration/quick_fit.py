@@ -1,11 +1,11 @@
 """Fit one order after another by SMC: from the peak of its likelihood, or from the posterior of the order below.
 
-Where one Gaussian more raises the likelihood much, its posterior lies about the highest peak, and particles start from
-a density fitted there. Where it does not, each part of the posterior, by its number of bright Gaussians, is sampled by
-itself. Where some Gaussians are faint, particles start from that part of the order below with a faint Gaussian more,
-and a bridge gives the ratio of the two evidences (`light_integral`). Where all are bright, they start from a wide
-density. At every order ascents from all over the prior look for a peak that the particles missed. A search of the whole
-prior checks the order that is chosen.
+If an added Gaussian raises the likelihood much, the posterior lies about the highest peak, and particles start from a
+density fitted there. If not, each part of the posterior, by its number of bright Gaussians, is sampled by itself. In
+parts with faint Gaussians, particles start from the same part of the order below with a faint Gaussian added, and a
+bridge gives the ratio of the two evidences (`light_integral`). In the part where all are bright, particles start from a
+wide density. At every order ascents from all over the prior look for a peak that the particles missed. A search of the
+whole prior by nested sampling checks the order that is chosen.
 """
 
 from __future__ import annotations
@@ -80,10 +80,8 @@ def fit_orders_quickly(
 ) -> tuple[dict[int, OrderPosterior], tuple[str, ...]]:
     """Fit all orders up to the greatest by SMC; `search` fits those whose SMC run is doubtful.
 
-    Returns
-    -------
-    The posterior of each order, and notes. Where SMC does not apply there are no posteriors, and the note says why all
-    orders must be searched in full.
+    Return the posterior of each of `orders`, and notes. With fewer than 80 usable readings, or a prior to which SMC
+    does not apply, there are no posteriors, and the note says why all orders must be searched in full.
     """
     highest = max(orders)
     n_usable = int(problems.recording.usable.sum())
@@ -115,9 +113,10 @@ def _check_chosen_order_or_search_in_full(
     search: Search,
     progress: Progress | None,
 ) -> dict[int, OrderPosterior]:
-    """Check the chosen order by a search of the prior; if it missed a peak, search it and those above in full.
+    """Check the chosen order by a search of the prior; if it missed a peak, search it and all orders above in full.
 
-    The orders above may have started from its samples. Where another order is then chosen, it is checked too.
+    The orders above may have started from its samples. Where another order is then chosen, it is checked too. Return
+    the posteriors by order.
     """
     asked: set[int] = set()
     while True:
@@ -135,7 +134,7 @@ def _check_chosen_order_or_search_in_full(
 
 
 def _why_smc_does_not_apply(problems: ProblemsByOrder, highest: int) -> str:
-    """Return in words why SMC does not apply to this prior; empty if it does."""
+    """Return in words why SMC does not apply to the priors up to `highest`; "" if it does."""
     priors = [problems.prior_of(n) for n in range(1, highest + 1)]
     if not all(has_uniform_prior_of_light(prior) for prior in priors):
         return "searched in full: the prior of a Gaussian's light is not uniform from 0"
@@ -158,30 +157,12 @@ def fit_next_order(
 ) -> tuple[OrderPosterior, dict[int, PosteriorPart]]:
     """Fit one Gaussian more than the order below has, by SMC; search the order in full where that is doubtful.
 
-    Parameters
-    ----------
-    problems
-        Problems of the recording, by order.
-    n
-        Number of Gaussians.
-    below
-        Parts of the posterior of n - 1, by their number of bright Gaussians; empty for the first order.
-    peak
-        Highest peak of the likelihood.
-    rng
-        Source of randomness.
-    whole
-        Place and size of the whole footprint.
-    needed
-        Whether the readings need the last Gaussian, so that the posterior lies about the peak.
-    search
-        Function that searches an order in full.
-    progress
-        Called with the order after each temperature.
+    `n`: the order. `below`: parts of the posterior of n - 1, by number of bright Gaussians; empty for the first order.
+    `peak`: highest peak of the likelihood of `n`. `whole`: centre and size of the whole footprint. `needed`: whether
+    the readings need the last Gaussian, so that the posterior lies about the peak. `search` searches an order in full.
+    `progress` is called with the order after each temperature.
 
-    Returns
-    -------
-    The posterior of the order, and its parts.
+    Return the posterior of the order, and its parts by number of bright Gaussians.
     """
     report: Callable[[TemperatureSummary], None] | None = None if progress is None else partial(progress, n)
     about = partial(_smc_from_peak, problems, n, peak, rng, report)
@@ -209,7 +190,7 @@ def _smc_from_peak(
     rng: np.random.Generator,
     report: Callable[[TemperatureSummary], None] | None,
 ) -> tuple[SMCResult, dict[int, PosteriorPart]]:
-    """Sample the posterior of `n`, starting from a density about the peak."""
+    """Sample the posterior of `n`, starting from a density about the peak; return the run, and no parts."""
     problem = problems.problem(n)
     density, n_calls = fit_density_about_peak(problem, peak.theta, rng=rng)
     density = density.widened(_WIDENED)
@@ -252,7 +233,8 @@ def _smc_from_order_below(
 ) -> tuple[SMCResult, dict[int, PosteriorPart]]:
     """Sample each part of the posterior of `n`: those with faint Gaussians, and the one where all are bright.
 
-    The former start from the same part of the order below, with a faint Gaussian more.
+    Parts with faint Gaussians start from the same part of the order below, a faint Gaussian added. Return the joined
+    run, and the parts by number of bright Gaussians.
     """
     tops = [peak.theta, *peak.others]
     about = [fit_density_about_peak(problems.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in tops]
@@ -284,9 +266,9 @@ def _smc_with_faint_gaussian_added(
     rng: np.random.Generator,
     report: Callable[[TemperatureSummary], None] | None,
 ) -> SMCResult:
-    """Sample the part of `n` with `n_bright` bright Gaussians, from that of n - 1 with a faint one more, or from peaks.
+    """Sample the part of `n` with `n_bright` bright Gaussians; the evidence comes from a bridge to the part `below`.
 
-    The evidence comes from a bridge between the two parts.
+    Particles start from that part of n - 1 with a faint Gaussian added, and from the densities `about` peaks.
     """
     problem_below = problems.problem(n - 1)
     coordinates = whole.whole_footprint_coordinates(problems.prior_of(n - 1), n_bright)
@@ -365,7 +347,8 @@ def _smc_with_all_gaussians_bright(
 def _with_bridged_evidence(made: SMCResult, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> SMCResult:
     """Return a complete run with the evidence of a bridge, if enough samples are effective; else the run unchanged.
 
-    If the two evidences disagree, a run of few temperatures gets a doubt.
+    `log_z`: of the other end of the bridge, per cloud. `added`, `taken`: see `bridge_log_z_ratio`. If the two evidences
+    disagree, a run of few temperatures gets a doubt.
     """
     if made.temperatures[-1] < 1.0:
         return made

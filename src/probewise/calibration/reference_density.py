@@ -1,4 +1,4 @@
-"""A density that particles start from, and how draws of it are proposed to them later."""
+"""A density that particles of SMC start from, and how draws from the density are proposed to particles later."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ class ReferenceDensity(Protocol):
         ...
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw parameters of N for each sample `rest` of N - 1, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
+        """Draw parameters of N for each sample `rest` of N - 1, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible.
+
+        A density that needs no samples uses only the number of rows.
+        """
         ...
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -42,10 +45,8 @@ def propose_independently(
 ) -> tuple[FloatArray, FloatArray]:
     """Draw from a density, independently of the particles `here`, (n, 6 N + 2).
 
-    Returns
-    -------
-    The draws, nan where outside the prior, and the log of the density over the prior's at `here`, minus that at the
-    draws, (n,); -inf where there is no draw.
+    Return the draws, nan where outside the prior, and the log of the density over the prior's at `here`, minus that at
+    the draws, (n,); -inf where there is no draw.
     """
     there = density.draw(here, rng=rng)
     log_drawn = np.full(len(here), -np.inf)

@@ -100,11 +100,11 @@ class FittedSensor(NamedSamples):
     patterns
         By effect, the names of the patterns to which it is restricted; other effects act on all patterns.
     absent
-        By effect, the samples without it, (n_samples,), where a diagnosis is uncertain whether it is present; other
-        effects act in all samples.
+        By effect, a mask of the samples without the effect, (n_samples,), where a diagnosis is uncertain whether it is
+        present; other effects act in all samples.
     origins
-        By effect, the time and place from which it counts, where it was found in a recording far from 0; others count
-        from 0.
+        By effect, the time and position from which it counts, where it was found in a recording far from 0; others
+        count from 0.
     scan_noise
         Noise of each scan of the recording.
     fingerprint, source
@@ -170,7 +170,7 @@ class FittedSensor(NamedSamples):
 
     @property
     def effects_on_new_scans(self) -> tuple[AnyEffect, ...]:
-        """The effects that also apply to new scans."""
+        """The effects that also apply to new scans, as objects: all but those of single scans (`BOUND_TO_SCANS`)."""
         return tuple(self._build_effect(name) for name in self.effects if name not in BOUND_TO_SCANS)
 
     def _build_effect(self, name: str) -> AnyEffect:
@@ -208,7 +208,7 @@ class FittedSensor(NamedSamples):
     free_form = is_free_form  # its earlier name
 
     def mean_mixture(self) -> FixedMixture:
-        """Return the mean SSF as a mixture of `n_gaussians` positive Gaussians; four for a free form."""
+        """Return the mean SSF as a `FixedMixture` of `n_gaussians` positive Gaussians; of four for a free form."""
         if self.is_free_form:
             return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
         n = self.n_gaussians
@@ -219,7 +219,8 @@ class FittedSensor(NamedSamples):
     def with_leading_effects(self) -> FittedSensor:
         """Return the sensor with the most probable combination of effects, where a diagnosis left several possible.
 
-        Its samples are repeated to the original number. If there is only one combination, return the sensor itself.
+        The samples of that combination are repeated to the original number. If there is only one combination, return
+        the sensor itself.
         """
         if not self.absent:
             return self
@@ -244,7 +245,7 @@ class FittedSensor(NamedSamples):
     leading = with_leading_effects  # its earlier name
 
     def ssf_quantities(self) -> tuple[QuantitySummary, ...]:
-        """Summarise the SSF by centre, widths and angle, and each Gaussian too, unless it is a free form."""
+        """Summarise the SSF by centre, widths and angle, and each Gaussian too, unless the SSF is a free form."""
         return ssf_quantities(self.samples, self.n_gaussians, each=not self.is_free_form)
 
     ssf = ssf_quantities  # its earlier name
@@ -403,7 +404,7 @@ class FittedSensor(NamedSamples):
 
 
 def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
-    """Write sensor.json atomically.
+    """Write a fitted sensor to the file `path` (sensor.json), atomically.
 
     Raises
     ------
@@ -418,7 +419,7 @@ def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
 
 
 def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
-    """Read sensor.json.
+    """Read a fitted sensor from the file `path` (sensor.json).
 
     Raises
     ------
@@ -532,7 +533,7 @@ def _checked_pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
 
 
 def _dataclass_of_item(read: _Reader, kind: type[T], item: Mapping[str, Any], place: str) -> T:
-    """Build a dataclass of texts, numbers and counts, checked by the types of its fields."""
+    """Build a dataclass of texts, numbers and counts from a JSON object; FileError if a value has a wrong type."""
     kinds: dict[str, type | tuple[type, ...]] = {"str": str, "int": int, "float": (int, float)}
     values: dict[str, object] = {}
     for field in fields(kind):  # type: ignore[arg-type]

@@ -2,8 +2,8 @@
 
 Particles are drawn from a known density, made from the posterior of N - 1 or about a peak. In small changes of
 temperature they become samples of the posterior of N: weighted, resampled, and moved by Metropolis steps. They form
-clouds, each weighted and resampled by itself, so that the scatter of the clouds' evidences is a valid error: it
-includes what one cloud found and another missed. Notes and documentation call such a run a climb.
+clouds, each weighted and resampled by itself. The scatter of the clouds' evidences is a valid error: it covers parts
+that one cloud found and another missed. Notes and documentation call such a run a climb.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class SMCResult(ShowsItself):
 
     @property
     def log_z_error(self) -> float:
-        """Standard error of log Z: `start_error`, and the scatter of the clouds, as of Student's t, as they are few."""
+        """Standard error of log Z: `start_error`, and the scatter of the few clouds as of a Student t, in quadrature."""
         relative = np.exp(self.log_z_of_clouds - self.log_z)
         n = len(relative)
         return math.hypot(float(relative.std(ddof=1)) * math.sqrt((n - 1) / (n - 3) / n), self.start_error)
@@ -164,7 +164,7 @@ class _Particles:
         return out
 
     def joined_cloud_by_cloud(self, other: _Particles, n_clouds: int) -> _Particles:
-        """Append to each cloud the cloud of the same number of `other`."""
+        """Append to each cloud of particles the cloud of the same number in `other`."""
         both = np.arange(len(self.x) + len(other.x))
         mine, others = np.split(both, [len(self.x)])
         rows = np.concatenate([mine.reshape(n_clouds, -1), others.reshape(n_clouds, -1)], axis=1).ravel()
@@ -205,23 +205,25 @@ def run_smc(
     problem
         The problem of N Gaussians.
     reference
-        Density from which the particles are drawn, of N Gaussians.
+        Density of N Gaussians from which the particles are drawn.
     rest
-        Samples of the posterior of N - 1, sorted by mass, (n, 6 N - 4), cloud after cloud.
+        Samples of the posterior of N - 1, sorted by mass, (n, 6 N - 4), cloud after cloud; (n, 0) for a reference that
+        needs none. n is the number of particles.
     log_z_below
-        Natural log of the evidence of N - 1 from each cloud, (n_clouds,); n_clouds divides n.
+        Natural log of the evidence of N - 1 from each cloud, (n_clouds,); n_clouds divides n. 0 without samples.
     error_below
         Standard error of `log_z_below` that all clouds share.
     n_calls_below
         Likelihood evaluations so far.
     rng
         Source of randomness.
+    space
+        Coordinates of the particles, with the prior density that they are held to; default: those of the prior.
     n_steps
         Moves of each particle at each temperature.
-    space
-        Coordinates of the particles, and the prior that they are held to; default: those of the prior.
     n_more
-        Moves of each particle once the posterior is reached; samples are kept from the last half of them.
+        Moves of each particle at the posterior, times the number of temperatures; samples are kept from their last
+        half.
     least_effective
         Least share of the particles that a change of temperature leaves effective.
     at_once_from
@@ -229,6 +231,11 @@ def run_smc(
         the evidence.
     progress
         Called after every temperature.
+
+    Returns
+    -------
+    SMCResult
+        It has `warnings` if the posterior was not reached, or its evidence is doubtful.
     """
     space = reference.prior.coordinates if space is None else space
     n_calls = n_calls_below
@@ -327,10 +334,7 @@ def _snapshots_of_posterior(
     n_more: int,
     rng: np.random.Generator,
 ) -> list[_Particles]:
-    """Move particles of the posterior `n_more` times; return `N_SNAPSHOTS` states of them from the last half.
-
-    They are fewer if the moves are very few.
-    """
+    """Move particles of the posterior `n_more` times; return at most `N_SNAPSHOTS` of their states, of the last half."""
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     kept = []
     for k in range(1, n_more + 1):
@@ -345,8 +349,8 @@ def _snapshots_of_posterior(
 def _log_evidence_ratio_and_overlap(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
     """Estimate by a bridge (Bennett 1976) the log ratio of two temperatures' evidences in each cloud, (n_clouds,).
 
-    `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each. Also return
-    the effective share of the particles.
+    `before` and `after` are the log weights of particles at either temperature, (n_clouds, n) each. Also return the
+    lesser effective share of the two sets of particles.
     """
     size = math.log(before.shape[1]) - math.log(after.shape[1])
     log_ratio = logsumexp(before, axis=1) - math.log(before.shape[1])
@@ -360,7 +364,7 @@ def _log_evidence_ratio_and_overlap(before: FloatArray, after: FloatArray) -> tu
 
 
 def _next_temperature(rise: FloatArray, beta: float, share: float, n_particles: int) -> float:
-    """Find the temperature after `beta`: the one whose weights leave a share `share` of the particles effective."""
+    """Find the temperature after `beta`, 1 at most, whose weights leave a share `share` of the particles effective."""
     # What is impossible is lost at any temperature.
     least = share * float(min(n_particles, np.isfinite(rise).sum()))
     if n_effective((1.0 - beta) * rise) >= least:

@@ -26,9 +26,9 @@ Quantity = QuantitySummary  # its earlier name
 def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) -> tuple[QuantitySummary, ...]:
     """Summarise the whole SSF and, if there are several, each Gaussian: medians and 95 % intervals.
 
-    `centre_u_mm` and `centre_v_mm`; `sd_long_mm` and `sd_short_mm` along the axes of the covariance; `angle_deg` of the
-    long axis from the u axis, anticlockwise, defined up to 180 degrees, with a median within 90 degrees of 0.
-    For Gaussian n also its share of the mass; its names are as "gaussian_n.share".
+    In this order: `centre_u_mm` and `centre_v_mm`; `sd_long_mm` and `sd_short_mm` along the axes of the covariance;
+    `angle_deg` of the long axis from the u axis, anticlockwise, defined up to 180 degrees, with a median within 90
+    degrees of 0. Then for each Gaussian n its share of the mass, and the same five, named as "gaussian_n.share".
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) 
 
 
 def _moments_of_whole_footprint(f: Footprint) -> tuple[FloatArray, ...]:
-    """Compute the moments of the whole mixture, (n_samples,) each: u, v, their variances and covariance."""
+    """Compute the moments of the whole mixture, (n_samples,) each: u, v, var u, var v, covariance."""
     u, v = ((f.weight * centre).sum(axis=-1)[:, 0] for centre in (f.u_mm, f.v_mm))
     du, dv = f.u_mm[:, 0] - u[:, None], f.v_mm[:, 0] - v[:, None]
     spread = ((f.var_u, du * du), (f.var_v, dv * dv), (f.cov_uv, du * dv))

@@ -1,6 +1,6 @@
 """Coordinates of a mixture with mean and covariance of the whole in place of those of its heaviest Gaussian.
 
-Readings determine the moments of the whole footprint, but hardly how the Gaussians share them. Where a lighter Gaussian
+Readings determine the moments of the whole footprint, but hardly each Gaussian's part in them. Where a lighter Gaussian
 grows or moves in these coordinates, the heaviest compensates and the whole stays the same: so a sampler moves easily
 from one Gaussian that holds all of the light to two that share it.
 """
@@ -25,10 +25,10 @@ _UNIT = np.array([[1.0], [1.0], [0.0]])
 
 @dataclass(frozen=True)
 class WholeFootprintCoordinates:
-    """`MomentCoordinates` but for the first Gaussian's centre, log variances and correlation: those of the whole.
+    """`MomentCoordinates`, with the whole's centre, log variances and correlation in place of the first Gaussian's.
 
-    The readings do not depend on light far out. So a Gaussian that is k times as wide, or as far out, as the sensor
-    counts with 1 / (1 + (k / 3)^4) of its light.
+    The readings do not depend on light far out. So a Gaussian that is k times as wide, or as far out, as the footprint
+    (`size_mm2`) counts with 1 / (1 + (k / 3)^4) of its light.
 
     Parameters
     ----------
@@ -65,9 +65,9 @@ class WholeFootprintCoordinates:
         return x
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters, (n, 6 N + 2); also return the log prior density of the coordinates, (n,).
+        """Map coordinates to parameters, (n, 6 N + 2); also return the log prior density in the coordinates, (n,).
 
-        It is -inf where the Gaussians are not sorted, or there are no such parameters.
+        It is -inf where the Gaussians are not sorted, or no parameters have these coordinates.
         """
         y = x.copy()
         g = view_by_kind_and_gaussian(y)
@@ -124,7 +124,7 @@ class WholeFootprintCoordinates:
 
 
 def count_bright_gaussians(theta: FloatArray) -> IntArray:
-    """Count the Gaussians that hold more than `FAINT` of the heaviest one's light, (n, 6 N + 2) -> (n,)."""
+    """Count the Gaussians that hold more than a tenth (`FAINT`) of the heaviest one's light, (n, 6 N + 2) -> (n,)."""
     light = total_light_by_gaussian(theta)
     return np.asarray((light > FAINT * light.max(axis=1, keepdims=True)).sum(axis=1))
 
@@ -142,7 +142,7 @@ def _positive_definite_mask(covariance: FloatArray) -> BoolArray:
 
 
 def _logs_from_covariance(covariance: FloatArray) -> FloatArray:
-    """Undo `_covariance_from_logs`."""
+    """Compute log variances and arctanh of the correlation, the inverse of `_covariance_from_logs`."""
     xx, yy, xy = covariance
     return np.stack([np.log(xx), np.log(yy), np.arctanh(xy / np.sqrt(xx * yy))])
 

@@ -1,7 +1,7 @@
 """Likelihoods of readings, and the inference problem: a prior, a sensor model, a likelihood and a recording.
 
-The likelihoods are the paper's naive one, its Student-t (the noise sd of each data set integrated out), a Gaussian
-one of known sd, and one of rounded readings; any sensor model works with any of them.
+The likelihoods are the paper's naive one, its Student-t (the noise sd of each data set integrated out), a Gaussian one
+of known sd, and one of rounded readings; any sensor model works with any of them.
 """
 
 from probewise.inference.gaussian import GaussianKnown

@@ -9,7 +9,7 @@ from probewise.errors import ShapeError
 def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return readings minus predictions, (n_points,), (n_samples, n_points) -> (n_samples, n_points).
 
-    Raises ShapeError if the shapes do not match.
+    ShapeError if the shapes do not match.
     """
     readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
     if readings.ndim != 1 or predicted.ndim != 2 or predicted.shape[1] != readings.size:

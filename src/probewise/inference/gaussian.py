@@ -22,7 +22,7 @@ class GaussianKnown:
     Parameters
     ----------
     sd
-        In units of the reading: a number, or one for each reading, (n_points,).
+        In units of the reading: a number, or one for each reading, (n_points,); ParameterError if not above 0.
     """
 
     sd: ArrayLike

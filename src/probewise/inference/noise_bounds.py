@@ -25,10 +25,11 @@ def reading_span(recording: Recording) -> float:
 
 
 def sd_floor(recording: Recording) -> float:
-    """Return the lower bound of the noise sd: that of rounding to the declared step, or a share of the range if larger.
+    """Return the lower bound of the noise sd: that of rounding, step / sqrt(12), or a share of the range if larger.
 
-    Where no step is declared, that of the lattice on which all readings lie, if any, is used: residuals of readings at
-    levels of that lattice would be 0 otherwise, which a heavy-tailed noise model would take for the noise sd.
+    The step is the declared one, else that of the lattice on which all readings lie, if any: residuals of readings at
+    levels of that lattice would otherwise be 0, and a heavy-tailed noise model would take 0 for the noise sd. The share
+    is `recording.least_share_of_span`, 0.001 for a light sensor.
     """
     step = recording.plan.instrumentation.step or lattice_step(recording.readings[recording.usable])
     return max(step / math.sqrt(12.0), recording.least_share_of_span * reading_span(recording))
@@ -40,7 +41,7 @@ def sd_ceiling(recording: Recording) -> float:
 
 
 def student_t_of(recording: Recording, groups: IntArray | None = None) -> StudentT:
-    """Build the Student-t likelihood of a recording's usable readings, with `sd_floor` and `sd_ceiling` of it.
+    """Build the Student-t likelihood of a recording's usable readings, with its `sd_floor` and `sd_ceiling`.
 
     Parameters
     ----------

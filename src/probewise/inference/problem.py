@@ -39,7 +39,7 @@ class Problem(Protocol):
 
 
 def require_model(model: object) -> None:
-    """Raise ParameterError unless `model` is like a sensor model: with `names` and `predict`."""
+    """Raise ParameterError unless `model` has `names` and `predict`, as a sensor model has."""
     allowed = "a sensor model such as Chain(ssf, levels, scene), with names and predict(theta, plan)"
     require_like("model", model, ("names", "predict"), allowed)
 
@@ -47,7 +47,7 @@ def require_model(model: object) -> None:
 def checked_log_prob(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return a likelihood's log likelihood of each prediction, (n_points,), (n_samples, n_points) -> (n_samples,).
 
-    Raises ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
+    ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
     """
     scored = likelihood.log_prob(readings, predicted)
     if np.shape(scored) != (len(predicted),):
@@ -59,7 +59,7 @@ def checked_log_prob(likelihood: Likelihood, readings: FloatArray, predicted: Fl
 
 
 def require_likelihood(likelihood: object) -> None:
-    """Raise ParameterError unless `likelihood` has `log_prob`; a noise sd is the usual mistake."""
+    """Raise ParameterError unless `likelihood` has `log_prob`; a number (a noise sd) is the usual mistake."""
     allowed = "a likelihood such as GaussianKnown(sd), with log_prob(readings, predicted)"
     require_like("likelihood", likelihood, ("log_prob",), allowed)
 
@@ -68,7 +68,7 @@ def require_likelihood(likelihood: object) -> None:
 class SensorProblem:
     """The problem of inferring sensor, scene or both (the model's parameters) from a recording's usable readings.
 
-    Raises ParameterError if the names of `prior` and `model` differ.
+    ParameterError if the names of `prior` and `model` differ, or an argument is of the wrong kind.
     """
 
     prior: Prior

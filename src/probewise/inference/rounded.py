@@ -24,7 +24,8 @@ _PER_SD = 50.0  # table entries per sd: linear interpolation errs by less than 1
 class ScaleEnds:
     """Outermost readings of a scale: each covers everything beyond the inner edge of its rounding cell.
 
-    `low` and `high` are the readings, `lowest_cell` and `highest_cell` the centres of their cells, `step` their width.
+    `low` and `high` are the readings, `lowest_cell` and `highest_cell` the centres of their cells, `step` the cells'
+    width.
     """
 
     low: float
@@ -42,19 +43,22 @@ class ScaleEnds:
         return cls(max(lowest, low), min(highest, high), lowest, highest, step)
 
     def lowest_reading_mask(self, readings: FloatArray) -> BoolArray:
-        """Return which readings are the lowest possible one."""
+        """Return a mask of the readings that are the lowest possible one."""
         return np.asarray(readings <= self.low + self._tolerance)
 
     def highest_reading_mask(self, readings: FloatArray) -> BoolArray:
-        """Return which readings are the highest possible one."""
+        """Return a mask of the readings that are the highest possible one."""
         return np.asarray(readings >= self.high - self._tolerance)
 
     def end_mask(self, readings: FloatArray) -> BoolArray:
-        """Return which readings are the lowest or the highest possible one."""
+        """Return a mask of the readings that are the lowest or the highest possible one."""
         return self.lowest_reading_mask(readings) | self.highest_reading_mask(readings)
 
     def log_prob_at_ends(self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray) -> FloatArray:
-        """Return the log probability of readings at an end, (n_points,), given predictions, (n_samples, n_points)."""
+        """Return the log probability of readings, all at an end, (n_points,), given predictions, (n_samples, n_points).
+
+        `sd`: of the noise, a number or one per reading.
+        """
         inward = np.where(
             self.highest_reading_mask(readings), predicted - self.highest_cell, self.lowest_cell - predicted
         )
@@ -82,6 +86,11 @@ class Rounded:
         Ends of the scale. The outermost reading that each allows covers everything beyond.
     whole_steps
         Whether readings are rounded; if not, `step` is only the width of a reading's cell.
+
+    Raises
+    ------
+    ParameterError
+        If `sd` or `step` is not above 0, or `low` not below `high`.
     """
 
     sd: float
@@ -116,7 +125,7 @@ class Rounded:
         return ScaleEnds.from_range(self.low, self.high, self.step, whole_steps=self.whole_steps)
 
     def _log_cell_probability(self, away: FloatArray) -> FloatArray:
-        """Interpolate the log probability of readings' cells from a table, by distance from the prediction in sds."""
+        """Return the log probability of readings' cells from their distances to the prediction in sds, by a table."""
         position = np.minimum(away, _FAR - 1.0) * _PER_SD
         entry = position.astype(np.int64)
         below = self._log_cell_probability_table[entry]

@@ -147,7 +147,7 @@ class StudentT:
 
     @cached_property
     def _group_starts(self) -> IntArray | None:
-        """Index of each data set's first reading, if there are over 16, each contiguous and in order; else None."""
+        """Index of each data set's first reading, if there are over 16, contiguous each and in order; else None."""
         starts = np.flatnonzero(np.diff(self.groups, prepend=self.groups[:1] - 1))
         in_one_piece = starts.size == self.group_sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
         return starts if in_one_piece and starts.size > _MANY_GROUPS else None
@@ -183,9 +183,9 @@ class StudentT:
         return np.asarray(integral.sum(axis=1) - constant)
 
     def inverse_noise_variance(self, residual: FloatArray) -> FloatArray:
-        """Return one over the noise variance of each reading's data set, as its residuals estimate it.
+        """Return one over the noise variance of each reading's data set, as its residuals estimate the variance.
 
-        (n_samples, n_points) -> the same shape.
+        (n_samples, n_points) -> the same shape. The variance is limited to the bounds of the sd.
 
         The gradient of `log_prob` by the predictions is the residual times this, except near the bounds of the sd.
         """

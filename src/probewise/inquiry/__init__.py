@@ -1,11 +1,12 @@
 """The choice of the next measurement (paper, the machine learning system, figures 3 and 8).
 
-Samples of the posterior predict a reading at every place of a fine grid; where their predictions differ most, a reading
-tells most. The utility of a reading has one interface, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses;
-`InformationGain` uses the whole posterior and subtracts the entropy of the noise. Readings of thousands of hypotheses
-are looked up: discs in a table of the sensor's response (`DiscForecast`), ellipses and convex polygons in tables of the
-unit Gaussian's mass inside a corner and a bent edge (`TabulatedForecast`); any other model predicts some hundreds
-directly (`DirectForecast`). An instrument without a field of shapes has an `Inquiry` over its own settings.
+Samples of the posterior predict a reading at every place of a fine grid; a reading where the predictions differ most is
+the most informative. A utility of readings is a `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses;
+`InformationGain` uses the whole posterior and subtracts the entropy of the noise. For thousands of hypotheses the
+readings are interpolated in tables: of the sensor's response to discs (`DiscForecast`), or of the unit Gaussian's mass
+inside a corner and a bent edge, for ellipses and convex polygons (`TabulatedForecast`). Any other model predicts some
+hundreds of hypotheses directly (`DirectForecast`). For an instrument that reads no field of shapes, `Inquiry` chooses
+among its own settings.
 """
 
 from probewise.inquiry.any_settings import Inquiry, Predictive, ReadingNoise

@@ -19,16 +19,16 @@ _FEW = 600  # hypotheses used to simulate them
 def choose_several(utility_input: UtilityInput, n: int, *, rng: np.random.Generator) -> tuple[int, ...]:
     """Choose readings with large joint information, greedily one after another.
 
-    Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + ..., within 1 - 1/e of the
-    best set (Nemhauser, Wolsey & Fisher 1978). The conditional information is averaged over simulated
-    outcomes: each is a draw from the predictive distribution, with its own posterior.
+    Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + ..., within 1 - 1/e of the best set
+    (Nemhauser, Wolsey & Fisher 1978). The conditional information is averaged over simulated outcomes: each is a draw
+    from the predictive distribution, with its own posterior.
 
     Parameters
     ----------
     utility_input
         Posterior, designs and sensor.
     n
-        Number of readings.
+        Number of readings, 1 or more; else ParameterError.
     rng
         Source of randomness.
 
@@ -53,9 +53,9 @@ def choose_several(utility_input: UtilityInput, n: int, *, rng: np.random.Genera
 def _weights_after_simulated_reading(
     utility_input: UtilityInput, row: int, weights: list[FloatArray], rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Simulate a reading under each posterior, and return the weights of each, updated by its reading.
+    """Simulate one reading per posterior at design `utility_input.rows[row]`; return the posteriors' weights after it.
 
-    `row` is an index into `utility_input.rows`.
+    `weights`: of each posterior, (n_samples,).
     """
     readout = utility_input.readout
     level = utility_input.forecast.predict(utility_input.theta, utility_input.plan.take(utility_input.rows[[row]]))[

@@ -63,10 +63,10 @@ def fewest_readings(
     ----------
     prior_bits, met_bits, target_bits
         Differential entropy of the parameters: under the prior, at the first reading on the shape (on average), and at
-        the target (`target_entropy`).
+        the target (`target_entropy`), in descending order; else ParameterError.
     most_covered
-        Probability that the best first place lies on the shape. A search reading answers yes or no, with at most this
-        probability of yes as long as no better place arises.
+        Probability, 0 to 1, that the best first place lies on the shape. A search reading answers yes or no, with at
+        most this probability of yes as long as no better place arises.
     capacity
         Capacity of the sensor, bits per reading (`capacity_bits`).
     """
@@ -87,10 +87,10 @@ def target_entropy(n_params: int, sd: float) -> float:
 
 
 def capacity_bits(low: float, high: float, readout: Readout) -> float:
-    """Return the capacity of the sensor in bits per reading, for levels from `low` to `high`.
+    """Return the capacity of the sensor in bits per reading, for levels from `low` to `high`, in this order.
 
     The capacity-achieving distribution of levels is found by the Blahut-Arimoto iteration (1972), until the bounds are
-    within 1e-4 bits.
+    within 1e-4 bits. ParameterError unless `low` is below `high`.
     """
     if not low < high:
         raise ParameterError("(low, high)", (low, high), "low < high")

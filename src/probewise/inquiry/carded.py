@@ -1,4 +1,4 @@
-"""Predictions with known cards on the field, over tabulated predictions of the shape."""
+"""Predictions with known cards (rectangles of known albedo) on the field, over tabulated predictions of the shape."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def cards_of(model: SensorModel) -> tuple[Card, ...]:
 class CardedModel:
     """A sensor model without effects, for a shape and known cards on the field.
 
-    `plain` predicts the shape alone, `chain` in closed form the share of the footprint on each card.
+    `plain` predicts the shape alone; `chain` gives the share of the footprint on each card in closed form.
     """
 
     chain: Chain
@@ -64,13 +64,13 @@ class CardedModel:
 
     @property
     def black_and_white_readings(self) -> tuple[float, float]:
-        """Readings over black and over white."""
+        """Readings over black and over white: (I_min, I_max)."""
         levels = self.chain.levels
         assert isinstance(levels, FixedLevels)
         return levels.i_min, levels.i_max
 
     def footprint_share_by_card(self, poses: Poses, plan: Plan) -> list[FloatArray]:
-        """Return the share of the footprint on each card, (n_samples or 1, n_points) each."""
+        """Return for each card the share of the footprint on the card, (n_samples or 1, n_points)."""
         mixture = self.chain.ssf
         assert isinstance(mixture, FixedMixture)
         sd = np.sqrt(np.linalg.eigvalsh(mixture.covs_mm2)[:, -1])
@@ -94,7 +94,7 @@ class CardedModel:
 
 @dataclass(frozen=True, eq=False)
 class CardedForecast:
-    """A forecast by the shape's tables for all hypotheses; near cards, by direct predictions for some."""
+    """A forecast by tables of the shape for all hypotheses; near cards, by direct predictions of at most 400."""
 
     base: Forecast
     chain: Chain
@@ -111,7 +111,7 @@ class CardedForecast:
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """Return the predictive distribution at `rows`: by tables; near cards, by predictions of some hypotheses."""
+        """Return the predictive distribution at `rows`; see `Forecast.predictive`."""
         base = self.base.predictive(theta, weight, designs, plan, rows, noise_sd)
         there, model = plan.take(rows), self.model
         covered = model.footprint_share_by_card(
@@ -141,7 +141,11 @@ class _ForecastAsModel:
 
 @dataclass(frozen=True, eq=False)
 class _CardedPredictive:
-    """Predictions by tables except for designs near a card; `answers` are predictions of `chosen` hypotheses there."""
+    """Predictions by the tables of `base`, except for designs `near` a card, of `n_rows` in all.
+
+    There `answers` are the readings predicted by the hypotheses `chosen`, (n_chosen, n_near); `stands_for` is the
+    factor from the weight of each to that of all hypotheses for which it stands.
+    """
 
     base: PredictiveDistributions
     chosen: IntArray
@@ -155,7 +159,7 @@ class _CardedPredictive:
         return self.base.levels
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level at each design: that of the tables, replaced at designs near a card."""
+        """Yield the weight of each level at each design; see `PredictiveDistributions.level_weights`."""
         own, n = weight[self.chosen] * self.stands_for, len(self.near)
         levels = self.levels
         index = nearest_level_index(self.answers, levels)

@@ -12,12 +12,16 @@ TIE = 1e-9
 
 
 def best_places_mask(utility: FloatArray, reachable: BoolArray) -> BoolArray:
-    """Mark the reachable places within `TIE` of the highest reachable utility; a mask, all arrays (n_places,).
+    """Mark the reachable places within `TIE` (1e-9) of the highest reachable utility; a mask, all arrays (n_places,).
 
     Raises
     ------
     ReachError
         If no place is reachable.
+    ShapeError
+        If the arrays differ in shape.
+    ParameterError
+        If the utility of a reachable place is not finite.
     """
     if utility.shape != reachable.shape or utility.ndim != 1:
         raise ShapeError(f"utility has shape {utility.shape}, reachable {reachable.shape}; allowed: (n_places,) both")
@@ -29,5 +33,8 @@ def best_places_mask(utility: FloatArray, reachable: BoolArray) -> BoolArray:
 
 
 def choose(utility: FloatArray, reachable: BoolArray, *, rng: np.random.Generator) -> int:
-    """Draw the index of the next place at random among the best (paper, the machine learning system)."""
+    """Draw the index of the next place at random among the best (paper, the machine learning system).
+
+    It raises as `best_places_mask` does.
+    """
     return int(rng.choice(np.flatnonzero(best_places_mask(utility, reachable))))

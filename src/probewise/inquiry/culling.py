@@ -25,7 +25,7 @@ _FAR_MM = 1e5
 class CullingBounds:
     """Bounding box of each hypothesis, corners `low_mm` and `high_mm`, (n_samples, 2).
 
-    A sensor beyond it reads `outside`.
+    A sensor outside the box reads `outside`.
     """
 
     low_mm: FloatArray
@@ -36,7 +36,8 @@ class CullingBounds:
     def of(cls, model: SensorModel, theta: FloatArray, plan: Plan) -> Self | None:
         """Compute the bounds of hypotheses, (n_samples, n_params); None if readings depend on more than the shape.
 
-        Only the shape matters for a known mixture and known levels without effects.
+        Only the shape matters for a known mixture and known levels without effects. None also for a shape without
+        closed edge.
         """
         if not isinstance(model, Chain) or model.effects or has_commanded_height_or_led(plan) or len(plan) == 0:
             return None

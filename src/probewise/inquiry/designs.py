@@ -64,7 +64,7 @@ class Designs:
 
     @cached_property
     def setting_combinations(self) -> tuple[Design, ...]:
-        """The combinations of settings as designs at the field's corner; repeats of one setting are adjacent."""
+        """The combinations of orientation, settings and repeats, as designs at (0, 0); repeats vary fastest."""
         names = [name for name, _ in self.settings]
         return tuple(
             Design(0.0, 0.0, turn, n, tuple(zip(names, values, strict=True)))
@@ -90,12 +90,12 @@ class Designs:
         return np.repeat([combination.repeats for combination in self.setting_combinations], self.grid.n_places)
 
     def plan(self, pattern_name: str, *, time_s: float = 0.0) -> Plan:
-        """Return a plan with one row per design, (n_designs,) rows, each a scan of its own (see `Grid.plan`)."""
+        """Return a plan with one row per design, in order, each a scan of its own (see `Grid.plan`)."""
         return replace(self._plan_without_time, pattern_names=(pattern_name,), time_s=np.full(len(self), time_s))
 
     @cached_property
     def _plan_without_time(self) -> Plan:
-        """The plan of all designs except time and pattern name, cached because it has thousands of scan names."""
+        """The plan of all designs with time 0 and pattern name "", cached because it has thousands of scan names."""
         n_places, n_designs = self.grid.n_places, len(self)
         once = self.grid.plan("")
         rows = np.tile(np.arange(n_places), len(self.setting_combinations))

@@ -43,12 +43,12 @@ class DiscTable:
     dark, bright
         Readings far outside and far inside.
     margin_mm
-        Distance from the edge within which the level differs from these.
+        Distance from the edge within which the level differs from `dark` or `bright`.
     bend_per_mm
         Least and greatest 1 / radius of the table.
     levels
-        Noise-free readings, (n_bends, n_directions + 1, n_distances): evenly spaced in 1 / radius, in the
-        direction's pseudo-angle (the last repeats the first), and in distance from -margin to margin.
+        Noise-free readings, (n_bends, n_directions + 1, n_distances): evenly spaced in 1 / radius, in the direction's
+        pseudo-angle (the last repeats the first), and in distance from -margin to margin.
     """
 
     dark: float
@@ -61,8 +61,8 @@ class DiscTable:
     def of(cls, model: SensorModel) -> Self | None:
         """Tabulate a model, or return None if that is not possible.
 
-        A table holds a known mixture, or the naive sensor, over a single circle, with no effects but those of
-        `is_known_footprint_effect`; it must see no farther than 80 mm.
+        Tabulated are a known mixture, or the naive sensor, over a single circle, with no effects but those of
+        `is_known_footprint_effect`, if the reading is constant farther than 80 mm from the edge.
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
@@ -190,7 +190,10 @@ class DiscTable:
     mass = level_histogram  # its old name
 
     def _distance_to_constant_level_mm(self, nearest: IntArray, ends: tuple[int, int]) -> float:
-        """Return the distance from an edge beyond which the nearest of a list of levels is constant."""
+        """Return the distance from an edge beyond which the nearest level is constant.
+
+        `nearest`: its index for each entry of the table; `ends`: that of the dark and the bright level.
+        """
         if self.margin_mm == 0.0:
             return 0.0
         distance = np.linspace(-self.margin_mm, self.margin_mm, nearest.shape[2])
@@ -198,7 +201,7 @@ class DiscTable:
         return float(np.abs(distance[off]).max(initial=0.0))
 
     def _nearest_entry_index(self, away: _DiscPlacePairs) -> IntArray:
-        """Return the index of the table's nearest entry for pairs of disc and place."""
+        """Return the index, in the flattened table, of the nearest entry for pairs of disc and place, (n_pairs,)."""
         _, n_directions, n_distances = self.levels.shape
         step = away.distance_mm + np.float32(self.margin_mm)
         step *= self._entries_per_mm
@@ -250,8 +253,8 @@ def _intervals_of_discs(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_
 class _DiscPlacePairs:
     """Pairs of a disc and a place near its edge, (n_pairs,) each.
 
-    `x_mm`, `y_mm`: the place relative to the disc's centre, in the sensor's frame. `distance_mm`: from the edge,
-    positive outside.
+    `x_mm`, `y_mm`: the place relative to the disc's centre, in the sensor's frame. `radius_mm`: the disc's.
+    `distance_mm`: from the edge, positive outside.
     """
 
     x_mm: FloatArray
@@ -281,7 +284,7 @@ class _DiscPlacePairs:
 
 
 def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return a pseudo-angle from 0 to 4 around the origin, monotonic in the angle, without trigonometry."""
+    """Return a pseudo-angle from 0 to 4 around the origin: it rises with the angle, but needs no trigonometry."""
     across = x / np.maximum(np.abs(x) + np.abs(y), _TINY)
     return np.asarray(2.0 - np.copysign(1.0 + across, y))
 
@@ -295,7 +298,7 @@ def _unit_vectors_of_pseudo_angles(pseudo_angle: FloatArray) -> FloatArray:
 
 
 def _index_and_fraction(position: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
-    """Split positions in units of the spacing into the index below and the fraction to the next."""
+    """Split positions in units of the spacing into the index below, of `n`, and the fraction to the next."""
     below = np.clip(position.astype(np.int64), 0, n - 2)
     return below, position - below
 

@@ -1,4 +1,4 @@
-"""Response of a known footprint to ellipses, from the nearest point of the edge and its curvature there."""
+"""Response of a known footprint to ellipses, from the nearest point of the edge and the edge's curvature there."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _TINY = np.float32(1e-6)
 class Ellipses:
     """Ellipses in the lab frame and, for each Gaussian of the footprint, in the frame in which it is the unit Gaussian.
 
-    In the lab an ellipse is where xx dx^2 + 2 xy dx dy + yy dy^2 <= 1. dx and dy count from the place of the sensor
-    at which the footprint's centre is over the ellipse's centre: `lab` (5, n_ellipses) holds x and y of that place,
-    then xx, xy, yy. `growth_per_sd` is the largest increase of each ellipse's scale per sd of the footprint,
-    `growth_by_offsets` the increase by the Gaussians' offsets from the centre. `axes` (n_gaussians, 2, n_ellipses) are
-    the semi-axes, major and minor. `to_axes_frame` (n_gaussians, 2, 3, n_ellipses) maps a place to their frames: for
-    each axis the factor of x, the factor of y, and a constant. `y_range_mm` (2, n_ellipses) are the lowest and the
-    highest point, `share` (n_gaussians,) the weights of the Gaussians.
+    In the lab an ellipse is where xx dx^2 + 2 xy dx dy + yy dy^2 <= 1. dx and dy count from the place of the sensor at
+    which the footprint's centre is over the ellipse's centre: `lab` (5, n_ellipses) holds x and y of that place, then
+    xx, xy, yy. `growth_per_sd` is the largest increase of each ellipse's scale per sd of the footprint,
+    `growth_by_offsets` the increase by the Gaussians' offsets from the centre, (n_ellipses,) each. `axes` (n_gaussians,
+    2, n_ellipses) are the semi-axes, major and minor. `to_axes_frame` (n_gaussians, 2, 3, n_ellipses) maps a place to
+    the semi-axes' frames: for each axis the factor of x, the factor of y, and a constant. `y_range_mm` (2, n_ellipses)
+    are the lowest and the highest point, `share` (n_gaussians,) the weights of the Gaussians.
     """
 
     y_range_mm: FloatArray
@@ -98,9 +98,10 @@ class CrossedEllipses:
     axes: FloatArray
 
     def interval_deeper_than(self, reach: float) -> Interval:
-        """Return the interval of x deeper than `reach` sds inside the edge; if negative, up to that far outside.
+        """Return the interval of x (both ends) deeper than `reach` sds inside; if negative, up to that far outside.
 
-        An ellipse scaled by 1 + d / (its shortest semi-axis) contains all points within d of it; and likewise inwards.
+        An ellipse scaled by 1 + d / (its shortest semi-axis) contains all points within d of the ellipse; likewise
+        inwards.
         """
         x_mm, up, xx, xy, yy = self.lab
         scale = 1.0 - np.float32(reach) * self.growth_per_sd - np.float32(np.sign(reach)) * self.growth_by_offsets
@@ -110,7 +111,7 @@ class CrossedEllipses:
         return np.where((room > 0) & (scale > 0), middle - half, np.inf), middle + half
 
     def footprint_share(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
-        """Return the share of the footprint over the ellipse for places of crossings, both (n_pairs,).
+        """Return the share of the footprint over the ellipse at `x_mm` of the crossings `crossing`, (n_pairs,) each.
 
         The nearest point is found by one step along the circle of curvature from the point on the same ray.
         """

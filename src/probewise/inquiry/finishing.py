@@ -20,7 +20,7 @@ _MOST_DESIGNS = 250  # the best by the other utility
 
 @dataclass(frozen=True)
 class Finishing:
-    """Utility: the probability that the next reading ends the run, if some reading may; otherwise another utility.
+    """Utility: the probability that the next reading ends the run, if that may be; until then another utility.
 
     Information counts bits on every parameter, even one that is known well enough: a greedy robot would refine one
     length while another is still too uncertain. This utility uses the sds of the stopping rule.
@@ -30,7 +30,7 @@ class Finishing:
     of
         The utility until then.
     least
-        Probability of ending the run from which it replaces the other utility.
+        Probability of ending the run, above 0, at which it replaces the other utility.
     """
 
     of: Utility = field(default_factory=InformationGain)
@@ -42,7 +42,7 @@ class Finishing:
 
     @property
     def label(self) -> str:
-        """Label of the other utility and of its replacement near the end."""
+        """Label of the utility until then, and of its replacement near the end."""
         return f"{self.of.label}, or chance to finish"
 
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
@@ -67,14 +67,14 @@ class Finishing:
 
 
 def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
-    """Return whether one more reading may end the run: the largest sd exceeds the goal by less than a factor of 15."""
+    """Return whether one more reading may end the run: the largest sd is 1 to 15 times the goal."""
     lengths = utility_input.theta[:, goal.columns]
     spread = utility_input.weight @ (lengths - utility_input.weight @ lengths) ** 2
     return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)
 
 
 def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
-    """Return the probability that a reading at each design reaches the target precision, (n_designs,)."""
+    """Return the probability that a reading reaches the target precision, (n,), for `designs`, places in `rows`."""
     rows, share = resampled_rows_and_weights(utility_input.weight, _MOST_ASKED)
     away = utility_input.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()

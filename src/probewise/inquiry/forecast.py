@@ -32,7 +32,7 @@ class PredictiveDistributions(Protocol):
         ...
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level, for one combination of settings with all places after another.
+        """Yield the weight of each level, for one combination of settings, with all its places, after another.
 
         Parameters
         ----------
@@ -134,7 +134,10 @@ def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> Float
 
 
 def rows_by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:
-    """Split rows of designs, (n,), by combination; yield its number, the indices into `rows`, and the places there."""
+    """Split rows of designs, (n,), by combination of settings.
+
+    Yield for each its number, the indices into `rows`, and the numbers of the places there.
+    """
     combination, place = np.divmod(rows, n_places)
     for number in np.unique(combination).tolist():
         at = np.flatnonzero(combination == number)
@@ -158,7 +161,10 @@ def predict_where_visible(model: SensorModel, theta: FloatArray, plan: Plan) -> 
 
 
 def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
-    """Return evenly spaced levels between two readings: at most `spacing` apart, unless that takes more than `most`."""
+    """Return evenly spaced levels between two readings, two or more, at most `spacing` apart.
+
+    `most`: largest number of levels, even if they are then further apart.
+    """
     low, high = min(low, high), max(low, high)
     n = max(2, int(np.ceil((high - low) / spacing)) + 1)
     return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))

@@ -17,8 +17,8 @@ _LEAST = 1e-12
 class WeightsGivenReading:
     """Weights of hypotheses times the probability of each cell of a reading, and sums over hypotheses.
 
-    Hypotheses with nearly equal predictions are summed first, so that the noise is applied to some hundred levels
-    instead of every hypothesis.
+    A cell is a range of readings recorded as one. Hypotheses with nearly equal predictions are summed first, so that
+    the noise is applied to some hundred levels instead of every hypothesis.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class WeightsGivenReading:
         return np.maximum(self.weighted_sum_by_cell(np.ones(len(self._weight))), _LEAST)
 
     def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:
-        """Sum weight times value, each with the probability of the cell: values (n,) -> (n_designs, n_cells)."""
+        """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""
         return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
 
     def weight_by_hypothesis_and_cell(self, design: int) -> FloatArray:

@@ -1,9 +1,8 @@
-"""Information gained on the parameters: prior minus posterior differential entropy, by three methods.
+"""Information gained on the parameters: prior minus posterior differential entropy, by two methods.
 
-The first comes with nested sampling: its information H is the relative entropy of the
-posterior to the prior, and the two entropies differ from it by the mean log prior only.
-The others look at equally weighted samples alone: a Gaussian's closed form, and distances
-to nearest neighbours, which assume no shape.
+`bits_gained` uses nested sampling: its information H is the relative entropy of the posterior to the prior, and the two
+entropies differ from it by the mean log prior only. `neighbour_entropy` looks at equally weighted samples alone: at
+distances to nearest neighbours, which assume no shape.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, p
 
 
 def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20_000) -> float:
-    """Return the differential entropy of a prior in bits, by minus the mean log2 density of draws from it."""
+    """Return the differential entropy of a prior in bits: minus the mean log2 density of `n_samples` draws."""
     theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
     return -float(np.mean(prior.log_prob(theta))) / math.log(2)
 
@@ -48,10 +47,10 @@ def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20
 def neighbour_entropy(theta: FloatArray, *, neighbour: int = 4) -> float:
     """Return the differential entropy in bits from distances to the k-th neighbour, theta (n_samples, n_params).
 
-    Kozachenko and Leonenko's estimate (k as in Kraskov et al. 2004): psi(n) - psi(k) + ln V_d
-    + d mean(ln r_k). The columns are scaled to unit sd first, and the scale is added back,
-    since the estimate assumes a density that is even over the distance r_k. Repeated samples
-    have distance zero and are refused.
+    Kozachenko and Leonenko's estimate (k, `neighbour`, as in Kraskov et al. 2004): psi(n) - psi(k) + ln V_d + d mean(ln
+    r_k). The columns are scaled to unit sd first, and the scale is added back, since the estimate assumes a density
+    that is even over the distance r_k. ParameterError for repeated samples, which have distance zero, a constant
+    column, or a k that is not below the number of samples.
     """
     n_samples, n_params = theta.shape
     if not 1 <= neighbour < n_samples:

@@ -12,7 +12,7 @@ from probewise.errors import ParameterError
 
 
 class Label(Protocol):
-    """A labelling of hypotheses; those with the same label need not be distinguished."""
+    """A labelling of hypotheses, as whole numbers; hypotheses of one label need not be distinguished."""
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """Return labels of weighted hypotheses: (n_samples, n_params), (n_samples,) -> (n_samples,)."""

@@ -12,7 +12,7 @@ UTILITY_NAMES = ("finishing", "information", "entropy", "per-second", "about:PAR
 
 
 def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
-    """Build a utility from its name, such as "entropy" or "about:radius_mm".
+    """Build a utility from its name, one of `UTILITY_NAMES`, such as "entropy" or "about:radius_mm".
 
     Parameters
     ----------

@@ -22,9 +22,10 @@ _LEAST = np.float32(1e-9)
 class EdgesInFootprintSds:
     """Edges of polygons as half-planes, in sds of each Gaussian of the footprint across the edge.
 
-    Distance inside edge k = across x + up y + offset, arrays (n_gaussians, n_edges, n_polygons). `opening`
-    (n_gaussians, 2^n_edges, n_polygons), at 2^k + 2^m, numbers the corner of edges k and m; see `mass_within_corner`.
-    `share` is the weight of each Gaussian. `y_range_mm` (2, n_polygons) are the lowest and the highest corner.
+    Distance inside edge k = across x + up y + offset, arrays (n_gaussians, n_edges, n_polygons), for the sensor at
+    (x, y). `opening` (n_gaussians, 2^n_edges, n_polygons), at 2^k + 2^m, numbers the corner of edges k and m; see
+    `mass_within_corner`. `share` is the weight of each Gaussian. `y_range_mm` (2, n_polygons) are the lowest and the
+    highest corner.
     """
 
     y_range_mm: FloatArray
@@ -84,7 +85,7 @@ class CrossedPolygons:
     which: IntArray
 
     def interval_deeper_than(self, reach: float) -> Interval:
-        """Return the interval of x deeper than `reach` sds inside every edge; if negative, up to that far outside.
+        """Return the interval of x (both ends) deeper than `reach` sds inside; if negative, up to that far outside.
 
         For several Gaussians, the outermost counts outside the polygon, and the innermost inside.
         """
@@ -96,7 +97,7 @@ class CrossedPolygons:
         return outermost(low, axis=0).max(axis=0), innermost(high, axis=0).min(axis=0)
 
     def footprint_share(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
-        """Return the share of the footprint over the polygon for places of crossings, both (n_pairs,)."""
+        """Return the share of the footprint over the polygon at `x_mm` of the crossings `crossing`, (n_pairs,) each."""
         which = self.which.take(crossing)
         out = to_single_precision(np.zeros(x_mm.shape))
         for share, slope, base, opening in zip(self.share, self.slope, self.base, self.opening, strict=True):

@@ -1,4 +1,4 @@
-"""From a noise-free level to the recorded number: noise, rounding, range."""
+"""From a noise-free level to the recorded reading: noise, rounding, range."""
 
 from __future__ import annotations
 
@@ -28,6 +28,11 @@ class Readout:
         Rounding step of the readings; None: not rounded.
     low, high
         Smallest and largest possible reading.
+
+    Raises
+    ------
+    ParameterError
+        If `noise_sd` or `step` is not above 0, or `low` not below `high`.
     """
 
     noise_sd: float
@@ -57,7 +62,8 @@ class Readout:
     def cell_edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
         """Return the edges of the cells for readings of these levels, (n_cells - 1,); the end cells are open.
 
-        Cells of unrounded readings are `fine` noise sds wide; above `most` cells, neighbours are merged.
+        A cell is a range of readings recorded as one: a step, or `fine` noise sds for unrounded readings. Above `most`
+        cells, neighbours are merged.
         """
         width = fine * self.noise_sd if self.step is None else self.step
         least = max(float(np.min(levels)) - _REACH * self.noise_sd, self.low)
@@ -72,7 +78,7 @@ class Readout:
     ) -> FloatArray:
         """Return the probability of each cell given each level, (n_levels,) -> (n_levels, n_cells); see `cell_edges`.
 
-        For repeats it is that of their mean, with cells scaled to its smaller noise.
+        For `repeats` readings it is that of their mean, with cells scaled to the mean's smaller noise.
         """
         sd = self.noise_sd / math.sqrt(repeats)
         each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)

@@ -29,9 +29,9 @@ class PlacesNearEdges:
 
 @dataclass(frozen=True, eq=False)
 class ScanlineIntervals:
-    """Intersections of shapes with some rows of a grid, (n_intervals,) each: row, shape, and columns.
+    """Intersections of shapes with some rows of a grid, (n_intervals,) each: row, shape (`hypothesis`), and columns.
 
-    The row is counted from the first of them. Columns from `first` to `last` are in the shape or near its edge,
+    `row` is counted from the first of these rows. Columns from `first` to `last` are in the shape or near its edge,
     those from `inner_first` to `inner_last` deep inside; if there are none, these are `last` + 1 and `last`.
     """
 
@@ -55,7 +55,7 @@ class ScanlineIntervals:
         grid, n_rows, row, hypothesis
             The grid, the number of its rows used, and the row and the shape of each interval.
         outer, inner
-            Intervals along the row, in single precision, which resolves a ten-thousandth of a millimetre.
+            Ends along the row, mm, in single precision, which resolves a ten-thousandth of a millimetre.
         """
         per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
 

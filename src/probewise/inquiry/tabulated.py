@@ -54,7 +54,7 @@ class DiscForecast:
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """Return the predictive distribution at `rows`, of all hypotheses by the table."""
+        """Return the predictive distribution at `rows`, of all hypotheses by the table; see `Forecast.predictive`."""
         levels = evenly_spaced_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
         turns = plan.orientation_rad.reshape(-1, designs.grid.n_places)
         return _DiscPredictive(self.table, theta, designs.grid, turns, rows, levels)
@@ -87,10 +87,10 @@ class _DiscPredictive:
 
 @dataclass(frozen=True, eq=False)
 class TabulatedForecast:
-    """A forecast for ellipses and convex polygons, by tables of the unit Gaussian's response.
+    """A forecast for ellipses and convex polygons, by tables of the unit Gaussian's response; made by `of`.
 
-    Its rms error is at most 0.5 % of the difference between dark and bright, which is checked against the sensor model
-    on construction.
+    Its rms error is at most 0.5 % of the difference between dark and bright, which `of` checks against the sensor
+    model.
     """
 
     model: Chain
@@ -100,7 +100,7 @@ class TabulatedForecast:
 
     @classmethod
     def of(cls, model: SensorModel, *, highest: float = 1.0) -> Self | None:
-        """Build the forecast, or return None if the tables do not apply to the model.
+        """Build the forecast, or return None if the tables do not apply to the model, or disagree with it.
 
         Parameters
         ----------
@@ -120,7 +120,8 @@ class TabulatedForecast:
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points), by the tables.
 
-        At many places, only hypotheses are evaluated whose shape is visible there.
+        At over 1000 places, over 8 orientations and heights, or where no table applies, the model predicts directly,
+        only the hypotheses visible from each place.
         """
         if len(plan) > _FEW:
             return predict_where_visible(self.model, theta, plan)
@@ -159,7 +160,7 @@ class TabulatedForecast:
         return _TabulatedPredictive(shapes_at, ways, designs.grid, rows, levels)
 
     def _tabulated_shapes_at(self, theta: FloatArray, turn_rad: float, height: float) -> TabulatedShapes | None:
-        """Return the shapes under the sensor at an orientation, and at `height` times that of its calibration."""
+        """Return the shapes under the sensor at an orientation, and at `height` times the calibrated one, or None."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         stands = height * np.array([[cosine, -sine], [sine, cosine]])
         seen = FixedMixture(
@@ -223,7 +224,7 @@ class _TabulatedPredictive:
 
 
 def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast:
-    """Choose the forecast for a model: tables if possible.
+    """Choose the forecast for a model: tables if possible, else direct predictions.
 
     `highest` is the largest height of the sensor over that of its calibration; None: always the calibrated height.
     """

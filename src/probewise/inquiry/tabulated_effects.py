@@ -1,4 +1,4 @@
-"""Predictions with effects that act before or after the seen white fraction of a disc, which is tabulated."""
+"""Predictions with effects that act before or after the white fraction of the footprint, tabulated for a disc."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from probewise.sensor.stages import SensorModel, Stage, View
 
 @dataclass(frozen=True, eq=False)
 class TabulatedChain:
-    """A chain over one disc that takes the seen white fraction from a table, and applies the other effects as they are.
+    """A chain over one disc that takes the seen white fraction from a table, and applies the other effects unchanged.
 
     No effect may change the disc itself, and effects on the footprint must be those of the table. `cards`: the model
     with known cards, if there are any.

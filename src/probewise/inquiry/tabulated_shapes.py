@@ -20,19 +20,19 @@ from probewise.sensor import FixedMixture
 
 
 class _CrossedShapes(Protocol):
-    """Shapes of one kind, each intersected by a row of places."""
+    """Shapes of one kind (ellipses or polygons), each intersected by a row of places."""
 
     def interval_deeper_than(self, reach: float) -> Interval:
-        """Return the interval in which the footprint is `reach` sds inside, or at most -`reach` sds outside."""
+        """Return the interval of x (both ends) deeper than `reach` sds inside; if negative, up to that far outside."""
         ...
 
     def footprint_share(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
-        """Return the share of the footprint over the shape for places of crossings, both (n_pairs,)."""
+        """Return the share of the footprint over the shape at `x_mm` of the crossings `crossing`, (n_pairs,) each."""
         ...
 
 
 class _ShapesOfOneKind(Protocol):
-    """Shapes of one kind under a footprint."""
+    """Shapes of one kind (ellipses or polygons) under a footprint."""
 
     @property
     def y_range_mm(self) -> FloatArray:
@@ -40,7 +40,7 @@ class _ShapesOfOneKind(Protocol):
         ...
 
     def crossed_by_rows(self, which: IntArray, y_mm: FloatArray) -> _CrossedShapes:
-        """Intersect shapes with rows of places, arrays of one shape."""
+        """Intersect each shape of `which` (by number) with a horizontal row at `y_mm`; both (n_crossings,)."""
         ...
 
 
@@ -48,8 +48,8 @@ class _ShapesOfOneKind(Protocol):
 class TabulatedShapes:
     """Shapes of hypotheses, grouped by kind for fast computation of the light from a footprint.
 
-    `parts`: indices of the hypotheses of each kind, and their geometry in the lab frame. `footprint_mm`: the largest
-    offset of a Gaussian from the sensor, and its largest sd.
+    `parts`: for each kind the indices of its hypotheses and their geometry in the lab frame. `footprint_mm`: the
+    largest offset of a Gaussian from the sensor, and its largest sd.
     """
 
     n_shapes: int

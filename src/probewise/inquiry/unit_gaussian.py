@@ -29,7 +29,8 @@ _NODES = 40
 def mass_within_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> FloatArray:
     """Return the mass of the unit Gaussian inside both edges of a corner: bivariate normal CDF of their distances.
 
-    `opening` numbers the correlation r of the two distances: floor((arcsin(r) / pi + 1 / 2) N_OPENINGS).
+    `first`, `second`: the distances inside, sds. `opening` numbers their correlation r: floor((arcsin(r) / pi + 1 / 2)
+    N_OPENINGS).
     """
     index = opening * (_N * _N) + _distance_index(second) * _N
     index += _distance_index(first)

@@ -30,10 +30,9 @@ class Utility(Protocol):
 class ReadingEntropy:
     """Shannon entropy, in bits, of the readings that a few hypotheses predict (paper, the machine learning system).
 
-    The predictions are noise-free and fall into fixed bins, `bin_width` wide and centred on
-    its multiples: one LEGO unit rounds as the sensor does. For the naive model there are two
-    readings, so the map is the paper's partition: at most one bit, where half of the circles
-    contain the place.
+    The predictions are noise-free and fall into fixed bins, `bin_width` wide and centred on its multiples: one LEGO
+    unit rounds as the sensor does. For the naive model there are two readings, so the map is the paper's partition: at
+    most one bit, where half of the circles contain the place.
     """
 
     bin_width: float = 1.0
@@ -92,7 +91,7 @@ class InformationAbout:
 
 @dataclass(frozen=True)
 class PerSecond:
-    """Utility of a reading per second, including travel."""
+    """The utility `of` a reading per second, including travel; ParameterError if a cost is not above 0."""
 
     of: Utility = field(default_factory=InformationGain)
 

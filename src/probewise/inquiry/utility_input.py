@@ -21,7 +21,7 @@ _BLOCK = 512  # designs per batch, to fit the cache
 
 @dataclass(frozen=True)
 class Goal:
-    """The stopping rule of a run: posterior sds of these columns of theta below `sd`."""
+    """The stopping rule of a run: the posterior sds of the columns `columns` of theta are all below `sd`."""
 
     columns: tuple[int, ...]
     sd: float
@@ -29,7 +29,7 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class UtilityInput:
-    """Posterior, designs and sensor, with the quantities that utilities need.
+    """Posterior, designs and sensor, with the quantities that utilities need; ShapeError if the arrays do not match.
 
     Attributes
     ----------
@@ -46,9 +46,9 @@ class UtilityInput:
     rows
         Indices of the available designs, (n,); all results are for these, in this order.
     cost_s
-        Seconds that each of them takes, (n,).
+        Seconds that each available design takes, (n,).
     goal
-        The stopping rule, if it is one of sds.
+        The stopping rule, if it is one of sds; else None.
     """
 
     forecast: Forecast
@@ -88,12 +88,12 @@ class UtilityInput:
 
     @cached_property
     def predictive(self) -> PredictiveDistributions:
-        """Predictive distribution under the whole posterior."""
+        """Predictive distribution under the whole posterior, as weights of levels."""
         noise_sd = self.readout.noise_sd / np.sqrt(max(self.designs.repeats))
         return self.forecast.predictive(self.theta, self.weight, self.designs, self.plan, self.rows, noise_sd)
 
     def information(self, weight: FloatArray) -> FloatArray:
-        """Return the expected information in bits of a reading at every design, for weights (n_samples,)."""
+        """Return the expected information in bits of a reading at every available design, for weights (n_samples,)."""
         out = np.empty(len(self.rows))
         for at, mass in self.predictive.level_weights(weight):
             chance = self._cell_probability(at)
@@ -101,9 +101,9 @@ class UtilityInput:
         return out
 
     def reading_entropy(self, weight: FloatArray) -> FloatArray:
-        """Return the entropy in bits of the reading at every design, including noise, rounding and range.
+        """Return the entropy in bits of the reading at every available design, including noise, rounding and range.
 
-        The weights, (n_samples,), are normalised, and may be 0 for some hypotheses.
+        The weights, (n_samples,), need not sum to one, and may be 0 for some hypotheses.
         """
         out = np.empty(len(self.rows))
         for at, mass in self.predictive.level_weights(weight):
@@ -111,7 +111,7 @@ class UtilityInput:
         return out
 
     def _cell_probability(self, at: IntArray) -> FloatArray:
-        """Return the probability of each cell given each level, for designs with equal repeats."""
+        """Return the probability of each cell given each level, (n_levels, n_cells), at designs of equal repeats."""
         n = int(self.designs.n_repeats[self.rows[at[0]]])
         chance = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
         return np.asarray(chance.astype(np.float32))

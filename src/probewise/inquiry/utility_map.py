@@ -60,7 +60,7 @@ class UtilityMap:
 
     @property
     def is_flat(self) -> bool:
-        """Whether there is no choice: all available designs have equal utility, or the only one has none."""
+        """Whether there is no choice: all available designs have equal utility (to 1e-5), or the only one has none."""
         values = self.values[self.reachable]
         return bool(np.ptp(values) <= FLAT and (len(values) > 1 or values[0] <= FLAT))
 
@@ -87,6 +87,8 @@ def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
         If the utility returns a wrong number of values.
     ParameterError
         If one of its values is not finite.
+    ReachError
+        If no design is available.
     """
     # The utility with two measures reports which one these values are.
     value, label = (
@@ -146,7 +148,10 @@ def entropy_map(
 
 
 def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1) -> IntArray:
-    """Return the indices of the designs at reachable places, (n_places,) -> (n,); ReachError if there are none."""
+    """Return the indices of the designs at reachable places, (n_places,) -> (n,), for `n_combinations` of settings.
+
+    ReachError if there are none; ShapeError for a mask of another shape.
+    """
     if reachable.shape != (n_places,):
         raise ShapeError(f"reachable has shape {reachable.shape}; allowed: ({n_places},), one per place")
     if not reachable.any():

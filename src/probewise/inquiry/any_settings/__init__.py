@@ -2,7 +2,7 @@
 
 The paper's machine learning system without a field of shapes: readings update the posterior (`posterior`), and the next
 setting maximises an acquisition function (`Inquiry.utility`): expected information (Lindley 1956) or, near a goal, the
-expected decrease of the posterior sds towards it.
+expected decrease of the posterior sds towards the goal.
 """
 
 from probewise.inquiry.any_settings.acquisition import Predictive

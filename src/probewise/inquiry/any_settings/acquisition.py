@@ -2,8 +2,8 @@
 
 At each setting the posterior samples are sorted by the reading that they predict, and divided into groups. The
 predictive density is a mixture with one component per group, whose variance is that of the noise plus that within the
-group; means over it are sums over samples of each group and nodes of a quadrature over the noise. Nothing is binned, so
-a hundredth of a bit is resolved as well as ten bits.
+group; means over the density are sums over groups and nodes of a quadrature over the noise. Nothing is binned, so a
+hundredth of a bit is resolved as well as ten bits.
 """
 
 from __future__ import annotations
@@ -25,12 +25,7 @@ _LEAST_SHARE = 1e-9  # of the variance that rounding may leave
 class Predictive:
     """Predictive distribution of the reading at each setting, of equally weighted samples of a posterior.
 
-    Parameters
-    ----------
-    predicted, scale
-        Predicted readings and sds of their noise, (n_samples, n_settings).
-    noise
-        The noise.
+    `predicted`, `scale`: predicted readings and sds of their noise, (n_samples, n_settings).
     """
 
     def __init__(self, predicted: FloatArray, scale: FloatArray, noise: ReadingNoise) -> None:
@@ -51,7 +46,7 @@ class Predictive:
 
         A group may hold samples far apart, with no sample near its mean. So each pair of nodes, above and below, is
         added to another sample's prediction, in turn from group to group. If the noise is wider than the group, these
-        predictions are shifted and scaled to its mean and variance.
+        predictions are shifted and scaled to the group's mean and variance.
         """
         n_groups, size = self._shape
         n_pairs = (len(weight) + 1) // 2
@@ -83,14 +78,16 @@ class Predictive:
         return np.asarray(np.maximum(given - mixed, 0.0) / math.log(2))
 
     def distance_from_goal(self, values: FloatArray, goal: FloatArray) -> FloatArray:
-        """Return the expected distance from the goal after a reading, (n_settings,): the sum of ln(sd / goal) above 0.
+        """Return the expected distance from the goal after a reading, nats, (n_settings,).
+
+        The distance is the sum over quantities of ln(sd / goal), 0 where an sd is below its goal.
 
         Parameters
         ----------
         values
             Posterior samples of the quantities in the goal, (n_samples, n_values).
         goal
-            The sd of each that is asked for, (n_values,).
+            Target sd of each, (n_values,).
         """
         n = self._order.shape[0]
         centred = values[:n] - values[:n].mean(axis=0)
@@ -109,9 +106,9 @@ class Predictive:
         return out
 
     def _regress_on_reading(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Regress a value on the reading within each group: level, slope, residual variance, (n_groups, n_settings).
+        """Regress values, (n_samples,), on the reading in each group; return level, slope and residual variance.
 
-        Within a group, value and reading are assumed jointly Gaussian.
+        Each is (n_groups, n_settings). Within a group, value and reading are assumed jointly Gaussian.
         """
         own = value[self._order].reshape(*self._shape, -1)
         mean = own.mean(axis=1)
@@ -120,9 +117,9 @@ class Predictive:
         return mean - slope * self._centre, slope, own.var(axis=1) - slope * together
 
     def _yield_density_blocks(self) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
-        """Yield, by blocks of settings: rows; nodes and the predictive density there, (n_rows, n_nodes); groups' parts.
+        """Yield for blocks of settings: their slice, nodes, predictive density there, and each group's part of it.
 
-        The last, (n_groups, n_rows, n_nodes), sums to the density.
+        Nodes and density are (n_rows, n_nodes); the parts, (n_groups, n_rows, n_nodes), sum to the density.
         """
         n_groups, n_settings = self._centre.shape
         node = self.noise.nodes_and_weights[0]

@@ -57,7 +57,7 @@ class Inquiry(ShowsItself):
         Seconds that a reading takes at each setting, (n_settings,); or a function of the last setting (None at first)
         that returns them. `utility` is then per second.
     n_samples
-        Posterior samples.
+        Posterior samples, 400 or more.
     n_live
         Live points of nested sampling, which starts anew if the samples cannot follow a surprising reading.
 
@@ -65,6 +65,8 @@ class Inquiry(ShowsItself):
     ------
     ParameterError
         If an argument is of the wrong kind.
+    ShapeError
+        If `cost_s` has not one number per setting.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class Inquiry(ShowsItself):
 
     @property
     def posterior(self) -> Weighted:
-        """Weighted samples of the posterior: `mean()`, `sd()`, `interval(0.95)`, `samples(n, rng=rng)`."""
+        """The posterior as `nested.Weighted` samples: `mean()`, `sd()`, `interval(0.95)`, `samples(n, rng=rng)`."""
         return self._posterior
 
     @property
@@ -112,15 +114,16 @@ class Inquiry(ShowsItself):
 
     @property
     def readings(self) -> tuple[tuple[Any, float], ...]:
-        """Settings and readings so far; to resume, pass them to `tell` of a new inquiry, one after the other."""
+        """Pairs (setting, reading) so far; to resume, call `tell(reading, setting)` of a new inquiry for each."""
         return tuple(self._taken)
 
     @property
     def utility(self) -> FloatArray:
         """Acquisition function of each setting, (n_settings,), per second if the costs in seconds are given.
 
-        It is the expected information until every sd that the goal names is within three times its goal; from then on
-        the expected decrease of the sum of ln(sd / goal); and once the goal is reached, information again.
+        It is the expected information, bits, until every sd that the goal names is within three times its goal; then
+        the expected decrease of the sum of ln(sd / goal), until the goal is reached; and from then on information
+        again.
         """
         if self._utility is None:
             self._utility = self._utility_for_weights(self._posterior.weight) / self._costs_s()
@@ -157,7 +160,10 @@ class Inquiry(ShowsItself):
 
     @property
     def doubt(self) -> str | None:
-        """A warning if no hypothesis explains the readings (p < 1e-6), with the worst reading; otherwise None."""
+        """A warning if even the best posterior sample does not explain the readings (p < 1e-6); otherwise None.
+
+        It names the reading that fits worst.
+        """
         if self._readings is None:
             return None
         best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
@@ -209,10 +215,11 @@ class Inquiry(ShowsItself):
         self._utility, self._next = None, None
 
     def several(self, n: int) -> list[Any]:
-        """Choose the settings of several readings to be taken before any of them is known; best first.
+        """Choose the settings of `n` readings to be taken before any of them is known; best first.
 
-        Greedy on the joint information (Nemhauser, Wolsey & Fisher 1978): each is the best addition to those before
-        it, averaged over simulated readings there. Pass the results one by one to `tell(reading, setting)`.
+        Greedy on the joint information (Nemhauser, Wolsey & Fisher 1978): each setting is the best addition to those
+        before it in the list, averaged over simulated readings there. Pass the results one by one to
+        `tell(reading, setting)`.
         """
         checked_whole("n", n)
         everywhere = np.ones(len(self._settings), dtype=np.bool_)
@@ -254,7 +261,7 @@ class Inquiry(ShowsItself):
 
     @property
     def _is_near_goal(self) -> bool:
-        """Whether the goal is not reached yet, but every sd is within `_NEAR_GOAL` times its goal."""
+        """Whether the goal is not reached yet, but every sd is within three times its goal."""
         return bool(self._goal) and 1.0 < self._largest_sd_over_goal < _NEAR_GOAL
 
     def _utility_for_weights(self, weight: FloatArray) -> FloatArray:
@@ -271,7 +278,10 @@ class Inquiry(ShowsItself):
         return np.asarray(now - predictive.distance_from_goal(values, np.array(goal)))
 
     def _costs_s(self) -> FloatArray:
-        """Return the seconds of a reading at each setting from here, (n_settings,) or one number; 1 by default."""
+        """Return the seconds of a reading at each setting from the last one, (n_settings,) or one number; default 1.
+
+        ShapeError or ParameterError for costs of a wrong shape or not above 0.
+        """
         given = self._cost_s
         if given is None:
             return np.ones(len(self._settings))
@@ -286,7 +296,7 @@ class Inquiry(ShowsItself):
 
 
 def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
-    """Return the target sds by parameter, checked; empty if no goal is given."""
+    """Return the target sds by parameter, empty if no goal is given; ParameterError if they are not such."""
     if goal is None:
         return {}
     if not isinstance(goal, Mapping) or not goal:

@@ -41,6 +41,11 @@ class ReadingNoise:
         Share of the readings that do not depend on the prediction, 0 or more, below 1.
     between
         Least and greatest outlier; they are uniform in between. Required if there are outliers.
+
+    Raises
+    ------
+    ParameterError
+        If a value is out of range.
     """
 
     sd: float | Callable[[FloatArray], Any] | Marginal
@@ -81,7 +86,8 @@ class ReadingNoise:
     def scale(self, predicted: FloatArray, sd: FloatArray | None) -> FloatArray:
         """Return the sd of each prediction's noise, (n_samples, n_points).
 
-        `sd` (n_samples,) is that of each sample if it is inferred, else None.
+        `sd`, (n_samples,): each sample's, if the sd is inferred; else None. ShapeError or ParameterError if a function
+        for the sd returns a wrong shape or a number not above 0.
         """
         if sd is not None:
             return np.asarray(np.broadcast_to(sd[:, None], predicted.shape))

@@ -40,7 +40,7 @@ class InstrumentModel:
     def from_function(
         cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings
     ) -> InstrumentModel:
-        """Find out how a user's function can be called: with arrays, for one sample, or for one reading."""
+        """Make the model of a user's function; find out if it takes arrays, one sample, or one reading at a time."""
 
         def call_with_arrays(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
             return function(dict(parameters), settings.in_model_form(columns))
@@ -91,7 +91,7 @@ class InstrumentModel:
         return out
 
     def _raise_own_error(self, theta: FloatArray, settings: Settings, out: FloatArray) -> None:
-        """Raise the function's own error at the first sample without a finite prediction, or name that sample."""
+        """Raise the function's own error at the first sample without a finite prediction, else ParameterError."""
         sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
         own = {name: theta[[sample], k : k + 1] for k, name in enumerate(self.own_prior.names)}
         self.caller(own, settings.columns, strict=True)
@@ -103,7 +103,7 @@ class InstrumentModel:
         return self.noise.scale(predicted, theta[:, -1] if self.noise.is_sd_inferred else None)
 
     def log_density(self, theta: FloatArray, settings: Settings, readings: FloatArray) -> FloatArray:
-        """Return the log density of readings, one at each setting, (n_settings,) -> (n_samples, n_settings)."""
+        """Return the log density of readings, one per setting, (n_settings,), under theta: (n_samples, n_settings)."""
         predicted = self.predict(theta, settings)
         return self.noise.log_density(readings, predicted, self.scale(theta, predicted))
 
@@ -112,7 +112,8 @@ class InstrumentModel:
 class ReadingsProblem:
     """Readings with their settings, as a problem for nested sampling.
 
-    `settings` holds each distinct setting once, `row` the setting's index for each reading, (n_readings,).
+    `settings` holds each distinct setting once; `row`, the setting's index, and `values` are of each reading,
+    (n_readings,).
     """
 
     model: InstrumentModel
@@ -166,21 +167,10 @@ def updated_posterior(
 ) -> Weighted:
     """Update the posterior by the last of the readings.
 
-    Samples are reweighted. If too few keep weight, `nested.update` draws `n` from a density fitted to them, against
-    all readings; if those are not reliable either, nested sampling starts from the prior.
-
-    Parameters
-    ----------
-    previous
-        Posterior given the readings before.
-    readings
-        All readings.
-    log_density
-        Log density of the last reading given each sample, (n_samples,).
-    n, n_live
-        Samples, and live points of a run.
-    rng
-        Source of randomness.
+    Samples are reweighted. If too few keep weight, `nested.update` draws `n` from a density fitted to the samples,
+    against all readings; if its draws are not reliable either, nested sampling with `n_live` points starts from the
+    prior. `previous`: posterior given the readings before. `log_density`: of the last reading given each sample,
+    (n_samples,).
     """
 
     def nested_run() -> NestedResult:

@@ -22,7 +22,7 @@ _ALLOWED = (
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Settings as columns, and the form in which they were given, in which the model and the user get them back.
+    """Settings as columns (n,) by name, and the form in which the user gave them, and user and model get them back.
 
     `form`: "one" knob, an array (n,); "several" knobs, an array (n, n_knobs); or knobs by "name", a dict of columns.
     """
@@ -32,7 +32,7 @@ class Settings:
 
     @classmethod
     def of(cls, given: Any) -> Settings:
-        """Read settings in any of their forms."""
+        """Read settings in any of their forms; ParameterError for anything else."""
         if isinstance(given, Settings):
             return given
         if isinstance(given, Mapping):
@@ -62,7 +62,7 @@ class Settings:
         return Settings({n: np.concatenate([c, other.columns[n]]) for n, c in self.columns.items()}, self.form)
 
     def in_model_form(self, columns: Mapping[str, Column]) -> Any:
-        """Return the settings in the model's form; several knobs as (n_knobs, n), to be unpacked."""
+        """Return `columns` in the form of these settings; several knobs as (n_knobs, n), to be unpacked."""
         if self.form == "one":
             return columns["setting"]
         return np.stack(list(columns.values())) if self.form == "several" else dict(columns)
@@ -75,7 +75,10 @@ class Settings:
         return np.array(list(own.values())) if self.form == "several" else own
 
     def checked_setting(self, setting: Any) -> Settings:
-        """Parse one setting given in the form of `self[row]`; it need not be one of these."""
+        """Parse one setting given in the form of `self[row]` as Settings of length 1; it need not be one of these.
+
+        ParameterError if it is not of that form.
+        """
         if self.form == "name":
             if not isinstance(setting, Mapping) or setting.keys() != self.columns.keys():
                 raise ParameterError("setting", setting, f"a dict of {', '.join(self.columns)}")

@@ -32,7 +32,7 @@ def missed_part_in_words(
 ) -> str:
     """Search the prior of `n` Gaussians, and describe in words what the SMC run `climbed` missed; "" if nothing.
 
-    `progress` is called after each round of the search.
+    `problems`: of the recording, by order. `progress` is called after each round of the search.
     """
     problem = problems.problem(n)
     n_live = max(_LEAST_LIVE, _LIVE_PER_PARAM * len(problem.prior.names))

@@ -106,7 +106,7 @@ class SMCResult(ShowsItself):
 
     @property
     def log_z_error(self) -> float:
-        """Standard error of log Z: `start_error`, and the scatter of the few clouds as of a Student t, in quadrature."""
+        """Standard error of log Z: `start_error` and the scatter of the few clouds as of a Student t, in quadrature."""
         relative = np.exp(self.log_z_of_clouds - self.log_z)
         n = len(relative)
         return math.hypot(float(relative.std(ddof=1)) * math.sqrt((n - 1) / (n - 3) / n), self.start_error)
@@ -334,7 +334,7 @@ def _snapshots_of_posterior(
     n_more: int,
     rng: np.random.Generator,
 ) -> list[_Particles]:
-    """Move particles of the posterior `n_more` times; return at most `N_SNAPSHOTS` of their states, of the last half."""
+    """Move particles of the posterior `n_more` times; return up to `N_SNAPSHOTS` of their states from the last half."""
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     kept = []
     for k in range(1, n_more + 1):

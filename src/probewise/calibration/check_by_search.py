@@ -65,8 +65,8 @@ def _missed_part_by_comparison_in_words(
 def share_far_from_known(known: FloatArray, asked: FloatArray, *, rng: np.random.Generator) -> float:
     """Return the share of samples `asked`, (m, d), that lie far from the samples `known`, (n, d), ordered by cloud.
 
-    Distances are to the nearest of 2,000 known samples, in the known ones' covariance. Far is further than each of the
-    first 500 known samples, which are not among the 2,000.
+    The distance is to the nearest of at most 2,000 known samples, drawn without the first 500, in the covariance of the
+    known ones. Far is a greater distance than that of any of the first 500.
     """
     from scipy.spatial.distance import cdist  # slow to import, and needed by calibrations only
 

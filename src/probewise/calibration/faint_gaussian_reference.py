@@ -224,7 +224,10 @@ class FaintGaussianReferenceDensity:
         return _insert_gaussian_before_levels(*self._draw_gaussian_and_compensate(rest, True, rng)[:2])
 
     def without_compensated_gaussian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Undo `with_compensated_gaussian`; also return the log density as `AddedGaussianProposal.back` does."""
+        """Take away the last Gaussian and undo the others' shift for it, (n, 6 N + 2) -> (n, 6 N - 4).
+
+        Also return the log density of its addition over the prior's, (n,), as `AddedGaussianProposal.back` does.
+        """
         last = theta[:, -8:-2]
         answer = self.compensation.linear.compensating_shift(last)
         return self._undo_compensation(self.without_last_gaussian(theta), last, answer, True)
@@ -254,7 +257,11 @@ class FaintGaussianReferenceDensity:
     def _undo_compensation(
         self, after: FloatArray, last: FloatArray, answer: CompensatingShift, last_of_all: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Undo `_draw_gaussian_and_compensate`; also return the log density as `AddedGaussianProposal.back` does."""
+        """Undo the shift of the others `after`, (n, 6 N - 4), that compensates for the Gaussian `last`, (n, 6).
+
+        Return the others before, and the log density of shift and addition over the prior's, (n,); -inf where
+        impossible.
+        """
         coordinates = self.compensation.coordinates
         masses, mass = self._masses(after), last[:, 0] / self._amplitude_at_unit_mass(last)
         whole, most = masses.sum(axis=1), self._greatest_faint_mass(masses, last_of_all=last_of_all)
@@ -298,7 +305,10 @@ class FaintGaussianReferenceDensity:
         return self._split_gaussian_off(rest, label, last)
 
     def merge_last_gaussian_into_bright_one(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
-        """Undo `split_gaussian_off_bright_one`; also return the log density as `AddedGaussianProposal.back` does."""
+        """Merge the last Gaussian into the bright one `label`, (n, 6 N + 2) -> (n, 6 N - 4).
+
+        Also return the log density of the reverse split over the prior's, (n,), as `AddedGaussianProposal.back` does.
+        """
         rest = self._merge_gaussian_into_bright_one(self.without_last_gaussian(theta), label, theta[:, -8:-2])
         most = self._greatest_faint_mass(self._masses(rest), last_of_all=True)
         return rest, self._log_density_of_split(rest, self.without_last_gaussian(theta), label, theta[:, -8:-2], most)
@@ -363,7 +373,10 @@ class FaintGaussianReferenceDensity:
     def _log_density_of_split(
         self, rest: FloatArray, others: FloatArray, label: int, last: FloatArray, most: FloatArray
     ) -> FloatArray:
-        """Log density of a split over the prior's, (n,), as `AddedGaussianProposal.back` returns it; may be -inf."""
+        """Log density over the prior's, (n,), of splitting `last` off Gaussian `label` of `rest`, leaving `others`.
+
+        `most`: greatest mass of `last`. -inf where the split is impossible.
+        """
         own = slice(6 * label, 6 * label + 6)
         centre, width = self._cube_places_and_kernel_widths(rest)
         ratio = last[:, 0] / self._amplitude_at_unit_mass(last) / np.maximum(most, _TINY)
@@ -381,7 +394,7 @@ class FaintGaussianReferenceDensity:
         return np.where(possible, found, -np.inf)
 
     def _log_prior_of_moments(self, g: FloatArray, levels_of: FloatArray) -> FloatArray:
-        """Log of one Gaussian's prior density over its moments, up to a constant, (n, 6) -> (n,)."""
+        """Log prior density of one Gaussian in the coordinates of its moments, up to a constant, (n, 6) -> (n,)."""
         alone = replace(self.prior, n_gaussians=1)
         log_det = np.log(np.maximum(g[:, 3] * g[:, 4] - g[:, 5] ** 2, _TINY))
         log_mass = np.log(g[:, 0] / self._amplitude_at_unit_mass(g))
@@ -389,7 +402,7 @@ class FaintGaussianReferenceDensity:
         return np.asarray(log_prob - 5.0 * log_mass + 3.5 * log_det)
 
     def _moments_of_gaussian(self, g: FloatArray) -> FloatArray:
-        """Mass, first and second moments about the origin, (n, 6) -> (n, 6)."""
+        """Compute mass and mass times u, v, and the second moments uu, vv, uv about the origin, (n, 6) -> (n, 6)."""
         det = g[:, 3] * g[:, 4] - g[:, 5] ** 2
         u, v = g[:, 1], g[:, 2]
         ones = np.ones(len(g))
@@ -397,7 +410,7 @@ class FaintGaussianReferenceDensity:
         return np.stack(each, axis=1) * (g[:, 0] / self._amplitude_at_unit_mass(g))[:, None]
 
     def _gaussian_from_moments(self, m: FloatArray) -> FloatArray:
-        """Compute a Gaussian's parameters from its moments, (n, 6) -> (n, 6); nan where no Gaussian has them."""
+        """Compute a Gaussian's parameters from its moments, (n, 6) -> (n, 6); nan where no Gaussian has the moments."""
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = m[:, 1] / m[:, 0], m[:, 2] / m[:, 0]
             uu, vv, uv = m[:, 3] / m[:, 0] - u * u, m[:, 4] / m[:, 0] - v * v, m[:, 5] / m[:, 0] - u * v
@@ -461,7 +474,7 @@ def _draw_mass_ratios(n: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _log_density_of_mass_ratio(ratio: FloatArray) -> FloatArray:
-    """Log of the density from which `_draw_mass_ratios` draws, (n,)."""
+    """Log density of the ratio of a new mass to the greatest that it may have, (n,) -> (n,)."""
     light = (1.0 - _EVEN_MASS) / (-math.log(_LEAST_RATIO) * np.maximum(ratio, _TINY))
     return np.asarray(np.log(_EVEN_MASS + np.where(ratio > _LEAST_RATIO, light, 0.0)))
 

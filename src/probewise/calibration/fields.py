@@ -56,10 +56,10 @@ def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray
 
 
 def gaussians_sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
-    """Sort the Gaussians of each sample by decreasing mass; field and predictions do not change.
+    """Sort the Gaussians of each sample, (n_samples, at least 6 N), by decreasing mass; return sorted samples.
 
-    The prior is exchangeable, so the labels of a posterior sample are arbitrary; sorted by mass, means
-    and intervals of single columns are meaningful.
+    Field and predictions do not change. The prior is exchangeable, so the labels of a posterior sample are arbitrary;
+    sorted by mass, means and intervals of single columns are meaningful.
     """
     order = np.argsort(-_footprint_of_samples(theta, n_gaussians).weight[:, 0], axis=1, kind="stable")
     out = theta.copy()

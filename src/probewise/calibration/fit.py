@@ -58,12 +58,12 @@ class OrderFit:
 
     @property
     def log_z(self) -> float:
-        """Natural log of the evidence: the refined estimate where it is sound."""
+        """Natural log of the evidence: the estimate refined by importance sampling if that is reliable."""
         return self.found.evidence_result.log_z
 
     @property
     def log_z_error(self) -> float:
-        """Standard error of log Z."""
+        """Standard error of the estimate `log_z`."""
         return self.found.evidence_result.log_z_error
 
     @property

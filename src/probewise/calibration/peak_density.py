@@ -107,7 +107,7 @@ class PeakDensity:
         return PeakDensity(self.space, StudentTDensity(own.mean(axis=0), np.asarray(root, dtype=np.float64)))
 
     def near_peak_mask(self, y: FloatArray) -> BoolArray:
-        """Return a mask, (n, d) -> (n,), of coordinates that with any labels lie in the densest 90 % of draws."""
+        """Return a mask of coordinates, (n, d) -> (n,), in the densest 90 % of draws for some order of the labels."""
         each = [
             self.one.log_density(self.space.apply_label_permutation(y, change))
             for change in self.space.label_permutations

@@ -380,7 +380,7 @@ def _with_bridged_evidence(made: SMCResult, log_z: FloatArray, added: FloatArray
 def _with_doubt_of_missed_peaks(
     problems: ProblemsByOrder, n: int, made: SMCResult, peak: HighestPeak, rng: np.random.Generator
 ) -> SMCResult:
-    """Add a doubt to an SMC run that missed a peak which holds a part of the evidence."""
+    """Add a doubt to an SMC run without samples about a higher `peak` that holds a fifth of the evidence or more."""
     if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:
         return made
     problem = problems.problem(n)

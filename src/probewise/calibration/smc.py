@@ -67,9 +67,10 @@ class SMCResult(ShowsItself):
     names
         Parameter names, one per column of theta.
     theta
-        Samples, (n, n_params), cloud after cloud, early ones first, the Gaussians sorted by mass.
+        Samples, (n, n_params), cloud after cloud, in each the earlier snapshots first; the Gaussians are sorted by
+        mass.
     log_likelihood, log_weight
-        Of each, (n,); the weights sum to one.
+        Of each sample, (n,); the weights sum to one.
     log_z_of_clouds
         Natural log of the evidence from each cloud, (n_clouds,).
     start_error

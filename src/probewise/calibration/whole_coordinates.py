@@ -101,7 +101,7 @@ class WholeFootprintCoordinates:
         return MomentCoordinates(self.prior)
 
     def _tapered_light_shares(self, g: FloatArray) -> FloatArray:
-        """Tapered share of the light of each Gaussian but the first, (N - 1, n)."""
+        """Share of the light of each Gaussian but the first, reduced for wide or distant Gaussians, (N - 1, n)."""
         x, y = self.centre_mm
         variance = np.exp(g[3:5, 1:].clip(-100.0, 100.0))
         reach = ((g[1, 1:] - x) ** 2 + (g[2, 1:] - y) ** 2 + variance[0] + variance[1]) / self.size_mm2
@@ -109,12 +109,12 @@ class WholeFootprintCoordinates:
         return np.asarray(light / (1.0 + light.sum(axis=0)))
 
     def _centre_contribution_of_others_and_first_share(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sum the centres of all but the first times their tapered shares, (2, n); and the first one's share, (n,)."""
+        """Return the sum over all but the first of centre times tapered share, (2, n); and the first's share, (n,)."""
         light = self._tapered_light_shares(g)
         return (light * g[1:3, 1:]).sum(axis=1), 1.0 - light.sum(axis=0)
 
     def _covariance_contribution_of_others(self, g: FloatArray, mean: FloatArray) -> FloatArray:
-        """Sum the contributions of all but the first to the covariance of the whole, (3, n)."""
+        """Return the contribution of all but the first to the covariance of the whole: xx, yy, xy, (3, n)."""
         off = g[1:3, 1:] - mean[:, None]
         return np.asarray(
             (self._tapered_light_shares(g) * (_covariance_from_logs(g[3:6, 1:]) + _squares_and_product(off))).sum(

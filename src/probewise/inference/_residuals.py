@@ -7,7 +7,7 @@ from probewise.errors import ShapeError
 
 
 def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Return readings minus predictions, (n_points,), (n_samples, n_points) -> (n_samples, n_points).
+    """Return readings, (n_points,), minus predictions, (n_samples, n_points): (n_samples, n_points).
 
     ShapeError if the shapes do not match.
     """

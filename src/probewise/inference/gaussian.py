@@ -36,7 +36,10 @@ class GaussianKnown:
         object.__setattr__(self, "sd", sd)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
+
+        All constants are included.
+        """
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         sd = np.asarray(self.sd)
         if sd.ndim == 1 and sd.size != readings.size:

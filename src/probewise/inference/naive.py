@@ -26,7 +26,8 @@ class Naive:
     Parameters
     ----------
     mu_black, sd_black, mu_white, sd_white
-        Mean and sd of readings over black and over white, in units of the reading.
+        Mean and sd of readings over black and over white, in units of the reading; the means differ, else
+        ParameterError.
     """
 
     mu_black: float
@@ -47,8 +48,8 @@ class Naive:
     def estimated(cls, black: ArrayLike, white: ArrayLike, *, sd_floor: float) -> Naive:
         """Build from readings over known black and known white, two or more of each: their means and sds.
 
-        `sd_floor`, for instance `step / sqrt(12)`, is the least sd, for readings that are all equal. Raises
-        ParameterError if readings are too few or not finite.
+        `sd_floor`, for instance `step / sqrt(12)`, is the least sd, for readings that are all equal. ParameterError if
+        readings are too few or not finite.
         """
         values: list[float] = []
         for name, readings in (("black", black), ("white", white)):
@@ -59,7 +60,7 @@ class Naive:
         return cls(*values)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log likelihood of every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,).
+        """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
 
         A prediction counts as white where it is nearer to `mu_white` than to `mu_black`.
         """

@@ -21,7 +21,10 @@ class Likelihood(Protocol):
     """The interface of a likelihood of readings given predictions."""
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
+
+        All constants are included.
+        """
         ...
 
 
@@ -45,9 +48,9 @@ def require_model(model: object) -> None:
 
 
 def checked_log_prob(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Return a likelihood's log likelihood of each prediction, (n_points,), (n_samples, n_points) -> (n_samples,).
+    """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
 
-    ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
+    ShapeError if `likelihood`, which may be a user's own, does not return one number per hypothesis.
     """
     scored = likelihood.log_prob(readings, predicted)
     if np.shape(scored) != (len(predicted),):

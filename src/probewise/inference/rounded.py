@@ -109,7 +109,7 @@ class Rounded:
             raise ParameterError("(low, high)", (self.low, self.high), "low < high")
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log probability of the readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log probability of readings, (n_points,), for each row of predictions, (n_samples, n_points)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
         at_end = self.ends.end_mask(readings)

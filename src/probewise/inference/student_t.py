@@ -1,9 +1,8 @@
 """The paper's Student-t likelihood of readings with unknown noise sd, made proper.
 
-The paper integrates a Gaussian over its unknown sd, sigma, and keeps [sum of squares]^(-(N-1)/2). With
-an unbounded prior of sigma this diverges where a hypothesis fits the few readings of a small data set
-exactly, and is flat after one reading. So here sigma's prior is 1/sigma between a floor and a
-ceiling, and all constants are kept.
+The paper integrates a Gaussian over its unknown sd, sigma, and keeps [sum of squares]^(-(N-1)/2). With an unbounded
+prior of sigma this diverges where a hypothesis fits the few readings of a small data set exactly, and is flat after one
+reading. So here sigma's prior is 1/sigma between a floor and a ceiling, and all constants are kept.
 """
 
 from __future__ import annotations
@@ -118,15 +117,15 @@ def _log_upper_gamma(a: FloatArray, t: FloatArray) -> FloatArray:
 class StudentT:
     """Student-t likelihood: Gaussian noise, the sd of each data set integrated out (paper, eq. studentT and product).
 
-    For a data set of N readings with sum of squares S, and L = ln(sd_ceiling / sd_floor):
-    (2 pi)^(-N/2) / L times the integral of sigma^(-N-1) exp(-S / 2 sigma^2) from floor to ceiling.
+    For a data set of N readings with sum of squares S, and L = ln(sd_ceiling / sd_floor): (2 pi)^(-N/2) / L times the
+    integral of sigma^(-N-1) exp(-S / 2 sigma^2) from floor to ceiling.
 
     Parameters
     ----------
     groups
         Label of the data set of each reading, (n_points,); any integers.
     sd_floor, sd_ceiling
-        Bounds of every data set's sigma, in units of the reading.
+        Bounds of every data set's sigma, in units of the reading: 0 < floor < ceiling, else ParameterError.
     """
 
     groups: IntArray
@@ -169,7 +168,10 @@ class StudentT:
         return self.group_sizes
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
+
+        All constants are included.
+        """
         residual = residuals(readings, predicted)
         if residual.shape[1] != self.groups.size:
             raise ShapeError(

@@ -62,7 +62,8 @@ class DiscTable:
         """Tabulate a model, or return None if that is not possible.
 
         Tabulated are a known mixture, or the naive sensor, over a single circle, with no effects but those of
-        `is_known_footprint_effect`, if the reading is constant farther than 80 mm from the edge.
+        `is_known_footprint_effect`, if the reading is constant farther than 80 mm from the edge. ParameterError if the
+        readings far outside and inside are equal.
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
@@ -104,14 +105,10 @@ class DiscTable:
     def predict_at(
         self, theta: FloatArray, x_mm: FloatArray, y_mm: FloatArray, orientation_rad: FloatArray
     ) -> FloatArray:
-        """Return noise-free readings at different places for each hypothesis.
+        """Return noise-free readings at different places for each hypothesis, (n_samples, n_points).
 
-        Parameters
-        ----------
-        theta
-            Discs, (n_samples, 3).
-        x_mm, y_mm, orientation_rad
-            Poses of the sensor, broadcasting to (n_samples, n_points).
+        `theta`: discs, (n_samples, 3). `x_mm`, `y_mm`, `orientation_rad`: poses of the sensor that broadcast to the
+        result.
         """
         require_theta_columns(theta, NAMES)
         away_x, away_y = x_mm - theta[:, :1], y_mm - theta[:, 1:2]
@@ -150,22 +147,11 @@ class DiscTable:
     def level_histogram(
         self, theta: FloatArray, weight: FloatArray, grid: Grid, levels: FloatArray, turn_rad: FloatArray
     ) -> FloatArray:
-        """Return the weighted histogram of predicted levels at every place of a grid.
+        """Return the weighted histogram of predicted levels at every place of a grid, (n_places, n_levels).
 
-        Parameters
-        ----------
-        theta, weight
-            Hypotheses (n_samples, 3) and their weights, (n_samples,).
-        grid
-            The places.
-        levels
-            Evenly spaced levels, (n_levels,), from the darkest to the brightest; a prediction counts for the nearest.
-        turn_rad
-            Orientation of the sensor at each place, (n_places,).
-
-        Returns
-        -------
-        Weight by place and level, (n_places, n_levels), each row summing to the hypotheses' weight.
+        `theta`, `weight`: hypotheses, (n_samples, 3), and their weights, (n_samples,); each row of the result has the
+        weights' sum. `levels`: evenly spaced, (n_levels,), from the darkest to the brightest; a prediction counts for
+        the nearest. `turn_rad`: orientation of the sensor at each place, (n_places,).
         """
         n_levels = len(levels)
         per_level = 1.0 / (levels[1] - levels[0])

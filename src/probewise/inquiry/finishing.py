@@ -74,7 +74,10 @@ def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
 
 
 def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
-    """Return the probability that a reading reaches the target precision, (n,), for `designs`, places in `rows`."""
+    """Return the probability that a reading reaches the target precision, (n,), for `designs`, places in `rows`.
+
+    The noise is that of a single reading, also for designs with repeats.
+    """
     rows, share = resampled_rows_and_weights(utility_input.weight, _MOST_ASKED)
     away = utility_input.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()

@@ -32,7 +32,7 @@ class PredictiveDistributions(Protocol):
         ...
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level, for one combination of settings, with all its places, after another.
+        """Yield the weight of each level at all places of one combination of settings, one combination after another.
 
         Parameters
         ----------
@@ -145,7 +145,10 @@ def rows_by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, In
 
 
 def predict_where_visible(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
-    """Predict every hypothesis at every row of a long plan, skipping rows that cannot see it: (n_samples, n_points)."""
+    """Predict every hypothesis at every row of a long plan: (n_samples, n_points).
+
+    The model is called only for hypotheses visible from a row; elsewhere the reading is the one outside the shape.
+    """
     bounds = CullingBounds.of(model, theta, plan)
     if bounds is not None:
         out = np.full((len(theta), len(plan)), bounds.outside)

@@ -48,14 +48,10 @@ class ScanlineIntervals:
     def from_interval_ends(
         cls, grid: Grid, n_rows: int, row: IntArray, hypothesis: IntArray, outer: Interval, inner: Interval
     ) -> Self:
-        """Build from ends of intervals along rows, (n_intervals,) each: in the shape or near its edge, and deep inside.
+        """Build from ends of intervals along rows: `outer`, in the shape or near its edge, and `inner`, deep inside.
 
-        Parameters
-        ----------
-        grid, n_rows, row, hypothesis
-            The grid, the number of its rows used, and the row and the shape of each interval.
-        outer, inner
-            Ends along the row, mm, in single precision, which resolves a ten-thousandth of a millimetre.
+        `row`, `hypothesis`: row and shape of each, (n_intervals,); `n_rows`: number of the grid's rows used. Ends are
+        in mm, in single precision, which resolves a ten-thousandth of a millimetre.
         """
         per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
 
@@ -85,20 +81,10 @@ class ScanlineIntervals:
     def level_histogram(
         self, weight: FloatArray, ring: PlacesNearEdges, level: IntArray, ends: tuple[int, int], n_levels: int
     ) -> FloatArray:
-        """Return the weighted histogram of levels at every place of the rows.
+        """Return the weighted histogram of levels at every place of the rows, (n_rows * n_x, n_levels).
 
-        Parameters
-        ----------
-        weight
-            Weight of each shape, (n_shapes,).
-        ring, level
-            Pairs near the edges, and the index of the level there, (n_pairs,).
-        ends, n_levels
-            Indices of the constant levels outside and inside, and the number of levels.
-
-        Returns
-        -------
-        Weight by place and level, (n_rows * n_x, n_levels), each row summing to that of all shapes.
+        `weight`: of each shape, (n_shapes,); each row of the result has the same sum. `ring`, `level`: pairs near the
+        edges, and the index of the level there, (n_pairs,). `ends`: indices of the constant levels outside and inside.
         """
         n_places = self.n_rows * self.grid.n_x
         near = np.bincount(ring.place * n_levels + level, weight[self.hypothesis][ring.interval], n_places * n_levels)

@@ -48,7 +48,7 @@ class DiscForecast:
     table: DiscTable
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points), by the table."""
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points); see `predict_where_visible`."""
         return predict_where_visible(self.model, theta, plan)
 
     def predictive(
@@ -72,7 +72,10 @@ class _DiscPredictive:
     levels: FloatArray
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level, one orientation of the sensor after another."""
+        """Yield the weight of each level, one combination of settings after another.
+
+        Combinations of one orientation share the computation.
+        """
         some = weight > 0
         stood, mass = None, np.empty(0)
         for number, at, places in rows_by_combination(self.rows, self.grid.n_places):
@@ -213,7 +216,10 @@ class _TabulatedPredictive:
     levels: FloatArray
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level, one orientation and height after another; repeats share them."""
+        """Yield the weight of each level, one combination of settings after another.
+
+        Combinations of one orientation and height, with other repeats, share the computation.
+        """
         stood, mass = None, np.empty(0)
         for number, at, places in rows_by_combination(self.rows, self.grid.n_places):
             if stood != self.turns_and_heights[number]:

@@ -82,22 +82,11 @@ class TabulatedShapes:
     def level_histogram(
         self, weight: FloatArray, grid: Grid, dark: float, bright: float, levels: FloatArray
     ) -> FloatArray:
-        """Return the weighted histogram of predicted levels at every place of a grid.
+        """Return the weighted histogram of predicted levels at every place of a grid, (n_places, n_levels).
 
-        Parameters
-        ----------
-        weight
-            Weight of each shape, (n_shapes,).
-        grid
-            The places.
-        dark, bright
-            Readings outside and inside.
-        levels
-            Evenly spaced levels, (n_levels,), from the darkest to the brightest; a reading counts for the nearest.
-
-        Returns
-        -------
-        Weight by place and level, (n_places, n_levels), each row summing to that of all shapes.
+        `weight`: of each shape, (n_shapes,); each row of the result has the same sum. `dark`, `bright`: readings
+        outside and inside. `levels`: evenly spaced, (n_levels,), from the darkest to the brightest; a reading counts
+        for the nearest.
         """
         n_levels = len(levels)
         first, per_level = float(levels[0]), 1.0 / float(levels[1] - levels[0])

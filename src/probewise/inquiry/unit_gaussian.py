@@ -38,7 +38,10 @@ def mass_within_corner(first: FloatArray, second: FloatArray, opening: IntArray)
 
 
 def mass_within_curved_edge(distance: FloatArray, bend: FloatArray) -> FloatArray:
-    """Return the mass of the unit Gaussian inside a curved edge; `bend` is the edge's curvature times the sd."""
+    """Return the mass of the unit Gaussian inside a curved edge, at a signed `distance` in sds, positive inside.
+
+    `bend`: the edge's curvature times the sd, 0 or more.
+    """
     index = np.minimum(to_int32(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
     index += _distance_index(distance)
     return np.asarray(_curved_edge_table().reshape(-1)[index])

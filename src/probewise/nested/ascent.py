@@ -32,7 +32,7 @@ class GaussianAtPeak:
     """A normal distribution at a peak of the likelihood: start or end of a climb.
 
     `centre` is its mean, (n_params,), and `root` @ `root`.T its covariance, (n_params, n_params), in the sampling
-    coordinates; `climb_to_top` scales it so that the best quarter of draws spans 0.2 nats. `highest`: best point of the
+    coordinates; `climb_to_top` widens it until the best quarter of draws spans 0.2 nats. `highest`: best point of the
     last generation, or live point; `met`: best point of the whole climb, maybe on another peak; None before a climb.
     """
 

@@ -86,7 +86,7 @@ class _EvidenceRoute:
 
     @property
     def least_calls_to_start(self) -> int:
-        """Evaluations of the first live points and of one round, with a margin of two: fewer are not worth a start."""
+        """Fewest evaluations with which a run is worth a start: its first live points, and twice those of one round."""
         n_steps = max(self.chain.fewest_steps, math.ceil(self.chain.steps_per_param * len(self.problem.prior.names)))
         return math.ceil(self.n_live * (1 + n_steps * self.chain.target))
 
@@ -282,7 +282,7 @@ def _choose_agreeing_run_and_estimate(
 def _routes_to_second_estimate(
     first: NestedResult, problem: Samplable, move: Move, least_live: int, rng: np.random.Generator
 ) -> Iterator[_EvidenceRoute]:
-    """Yield the routes to a second estimate, the cheapest first; the last one is an estimate whatever it finds."""
+    """Yield the routes to a second estimate, the cheapest first; the last one expects no mean log likelihood."""
 
     def route_near_posterior(near: Repartitioned, nats: float) -> _EvidenceRoute:
         wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)

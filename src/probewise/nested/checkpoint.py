@@ -293,7 +293,10 @@ _RECORD = ("n_at_death", "rank", "n_ranked")
 
 
 def _run_state_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> RunState:
-    """Rebuild the state of a run from the head and the arrays of a checkpoint; `move` is the one given on resuming."""
+    """Rebuild the state of a run from the JSON head and the arrays of a checkpoint.
+
+    `move`: the one given on resuming; it gets the tuned numbers of the file.
+    """
     ends = np.cumsum(np.asarray(head["sizes"], dtype=np.int64))
     dead = []
     for end, size in zip(ends, np.diff(ends, prepend=0), strict=True):

@@ -81,7 +81,7 @@ class Clusters:
 
 
 def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
-    """Split points, (n, n_params), recursively into at most 32 clusters while two Gaussians fit better than one.
+    """Split points, (n, n_params), recursively while two Gaussians fit better than one; return at most 32 clusters.
 
     `least`: fewest points of a cluster; by default 2 n_params + 2.
 

@@ -102,8 +102,9 @@ def intensified(
 class _Thread:
     """New points with the records of their births, in order of death.
 
-    `started`: the row of the run's point at which each one's chain began, -1 where that is another new point, (n,).
-    `rank`: how many of the `n_ranked` points alive at each insertion were worse than the new one, (n_inserted,) each.
+    `started`: row of the run's point at which each one's chain began, -1 where there is none (the chain began at
+    another new point, or the prior was drawn from), (n,). `rank`: how many of the `n_ranked` points alive at each
+    insertion were worse than the new one, (n_inserted,) each.
     """
 
     points: Points
@@ -158,7 +159,10 @@ def _draw_thread(
     max_calls: int | None,
     rng: np.random.Generator,
 ) -> _Thread:
-    """Draw new points above the level of row `first` and replace the worst up to that of row `last` or `max_calls`."""
+    """Draw new points above the level of row `first`, and replace the worst half again and again.
+
+    It ends when they pass the level of row `last`, or before `max_calls` evaluations are exceeded.
+    """
     end = (float(result.log_likelihood[last]), float(result.label[last]))
     bound = Bound(float(result.log_likelihood[first]), float(result.label[first]))
     above = _rows_alive_after(result, first)

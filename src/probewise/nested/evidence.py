@@ -35,14 +35,14 @@ class Evidence:
     def log_z_error(self, memory: float) -> float:
         """Return the standard error of log Z.
 
-        `memory`: factor by which correlated chains multiply its variance, from
+        `memory`: factor by which correlated chains multiply the variance from shrinkage; see
         `probewise.nested.relative_lineage_variance`.
         """
         return math.hypot(math.sqrt(memory) * self.spread, self.log_start_error)
 
 
 def log_volumes(n_at_death: IntArray, log_start: float = 0.0) -> FloatArray:
-    """Return the expected log prior volume after each death, (n_dead,): E[log t] = -1/n with n points alive."""
+    """Return `log_start` plus the expected log shrinkage up to each death, (n_dead,): -1/n per death of n alive."""
     return np.asarray(log_start - np.cumsum(1.0 / n_at_death))
 
 
@@ -117,24 +117,12 @@ def birth_rows(
 
 
 def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.random.Generator) -> float:
-    """Test that new points were inserted uniformly among the live ones (Fowlie, Handley & Su 2020).
+    """Test that new points were inserted uniformly among the live ones (Fowlie, Handley & Su 2020); return p.
 
-    Each new point is ranked among those alive at its insertion; the ranks of a correct sampler are
-    independent and uniform on 0..m. A Kolmogorov-Smirnov test is made of the whole run and of its
-    tenths (a fault may be temporary), with Bonferroni's correction.
-
-    Parameters
-    ----------
-    rank
-        Number of live points worse than the new one, (n_inserted,).
-    n_below_or_above
-        Number of points alive at insertion, m, without the new one, (n_inserted,).
-    rng
-        Source of randomness, for jittering the discrete ranks.
-
-    Returns
-    -------
-    The p value; 1 for fewer than 20 points.
+    `rank`: number of live points worse than each new one; `n_below_or_above`: number of points alive at its insertion,
+    m, without itself; (n_inserted,) each. The ranks of a correct sampler are independent and uniform on 0..m. A
+    Kolmogorov-Smirnov test is made of the whole run and of its tenths (a fault may be temporary), with Bonferroni's
+    correction. `rng` jitters the discrete ranks. For fewer than 20 points p is 1.
     """
     if len(rank) < 20:
         return 1.0

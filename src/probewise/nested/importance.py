@@ -251,7 +251,7 @@ class HeldOutSamples:
 
 
 def effective_lineages(found: Posterior) -> float:
-    """Return the number of independent samples that would give the posterior mass of a mode as precisely.
+    """Return the number of independent samples that would give the share of a mode as precisely as this posterior.
 
     Many samples of a run descend from one live point. The log evidence of a mode has the error sqrt(H memory / n_live),
     with H the information and `memory` the variance factor of correlated chains; a share estimated from n independent

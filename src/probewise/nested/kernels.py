@@ -160,11 +160,11 @@ class _LastAcceptedProposals:
 def _accept_in_turn(
     possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray
 ) -> _LastAcceptedProposals:
-    """Let every chain accept or reject its proposals in turn (Metropolis-Hastings, independent proposals).
+    """Let every chain accept or reject its proposals in turn; return the last one that each accepted.
 
-    `possible`, whether each proposal lies above the bound, and `log_target`, the log of target over proposal density,
-    are (n_steps * n_chains,), steps first; `log_now` is that log at the starts, (n_chains,). `log_odds`: logs of
-    uniform numbers, (n_steps, n_chains).
+    Metropolis-Hastings with independent proposals. `possible`, whether each proposal lies above the bound, and
+    `log_target`, the log of target over proposal density, are (n_steps * n_chains,), steps first; `log_now` is that log
+    at the starts, (n_chains,). `log_odds`: logs of uniform numbers, (n_steps, n_chains).
     """
     n_steps, n_chains = log_odds.shape
     log_target = np.where(possible, log_target, -np.inf).reshape(n_steps, n_chains)

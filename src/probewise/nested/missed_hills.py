@@ -55,7 +55,10 @@ class MissedHills:
     n_calls: int = 0
 
     def doubts(self, run: Posterior) -> tuple[str, ...]:
-        """Return a doubt in words for each kind of hill that would change log Z and that `run` has not met."""
+        """Return doubts in words, at most one per kind of hill, about hills that `run` has not met.
+
+        Lost hills count if together they would raise log Z by more than 1 of its errors, higher peaks by more than 2.5.
+        """
         lost, above = (log_evidence_of_unmet_hills(hills, run) for hills in (self.lost, self.above))
         mine, notes = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}", list[str]()
         if log_z_rise_in_errors(run, lost) > _MISSING:

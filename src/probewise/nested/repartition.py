@@ -168,7 +168,7 @@ class Repartitioned:
     prior: _PriorNearPosterior
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log likelihood plus the log ratio of the priors, (n, n_params) -> (n,)."""
+        """Log likelihood plus the log of the original over the new prior density, (n, n_params) -> (n,)."""
         # The ratio first: a likelihood may modify its argument.
         log_prior_ratio = self.prior.log_prior_ratio(theta)
         return np.asarray(self.problem.log_likelihood(theta) + log_prior_ratio)

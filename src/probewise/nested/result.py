@@ -257,7 +257,7 @@ class NestedResult(DeadPoints):
         return conversions.to_arviz(self, attributes, rng=rng, n=max(1, int(self.n_eff)) if n is None else n)
 
     def save(self, path: str | Path) -> None:
-        """Write the result to one .npz file, atomically."""
+        """Write the result to one .npz file, atomically; FileError if it cannot be written."""
         path = checked_path("path", path)
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)

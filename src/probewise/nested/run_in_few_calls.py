@@ -122,7 +122,7 @@ def run_in_few_calls(
     progress
         Called with the number of evaluations after every batch of draws.
     executor, n_workers
-        Evaluates batches in parallel, as for `run`.
+        As for `run`; without `n_workers` only the nested run evaluates in parallel.
 
     Returns
     -------
@@ -241,7 +241,7 @@ def _variance_of_weights(pilot: Weighted, drawn: Proposal, best: Proposal, space
 def _draw_at_rising_powers(
     evaluate: Evaluator, space: Space, *, max_calls: int, report: Callable[[int], None], rng: np.random.Generator
 ) -> _WeightedDraws | None:
-    """Draw at rising powers of the likelihood until enough draws represent the posterior; None if the limit ends it."""
+    """Draw at rising powers of the likelihood until enough draws represent the posterior; None beyond `max_calls`."""
     n_params = len(evaluate.names)
     n_draws, wanted = 300 + 60 * n_params, 150 + 25 * n_params
     draws = _DrawsOfAllSources(evaluate, space)

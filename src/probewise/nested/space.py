@@ -48,7 +48,7 @@ class Space(Protocol):
 
 
 def within_bounds_mask(space: Space, u: FloatArray) -> BoolArray:
-    """Return a mask of the coordinates, (n, n_params) -> (n,), that lie within the bounds of the space."""
+    """Return a mask of the points, (n, n_params) -> (n,), strictly within the bounds of every coordinate."""
     return np.asarray(((u > space.low) & (u < space.high)).all(axis=1))
 
 

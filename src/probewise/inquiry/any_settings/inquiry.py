@@ -218,8 +218,8 @@ class Inquiry(ShowsItself):
         """Choose the settings of `n` readings to be taken before any of them is known; best first.
 
         Greedy on the joint information (Nemhauser, Wolsey & Fisher 1978): each setting is the best addition to those
-        before it in the list, averaged over simulated readings there. Pass the results one by one to
-        `tell(reading, setting)`.
+        before it in the list, averaged over simulated readings there. Costs count from the last setting read. Pass the
+        results one by one to `tell(reading, setting)`.
         """
         checked_whole("n", n)
         everywhere = np.ones(len(self._settings), dtype=np.bool_)
@@ -296,7 +296,7 @@ class Inquiry(ShowsItself):
 
 
 def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
-    """Return the target sds by parameter, empty if no goal is given; ParameterError if they are not such."""
+    """Return the target sds by parameter, empty if no goal is given; ParameterError for anything else."""
     if goal is None:
         return {}
     if not isinstance(goal, Mapping) or not goal:

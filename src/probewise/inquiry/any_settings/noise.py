@@ -107,14 +107,14 @@ class ReadingNoise:
         return out
 
     def log_density(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
-        """Return the natural log of the density of each reading; arrays that broadcast."""
+        """Return the log density of readings, given predictions and sds (`scale`); arrays that broadcast."""
         core = self._log_standard_density((readings - predicted) / scale) - np.log(scale)
         if not self.outliers:
             return np.asarray(core)
         return np.asarray(np.logaddexp(math.log1p(-self.outliers) + core, self._log_outlier_density(readings)))
 
     def cdf(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
-        """Return the probability of a smaller reading; arrays that broadcast."""
+        """Return the probability of a smaller reading, given prediction and sd (`scale`); arrays that broadcast."""
         z = (readings - predicted) / scale
         core = ndtr(z) if math.isinf(self.dof) else stdtr(self.dof, z)
         if not self.outliers:
@@ -123,7 +123,7 @@ class ReadingNoise:
         return np.asarray((1 - self.outliers) * core + self.outliers * np.clip((readings - low) / (high - low), 0, 1))
 
     def draw(self, predicted: FloatArray, scale: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw a reading for each prediction, arrays of one shape."""
+        """Draw a reading for each prediction, with sd `scale`; arrays of one shape."""
         z = rng.standard_normal(predicted.shape) if math.isinf(self.dof) else rng.standard_t(self.dof, predicted.shape)
         core = predicted + scale * z
         if not self.outliers:

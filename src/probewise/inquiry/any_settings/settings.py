@@ -22,7 +22,7 @@ _ALLOWED = (
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Settings as columns (n,) by name, and the form in which the user gave them, and user and model get them back.
+    """Settings as columns (n,) by name; `form` is how the user gave them, and how user and model get them back.
 
     `form`: "one" knob, an array (n,); "several" knobs, an array (n, n_knobs); or knobs by "name", a dict of columns.
     """
@@ -54,7 +54,7 @@ class Settings:
         return len(next(iter(self.columns.values())))
 
     def take(self, rows: IntArray) -> Settings:
-        """Select settings by their indices."""
+        """Return the settings with these indices."""
         return Settings({name: column[rows] for name, column in self.columns.items()}, self.form)
 
     def joined(self, other: Settings) -> Settings:

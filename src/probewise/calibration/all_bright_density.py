@@ -64,5 +64,8 @@ class AllGaussiansBrightDensity:
         return theta
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose a draw for each particle; see `propose_independently`."""
+        """Propose a draw of this density to each particle, both (n, 6 N + 2), nan where outside the prior.
+
+        Also return log density over prior at the particles minus that at the draws, (n,); -inf where there is no draw.
+        """
         return propose_independently(self, here, rng=rng)

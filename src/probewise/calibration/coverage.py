@@ -44,7 +44,7 @@ _MASS = 0.95
 
 @dataclass(frozen=True)
 class TrueSensor:
-    """A simulated sensor: one Gaussian (centre and sds in mm), the readings over black and white, the noise sd."""
+    """A simulated sensor: one Gaussian (centre, sds in mm, correlation), readings over black and white, noise sd."""
 
     center_mm: tuple[float, float]
     sd_mm: tuple[float, float]

@@ -160,7 +160,7 @@ def _footprint_bounds_along_axis(center: FloatArray, sd: FloatArray, mass: Float
 
 
 def _mass_quantile_999(values: FloatArray, mass: FloatArray) -> float:
-    """Quantile of values below which 0.999 of the mass lies; both arrays have one shape."""
+    """Smallest of the values up to which 0.999 of the mass lies; both arrays have one shape."""
     flat, weight = values.ravel(), mass.ravel()
     order = np.argsort(flat)
     ladder = np.cumsum(weight[order])
@@ -168,6 +168,6 @@ def _mass_quantile_999(values: FloatArray, mass: FloatArray) -> float:
 
 
 def _rounded_up_pixel_mm(pixel_mm: float) -> float:
-    """Round up to 1, 2 or 5 times a power of ten."""
+    """Round up to 1, 2, 5 or 10 times a power of ten."""
     decade = 10.0 ** math.floor(math.log10(pixel_mm))
     return float(next(s * decade for s in (1.0, 2.0, 5.0, 10.0) if s * decade >= pixel_mm * (1 - 1e-9)))

@@ -22,7 +22,7 @@ _MOST_LOG = 60.0
 
 @dataclass(frozen=True)
 class LabelSymmetricCoordinates:
-    """Coordinates of N Gaussians in which a permutation of labels changes no volume.
+    """Coordinates of N Gaussians in which a permutation of the labels leaves volumes unchanged.
 
     `prior`: of N Gaussians with light uniform from 0 to a unit; see `has_uniform_prior_of_light`.
     """

@@ -132,7 +132,7 @@ class FaintGaussianLikelihoodRatio:
     def _log_likelihood_times_prior(
         self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray, share: FloatArray
     ) -> FloatArray:
-        """Log of likelihood times prior at shares of the light `share`, (..., n_shares)."""
+        """Log of likelihood times prior, up to a constant, at shares of the light `share`, (..., n_shares)."""
         q = share[..., None]
         left = square[..., None, :] - 2.0 * q * both[..., None, :] + q * q * own[..., None, :]
         log_measure = np.log(whole[..., None]) - 2.0 * np.log1p(-share)

@@ -54,7 +54,10 @@ class MixedReferenceDensity:
         return out
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose new parameters by one of the densities, drawn for each particle; see `ReferenceDensity`."""
+        """Propose new parameters, (n, 6 N + 2), by one of the densities, drawn for each particle.
+
+        Also return that density's log over the prior's at the particles minus that at the new parameters, (n,).
+        """
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
         for density, rows in self._assign_rows_to_densities(len(here), rng):
             there[rows], log_drawn[rows] = density.propose(here[rows], rng=rng)

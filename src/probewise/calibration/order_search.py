@@ -56,7 +56,7 @@ def search_prior_of_order(
     refined: bool = True,
     progress: Progress | None = None,
 ) -> OrderPosterior:
-    """Search the prior of an order by nested sampling, and refine the evidence unless asked not to."""
+    """Search the prior of an order by nested sampling, and refine the evidence if `refined`; return the posterior."""
     problem = problems.problem(n_gaussians)
     report = None if progress is None else round_reporter(progress, n_gaussians)
     result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)

@@ -64,7 +64,7 @@ class PosteriorPart:
 
     @property
     def log_z(self) -> float:
-        """Natural log of the evidence."""
+        """Natural log of the mean of the clouds' evidences."""
         return float(logsumexp(self.log_z_of_clouds)) - math.log(len(self.log_z_of_clouds))
 
 

@@ -127,7 +127,7 @@ class CardedForecast:
 
 @dataclass(frozen=True, eq=False)
 class _ForecastAsModel:
-    """Adapter that makes a forecast a sensor model."""
+    """Adapter that gives a forecast the interface of a sensor model."""
 
     forecast: Forecast
 

@@ -21,7 +21,7 @@ class Label(Protocol):
 
 @dataclass(frozen=True)
 class ParameterValue:
-    """Labels by the value of one parameter, in bins of equal posterior probability."""
+    """Labels by the value of the parameter `name`, in `n_bins` bins of equal posterior probability."""
 
     name: str
     n_bins: int = 16
@@ -41,7 +41,7 @@ class ParameterValue:
 
 @dataclass(frozen=True)
 class WhichShape:
-    """Labels by the shape in a set of shapes."""
+    """Labels by the number of the shape, for hypotheses of a set of shapes (parameter "shape")."""
 
     def __str__(self) -> str:
         return "the shape"

@@ -251,7 +251,7 @@ def _tabulated_chain(model: Chain) -> TabulatedChain | None:
 
 
 def _forecast_of_model_with_cards(model: SensorModel, highest: float | None) -> Forecast:
-    """Return the forecast of a model with known cards: by tables, if possible, for the shape alone."""
+    """Return the forecast of a model with known cards: by tables of the shape alone if possible, else direct."""
     if not isinstance(model, Chain) or model.effects or highest is not None:
         return DirectForecast(model)
     base = forecast_of(replace(model, scene=HypothesisScene(model.scene.shape)))  # type: ignore[attr-defined]

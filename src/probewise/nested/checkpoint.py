@@ -52,7 +52,7 @@ class BirthRecords:
 
     @classmethod
     def join(cls, *parts: BirthRecords) -> BirthRecords:
-        """Concatenate records."""
+        """Return the records of all parts, in order."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 

@@ -38,7 +38,7 @@ class Clusters:
 
     @staticmethod
     def from_groups(groups: list[FloatArray]) -> Clusters:
-        """Compute mean and covariance of groups of points, each (n, n_params)."""
+        """Make one cluster of each group of points, (n, n_params), by the group's mean and covariance."""
         mean = np.stack([g.mean(axis=0) for g in groups])
         root = np.stack([_cholesky_of_covariance(g) for g in groups])
         inverse = np.asarray(np.linalg.inv(root), dtype=np.float64)
@@ -152,7 +152,7 @@ def _least_points_of_cluster(n_params: int) -> int:
 
 
 def _cholesky_of_covariance(points: FloatArray) -> FloatArray:
-    """Cholesky factor of the covariance of points (n, n_params), with a small ridge where there is no extent."""
+    """Cholesky factor of the covariance of points (n, n_params), with a ridge in case a direction has no extent."""
     n_params = points.shape[1]
     centred = points - points.mean(axis=0)
     covariance = centred.T @ centred / max(len(points) - 1, 1)

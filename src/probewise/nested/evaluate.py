@@ -56,7 +56,7 @@ class Points:
     take = take_rows  # its earlier name
 
     def copy(self) -> Points:
-        """Copy every array."""
+        """Return the points with a copy of every array."""
         return Points(
             self.u.copy(),
             self.theta.copy(),
@@ -81,7 +81,7 @@ class Points:
 
     @staticmethod
     def join(*parts: Points) -> Points:
-        """Concatenate points."""
+        """Return the points of all parts, in order."""
         return Points(
             np.concatenate([p.u for p in parts]),
             np.concatenate([p.theta for p in parts]),
@@ -134,7 +134,7 @@ class Evaluator:
         self.space = space_of(self.problem.prior, getattr(self.problem, "periodic", ()))
 
     def draw_from_prior(self, n: int, rng: np.random.Generator) -> Points:
-        """Draw `n` points from the prior and evaluate them."""
+        """Draw `n` points from the prior and return them evaluated; NotConvergedError as for `log_likelihood`."""
         return self(self.space.draw(n, rng=rng), rng)
 
     from_prior = draw_from_prior  # its earlier name

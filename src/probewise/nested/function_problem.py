@@ -182,7 +182,7 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
 
 
 def _product_of_list(prior: Sequence[Any], given: tuple[str, ...] | None, names: Sequence[str] | None) -> Product:
-    """Make a prior of a list of distributions; without names they are p0, p1, ..."""
+    """Make a prior of a list of distributions, named `given` or p0, p1, ...; ParameterError if they do not match."""
     own = given if given is not None else tuple(f"p{i}" for i in range(len(prior)))
     if len(own) != len(prior):
         raise ParameterError("names", names, f"{len(prior)} names, one for each distribution")

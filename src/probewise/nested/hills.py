@@ -62,12 +62,12 @@ class HillEstimate:
 
 
 def _distance_in_sds(x: FloatArray, shape: Clusters) -> FloatArray:
-    """Distance of points (n, n_params) from the middle of a cluster, sds, (n,)."""
+    """Distance of points (n, n_params) from the mean of a single cluster, in sds of the cluster, (n,)."""
     return np.asarray(np.linalg.norm((x - shape.mean[0]) @ shape.inverse_root[0].T, axis=1))
 
 
 def log_evidence_of_unmet_hills(hills: Iterable[HillEstimate], run: Posterior) -> float:
-    """Return the log of the joint evidence of those hills that a run has not met; -inf where it met all."""
+    """Return the log of the sum of the evidences of the hills that a run has not met; -inf where it met all."""
     return float(logsumexp([-math.inf, *(hill.log_z for hill in hills if not hill.is_met_by(run))]))
 
 

@@ -221,7 +221,7 @@ def repartitioned(
 
 
 def split_into_clusters(x: FloatArray) -> list[FloatArray]:
-    """Divide samples (n, n_params) into clusters, each with enough samples for its axes."""
+    """Divide samples (n, n_params) into groups by cluster, of 20 or more samples per parameter, else into one."""
     least = _SAMPLES_IN_CLUSTER * x.shape[1]
     clusters = find_clusters(x, least=least)
     home = clusters.assign(x)

@@ -59,7 +59,10 @@ class WeightedSamples(ShowsItself):
         return weighted_quantiles(self.theta, self.weight, q)
 
     def interval(self, mass: float = 0.95) -> FloatArray:
-        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
+        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper.
+
+        ParameterError unless 0 < mass < 1.
+        """
         share = "greater than 0, less than 1"
         columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
         if not 0 < checked_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:

@@ -151,7 +151,7 @@ class ReadingsProblem:
 
 
 def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:
-    """Draw equally weighted samples of the prior, which is the posterior without readings; its evidence is one."""
+    """Draw `n` equally weighted samples of the prior, as the posterior without readings: its evidence is one."""
     theta = prior.from_unit_cube(rng.random((n, len(prior.names))))
     return Weighted(prior.names, theta, np.zeros(n), np.full(n, -math.log(n)), 0.0, 0.0, float(n), 0, -math.inf)
 

@@ -96,7 +96,7 @@ class Calibration(ShowsItself):
 
     @property
     def fields(self) -> dict[int, SSFField]:
-        """Mean SSF field by order."""
+        """Mean SSF field of each fit, in a dict by order."""
         return {fit.n_gaussians: fit.field for fit in self.fits}
 
     @property

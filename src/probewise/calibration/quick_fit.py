@@ -322,7 +322,10 @@ def _smc_with_all_gaussians_bright(
     rng: np.random.Generator,
     report: Callable[[TemperatureSummary], None] | None,
 ) -> SMCResult:
-    """Sample the part of the posterior of `n` where all Gaussians are bright, from a wide density."""
+    """Sample the part of the posterior of `n` where all Gaussians are bright.
+
+    Particles start from a wide density made from the samples of `below`, and from the densities `about` peaks.
+    """
     space = whole.whole_footprint_coordinates(problems.prior_of(n), n)
     fewer = whole.whole_footprint_coordinates(problems.prior_of(n - 1), n - 1).enter(below.theta)
     reference: ReferenceDensity = AllGaussiansBrightDensity.from_samples_below(space, fewer)

@@ -50,7 +50,7 @@ class CardedModel:
 
     @property
     def cards(self) -> tuple[Card, ...]:
-        """The cards."""
+        """The known cards on the field."""
         return cards_of(self.chain)
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:

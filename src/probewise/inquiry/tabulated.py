@@ -72,7 +72,7 @@ class _DiscPredictive:
     levels: FloatArray
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level, one combination of settings after another.
+        """Yield the weight of each level at all places of one combination of settings, one combination after another.
 
         Combinations of one orientation share the computation.
         """
@@ -216,7 +216,7 @@ class _TabulatedPredictive:
     levels: FloatArray
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level, one combination of settings after another.
+        """Yield the weight of each level at all places of one combination of settings, one combination after another.
 
         Combinations of one orientation and height, with other repeats, share the computation.
         """
@@ -245,7 +245,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
 
 
 def _tabulated_chain(model: Chain) -> TabulatedChain | None:
-    """Return a chain with effects over the table of the chain without those that no table holds; None if impossible."""
+    """Return `model` as a chain over a table that holds its known footprint effects; None if that is impossible."""
     table = DiscTable.of(replace(model, effects=tuple(filter(is_known_footprint_effect, model.effects))))
     return None if table is None else TabulatedChain.of(model, table)
 

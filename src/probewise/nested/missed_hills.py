@@ -75,7 +75,7 @@ class MissedHills:
 
 
 def log_z_rise_in_errors(run: Posterior, log_z: float) -> float:
-    """Return by how many of its errors a run's log Z would rise with a part of log evidence `log_z` that it missed."""
+    """Return by how many of its errors a run's log Z would rise if a part of log evidence `log_z` were added."""
     return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / max(run.log_z_error, 1e-12)
 
 

@@ -70,7 +70,7 @@ class Proposal:
 
 
 def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
-    """Combine proposals into a mixture with these shares, which need not be normalised."""
+    """Combine proposals into one mixture with the shares `share`, which need not be normalised."""
     total = math.fsum(share)
     return Proposal(
         _concatenated_clusters([p.clusters for p in proposals]),

@@ -114,7 +114,7 @@ class _DirectPredictive:
     n_places: int
 
     def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level at all places of one combination of settings, one combination after another."""
+        """Yield the weight of each level at all places of one combination of settings; then of the next."""
         own, n_levels = weight[self.chosen] * self.stands_for, len(self.levels)
         for _, at, _ in rows_by_combination(self.rows, self.n_places):
             yield at, weight_by_level(self.index[:, at], own, n_levels)

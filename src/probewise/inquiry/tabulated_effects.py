@@ -30,7 +30,7 @@ class TabulatedChain:
 
     @classmethod
     def of(cls, chain: Chain, plain: SensorModel) -> Self | None:
-        """Make `chain` a chain over the table of `plain`, the same chain with fewer effects; None if that is impossible."""
+        """Make `chain` a chain over the table of `plain`, the same chain with fewer effects; None if impossible."""
         if isinstance(plain, TabulatedChain):
             plain = plain.table if plain.cards is None else plain.cards
         cards = plain if isinstance(plain, CardedModel) else None

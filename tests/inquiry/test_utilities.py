@@ -17,11 +17,13 @@ from probewise.inquiry import (
     ParameterValue,
     PerSecond,
     ReadingEntropy,
+    Readout,
     WhichShape,
     choose_several,
     utility_map,
     utility_named,
 )
+from probewise.inquiry.finishing import _probability_of_ending
 
 APART = [[0.0, 0.0, 0.0], [0.0, 40.0, 40.0], [0.0, 0.0, 80.0], [0.0, 40.0, 120.0]]
 """Four hypotheses: the first place tells nothing, the second one bit, the third all two."""
@@ -198,6 +200,15 @@ def test_near_the_end_the_reading_that_may_end_the_run_is_preferred(made):
     assert chance.max() <= 1.0
     best = int(chance.argmax())
     assert chance[best] == pytest.approx(by_importance(made, utility_input, goal, best), abs=0.06)
+
+
+def test_four_readings_end_a_run_as_one_of_half_the_noise_does(made):
+    near = narrow(made, Goal((2,), 5.0))
+    each = replace(near, readout=Readout(2.0), designs=replace(near.designs, repeats=(4,)))
+    designs = np.arange(0, len(near.rows), 500)
+    np.testing.assert_allclose(
+        _probability_of_ending(each, each.goal, designs), _probability_of_ending(near, near.goal, designs), atol=1e-9
+    )
 
 
 def test_the_label_of_a_map_names_the_one_quantity_that_it_shows(made):

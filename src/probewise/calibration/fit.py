@@ -33,6 +33,7 @@ from probewise.calibration.smc import SMCResult
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import NestedResult, StopRule
+from probewise.nested.sampler import least_live
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_patterns_described, require_recording
 from probewise.sensor import SSFField
@@ -188,8 +189,8 @@ def calibrate(
     require_recording(recording)
     require_patterns_described(recording.plan)
     require_rng(rng)
-    checked_whole("n_live", n_live)
     wanted = _checked_orders(orders)
+    checked_whole("n_live", n_live, least=least_live(6 * max(wanted) + 2))
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
     checked_whole("n_samples", n_samples, least=MIN_SAMPLES)
     if pixel_mm is not None and not checked_finite_number("pixel_mm", pixel_mm, "greater than 0, or None") > 0:

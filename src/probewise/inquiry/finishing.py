@@ -74,9 +74,9 @@ def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
 
 
 def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
-    """Return the probability that a reading reaches the target precision, (n,), for `designs`, places in `rows`.
+    """Return the probability that a reading, or the mean of a design's repeats, reaches the target precision, (n,).
 
-    The noise is that of a single reading, also for designs with repeats.
+    `designs` are places in `rows`.
     """
     rows, share = resampled_rows_and_weights(utility_input.weight, _MOST_ASKED)
     away = utility_input.theta[rows][:, goal.columns]
@@ -84,9 +84,14 @@ def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: Int
     answers = utility_input.forecast.predict(
         utility_input.theta[rows], utility_input.plan.take(utility_input.rows[designs])
     )
-    given = WeightsGivenReading(answers, share, utility_input.readout)
-    ends = np.ones(given.weight_by_cell.shape, dtype=np.bool_)
-    for length in away.T:
-        mean = given.weighted_sum_by_cell(length) / given.weight_by_cell
-        ends &= given.weighted_sum_by_cell(length**2) / given.weight_by_cell - mean**2 < goal.sd**2
-    return np.asarray((given.weight_by_cell * ends).sum(axis=1) / given.weight_by_cell.sum(axis=1))
+    n_repeats = utility_input.designs.n_repeats[utility_input.rows[designs]]
+    out = np.empty(len(designs))
+    for n in np.unique(n_repeats).tolist():
+        own = n_repeats == n
+        given = WeightsGivenReading(answers[:, own], share, utility_input.readout, repeats=n)
+        ends = np.ones(given.weight_by_cell.shape, dtype=np.bool_)
+        for length in away.T:
+            mean = given.weighted_sum_by_cell(length) / given.weight_by_cell
+            ends &= given.weighted_sum_by_cell(length**2) / given.weight_by_cell - mean**2 < goal.sd**2
+        out[own] = (given.weight_by_cell * ends).sum(axis=1) / given.weight_by_cell.sum(axis=1)
+    return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
@@ -30,15 +31,18 @@ class WeightsGivenReading:
         The cells of a reading and its noise.
     fine
         Width of a cell in noise sds, if readings are not rounded.
+    repeats
+        Number of readings at each design, of which the mean counts.
     """
 
-    def __init__(self, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0) -> None:
-        levels = evenly_spaced_levels(
-            float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD, most=MOST_LEVELS
-        )
+    def __init__(
+        self, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
+    ) -> None:
+        sd = readout.noise_sd / math.sqrt(repeats)
+        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), sd / _PER_SD, most=MOST_LEVELS)
         self._index = nearest_level_index(answers, levels)
         self._weight = weight
-        self._chance = readout.cell_probability(levels, fine=fine, most=MOST_LEVELS)
+        self._chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
 
     @cached_property
     def weight_by_cell(self) -> FloatArray:

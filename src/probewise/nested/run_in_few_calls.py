@@ -14,6 +14,7 @@ used.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -122,7 +123,7 @@ def run_in_few_calls(
     progress
         Called with the number of evaluations after every batch of draws.
     executor, n_workers
-        As for `run`; without `n_workers` only the nested run evaluates in parallel.
+        As for `run`.
 
     Returns
     -------
@@ -142,7 +143,7 @@ def run_in_few_calls(
     if not checked_finite_number("error", error) > 0:
         raise ParameterError("error", error, "greater than 0")
     max_calls = checked_whole("max_calls", max_calls, least=_LEAST_CALLS)
-    evaluate = Evaluator(posed, executor=executor, n_parts=n_workers or 1)
+    evaluate = Evaluator(posed, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     report = progress or (lambda n_calls: None)
     n_params = len(evaluate.names)
     again = partial(run_once, rng=rng, executor=executor, n_workers=n_workers, return_interrupted=False)

@@ -122,6 +122,13 @@ def test_readings_taken_together_are_spread():
     assert sorted(inquiry(n_samples=2000, noise=0.05).several(2)) == [0.0, 2.0]
 
 
+def test_the_way_to_the_second_of_two_readings_begins_at_the_first():
+    """Each move costs more than it is worth, so both are taken at one place."""
+    together = inquiry(cost_s=lambda last: np.ones(5) if last is None else 0.01 + 100 * np.abs(PLACES - last))
+    first, second = together.several(2)
+    assert first == second
+
+
 FORMS = {
     "several knobs": (np.array([[0.0, 1.0], [1.0, 0.5], [2.0, 2.0]]), lambda p, s: p["a"] * s[0] + s[1]),
     "knobs by name": (

@@ -100,7 +100,7 @@ class Inquiry(ShowsItself):
         self._readings: ReadingsProblem | None = None
         self._utility: FloatArray | None = None
         self._next: Any = None
-        self._costs_s()
+        self._costs_s(None)
 
     @property
     def posterior(self) -> Weighted:
@@ -126,7 +126,7 @@ class Inquiry(ShowsItself):
         again.
         """
         if self._utility is None:
-            self._utility = self._utility_for_weights(self._posterior.weight) / self._costs_s()
+            self._utility = self._utility_for_weights(self._posterior.weight) / self._costs_s(self._last_setting)
             self._utility.flags.writeable = False
         return self._utility
 
@@ -218,7 +218,7 @@ class Inquiry(ShowsItself):
         """Choose the settings of `n` readings to be taken before any of them is known; best first.
 
         Greedy on the joint information (Nemhauser, Wolsey & Fisher 1978): each setting is the best addition to those
-        before it in the list, averaged over simulated readings there. Costs count from the last setting read. Pass the
+        before it in the list, averaged over simulated readings there. Costs count from the setting before it. Pass the
         results one by one to `tell(reading, setting)`.
         """
         checked_whole("n", n)
@@ -234,7 +234,8 @@ class Inquiry(ShowsItself):
                 imagined = noise.draw(predicted[truth], scale[truth], rng=self._rng)
                 log_density = noise.log_density(imagined, predicted, scale)[:, 0]
                 weights[k] = weight * np.exp(log_density - log_density[weight > 0].max())
-            utility = np.mean([self._utility_for_weights(weight) for weight in weights], axis=0) / self._costs_s()
+            cost_s = self._costs_s(self._settings[rows[-1]])
+            utility = np.mean([self._utility_for_weights(weight) for weight in weights], axis=0) / cost_s
             rows.append(choose(utility, everywhere, rng=self._rng))
         return [self._settings[row] for row in rows]
 
@@ -277,8 +278,13 @@ class Inquiry(ShowsItself):
         now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
         return np.asarray(now - predictive.distance_from_goal(values, np.array(goal)))
 
-    def _costs_s(self) -> FloatArray:
-        """Return the seconds of a reading at each setting from the last one, (n_settings,) or one number; default 1.
+    @property
+    def _last_setting(self) -> Any:
+        """Setting of the last reading; None before the first."""
+        return self._taken[-1][0] if self._taken else None
+
+    def _costs_s(self, last: Any) -> FloatArray:
+        """Return the seconds of a reading at each setting after one at `last`, (n_settings,) or a number; default 1.
 
         ShapeError or ParameterError for costs of a wrong shape or not above 0.
         """
@@ -286,7 +292,7 @@ class Inquiry(ShowsItself):
         if given is None:
             return np.ones(len(self._settings))
         if callable(given):
-            given = given(self._taken[-1][0] if self._taken else None)
+            given = given(last)
         cost_s = floats(given, "cost_s")
         if cost_s.shape not in ((), (len(self._settings),)):
             raise ShapeError(f"cost_s has shape {cost_s.shape}; allowed: ({len(self._settings)},), one per setting")

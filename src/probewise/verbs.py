@@ -301,14 +301,14 @@ def explore(
     )
     from probewise._progress import progress_or_bar
     from probewise.arm import LegoArm, as_instrument
-    from probewise.calibration.sensor_file import require_sensor
+    from probewise.calibration.sensor_file import require_fitted_sensor
     from probewise.errors import ParameterError
     from probewise.scene import Field
 
     require_rng(rng)
     field = Field() if field is None else field
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
-    require_sensor(sensor, "in the order explore(sensor, ...)")
+    require_fitted_sensor(sensor, "in the order explore(sensor, ...)")
     require_flag("learn_sensor", learn_sensor)
     lies = posing.as_shape(shape, field)
     streams, hidden = posing.RandomStreams.spawned_from(rng), None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from probewise.calibration import Calibration, OrderPosterior, SMCResult, calibrate, default_prior, quick_fit
-from probewise.calibration.check_by_search import missed_part_in_words, share_far_from_known
+from probewise.calibration.check_by_search import search_for_missed_part, share_far_from_known
 from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.calibration.order_search import search_prior_of_order
 from probewise.calibration.quick_fit import fit_orders_quickly
@@ -50,7 +50,7 @@ def test_samples_of_a_part_that_is_not_known_lie_apart() -> None:
 def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording) -> None:
     problems, rng = ProblemsByOrder(mirrored, default_prior), np.random.default_rng(3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quick_fit, "missed_part_in_words", lambda *_, **__: "")
+        patch.setattr(quick_fit, "search_for_missed_part", lambda *_, **__: "")
         found, why = fit_orders_quickly(
             problems, (1,), search=partial(search_prior_of_order, problems, n_live=50), rng=rng
         )
@@ -59,7 +59,7 @@ def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording
     assert isinstance(made, SMCResult)
     correlated = made.theta[:, 5] < 0.0
     assert correlated.all() or not correlated.any()
-    assert "lie apart" in missed_part_in_words(problems, 1, made, rng=rng)
+    assert "lie apart" in search_for_missed_part(problems, 1, made, rng=rng)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_the_order_that_missed_a_peak_and_those_above_are_searched(
     made = vouched.result
     assert isinstance(made, SMCResult)
     low = OrderPosterior(replace(made, log_z_of_clouds=made.log_z_of_clouds - 90.0), None)
-    monkeypatch.setattr(quick_fit, "missed_part_in_words", lambda *_, **__: "it lies elsewhere")
+    monkeypatch.setattr(quick_fit, "search_for_missed_part", lambda *_, **__: "it lies elsewhere")
     found = quick_fit._check_chosen_order_or_search_in_full(
         ProblemsByOrder(recording, default_prior),
         {1: low, 2: vouched, 3: low},

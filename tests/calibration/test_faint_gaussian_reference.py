@@ -148,9 +148,9 @@ def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth:
     lone = np.concatenate([other, truth[None, -2:]], axis=1)
     change = problem.model.predict(lone, recording.plan)[0] - predicted(centre)[0]
     refit = -np.linalg.solve(slope @ slope.T, slope @ change)
-    shift = compensation.linear.compensating_shift(other).shift[0]
+    shift = compensation.linear.shift_for_added_gaussian(other).shift[0]
     assert shift[0] == 0.0
-    assert compensation.linear.compensating_shift(other[:0]).shift.shape == (0, 8)
+    assert compensation.linear.shift_for_added_gaussian(other[:0]).shift.shape == (0, 8)
     sds = np.sqrt(np.diag(covariance))
     apart = np.linalg.norm((shift[told] - refit) / sds)
     assert apart < 0.15 * np.linalg.norm(refit / sds)

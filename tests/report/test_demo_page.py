@@ -16,7 +16,7 @@ from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
 from probewise.report import doubting_robot
 from probewise.report.demo import HEADER, search_comparison_lines
-from probewise.report.paper_view import fine_entropy_map, paper_view, window_mm
+from probewise.report.paper_view import fine_entropy_map, paper_view, window_around_runs_mm
 from probewise.report.plots import PAGE_IN
 from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import join_side_by_side
@@ -59,7 +59,7 @@ def test_the_fine_map_agrees_with_the_robots_own_where_both_have_a_place(found):
 
 
 def test_the_view_shows_the_fifty_circles_and_the_place_chosen_from_them(found):
-    window = window_mm([found], 1)
+    window = window_around_runs_mm([found], 1)
     outline = np.array([[510.0, 260.0], [600.0, 350.0], [690.0, 260.0]])
     ax = paper_view(found, 1, levels=(10.0, 60.0), truth_mm=outline, window_mm=window)
     assert len(ax.collections[0].get_paths()) == 50

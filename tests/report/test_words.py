@@ -4,7 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.report.words import interval_text, unit_of, value_and_interval_texts, value_with_error, without_unit
+from probewise.report.words import (
+    interval_text,
+    unit_of,
+    value_and_interval_texts,
+    value_with_error,
+    words_without_unit,
+)
 
 
 @pytest.mark.parametrize(
@@ -42,6 +48,6 @@ def test_an_interval_is_written_to_the_third_figure_of_its_width():
 
 
 def test_a_parameters_unit_is_told_once():
-    assert (without_unit("rectangle.width_mm"), unit_of("rectangle.width_mm")) == ("rectangle width", "mm")
-    assert (without_unit("angle_rad"), unit_of("angle_rad")) == ("angle", "rad")
-    assert (without_unit("A_1"), unit_of("A_1")) == ("A 1", "")
+    assert (words_without_unit("rectangle.width_mm"), unit_of("rectangle.width_mm")) == ("rectangle width", "mm")
+    assert (words_without_unit("angle_rad"), unit_of("angle_rad")) == ("angle", "rad")
+    assert (words_without_unit("A_1"), unit_of("A_1")) == ("A 1", "")

@@ -27,7 +27,7 @@ _MISSED = 0.2
 _N_SAMPLES, _N_OWN, _N_OTHERS = 300, 500, 2000
 
 
-def missed_part_in_words(
+def search_for_missed_part(
     problems: ProblemsByOrder, n: int, climbed: SMCResult, *, rng: np.random.Generator, progress: Progress | None = None
 ) -> str:
     """Search the prior of `n` Gaussians, and describe in words what the SMC run `climbed` missed; "" if nothing.

@@ -155,7 +155,7 @@ class _LinearisedPosterior:
             float((theta[:, -1] - theta[:, -2]).mean()) * per_sd,
         )
 
-    def compensating_shift(self, gaussian: FloatArray) -> CompensatingShift:
+    def shift_for_added_gaussian(self, gaussian: FloatArray) -> CompensatingShift:
         """Return the shifts that compensate for one Gaussian more per row, (n, 6); its amplitude does not matter."""
         blocks = np.array_split(gaussian, max(1, -(-len(gaussian) // _AT_ONCE)))
         parts = [self._compensating_shift_of_block(block) for block in blocks]
@@ -230,7 +230,7 @@ class CompensatedShapeProposal:
         while log_asked.size < n_pool and (not pools or n_effective(log_asked) < _EFFECTIVE):
             n_more = min(_N_DRAWN, n_pool - log_asked.size)
             pools.append(prior.from_unit_cube(rng.random((n_more, len(prior.names))))[:, :6])
-            answers.append(linear.compensating_shift(pools[-1]))
+            answers.append(linear.shift_for_added_gaussian(pools[-1]))
             log_asked = np.concatenate([log_asked, _TEMPERED * answers[-1].log_bayes_factor(most)])
         log_norm = float(logsumexp(log_asked)) - math.log(log_asked.size)
         return cls(coordinates, linear, np.concatenate(pools), CompensatingShift.concatenate(answers), most, log_norm)

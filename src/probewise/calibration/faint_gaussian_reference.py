@@ -183,7 +183,9 @@ class FaintGaussianReferenceDensity:
         others = g[np.arange(n) != label[:, None]].reshape(m, 6 * (n - 1))
         rest = np.concatenate([others, here[:, -2:]], axis=1)
         old = g[np.arange(m), label]
-        before, log_here = self._undo_compensation(rest, old, self.compensation.linear.compensating_shift(old), False)
+        before, log_here = self._undo_compensation(
+            rest, old, self.compensation.linear.shift_for_added_gaussian(old), False
+        )
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         rows = np.flatnonzero(np.isfinite(log_here))
         if rows.size:
@@ -229,7 +231,7 @@ class FaintGaussianReferenceDensity:
         Also return the log density of its addition over the prior's, (n,), as `AddedGaussianProposal.back` does.
         """
         last = theta[:, -8:-2]
-        answer = self.compensation.linear.compensating_shift(last)
+        answer = self.compensation.linear.shift_for_added_gaussian(last)
         return self._undo_compensation(self.without_last_gaussian(theta), last, answer, True)
 
     def _draw_gaussian_and_compensate(
@@ -242,7 +244,7 @@ class FaintGaussianReferenceDensity:
         last, answer = self.compensation.draw(len(rest), rng=rng)
         near = np.flatnonzero(rng.random(len(rest)) < _NEAR)
         last[near] = self._draw_gaussians_near_others(rest[near], rng)
-        answer = answer.with_rows_replaced(near, self.compensation.linear.compensating_shift(last[near]))
+        answer = answer.with_rows_replaced(near, self.compensation.linear.shift_for_added_gaussian(last[near]))
         masses = self._masses(rest)
         whole, most = masses.sum(axis=1), self._greatest_faint_mass(masses, last_of_all=last_of_all)
         told = answer.draw_light_share(most / (whole + most), rng=rng)

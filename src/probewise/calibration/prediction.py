@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, floats
 from probewise.calibration.deduplicated_model import DeduplicatedModel
-from probewise.calibration.sensor_file import FittedSensor, require_sensor
+from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
 from probewise.effects import PredictiveMixture
 from probewise.effects.origin import CountsTimeFromOrigin
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
@@ -68,7 +68,7 @@ def predict(
         If the plan's unit is not that of the calibration, the plan commands heights but its description gives none, it
         lacks a column that an effect reads, or it lies before the time from which an effect counts.
     """
-    require_sensor(sensor, "in the order predict(sensor, plan)")
+    require_fitted_sensor(sensor, "in the order predict(sensor, plan)")
     if isinstance(plan, Recording):
         if readings is not None:
             raise ParameterError("readings", readings, "none together with a recording, which has its own")

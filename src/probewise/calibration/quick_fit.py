@@ -19,7 +19,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.calibration.all_bright_density import AllGaussiansBrightDensity
-from probewise.calibration.check_by_search import missed_part_in_words
+from probewise.calibration.check_by_search import search_for_missed_part
 from probewise.calibration.compensation import CompensatedShapeProposal
 from probewise.calibration.faint_gaussian_reference import FaintGaussianReferenceDensity, has_uniform_prior_of_light
 from probewise.calibration.light_integral import FaintGaussianLikelihoodRatio, bridge_log_z_ratio
@@ -125,7 +125,7 @@ def _check_chosen_order_or_search_in_full(
         if chosen in asked or not isinstance(made, SMCResult):
             return found
         asked.add(chosen)
-        why = missed_part_in_words(problems, chosen, made, rng=rng, progress=progress)
+        why = search_for_missed_part(problems, chosen, made, rng=rng, progress=progress)
         if why:
             note = f"searched in full, since the quick way missed a peak of order {chosen}: {why}"
             for n in (n for n in found if n >= chosen):

@@ -413,7 +413,7 @@ def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
     FileError
         If the file cannot be written.
     """
-    require_sensor(sensor)
+    require_fitted_sensor(sensor)
     path = checked_path("path", path)
     write_text_atomically(path, sensor.to_json())
 
@@ -430,7 +430,7 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
     return FittedSensor.from_json(read_text(path, _ALLOWED), path)
 
 
-def require_sensor(sensor: object, more: str = "") -> None:
+def require_fitted_sensor(sensor: object, more: str = "") -> None:
     """Raise ParameterError unless `sensor` is a FittedSensor; the message says how to get one, and `more`."""
     allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
     if isinstance(getattr(sensor, "sensor", None), FittedSensor):

@@ -40,13 +40,13 @@ def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) 
         Whether to summarise each of several Gaussians too.
     """
     f = footprint_of(samples[:, : 6 * n_gaussians], n_gaussians)
-    found = _quantities_of_moments("", *_moments_of_whole_footprint(f))
+    found = _summaries_of_sampled_moments("", *_moments_of_whole_footprint(f))
     if n_gaussians > 1 and each:
         for k in range(n_gaussians):
             prefix = f"gaussian_{k + 1}."
             own = (f.u_mm, f.v_mm, f.var_u, f.var_v, f.cov_uv)
             found += (_quantity_of_samples(f"{prefix}share", "1", f.weight[:, 0, k]),)
-            found += _quantities_of_moments(prefix, *(values[:, 0, k] for values in own))
+            found += _summaries_of_sampled_moments(prefix, *(values[:, 0, k] for values in own))
     return found
 
 
@@ -58,7 +58,7 @@ def _moments_of_whole_footprint(f: Footprint) -> tuple[FloatArray, ...]:
     return u, v, *((f.weight[:, 0] * (own[:, 0] + off)).sum(axis=-1) for own, off in spread)
 
 
-def _quantities_of_moments(
+def _summaries_of_sampled_moments(
     prefix: str, u: FloatArray, v: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[QuantitySummary, ...]:
     middle, half = (var_u + var_v) / 2, np.hypot((var_u - var_v) / 2, cov_uv)

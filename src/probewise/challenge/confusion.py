@@ -42,7 +42,10 @@ def confusion_counts(
 
 
 def _stated_name(result: Mapping[str, Any], truth: str) -> str:
-    """Return the name for which a leading hypothesis counts: `truth` if right, "clean", its one name, or `SEVERAL`."""
+    """Return the name for which a leading hypothesis counts: `truth` if right, "clean", its one name, or `SEVERAL`.
+
+    If the concealed effects act on the mean, names of noise effects are ignored.
+    """
     names = leading_hypothesis(result, clean=True)[0]
     if acts_on_mean(result):
         names = tuple(name for name in names if name not in NOISE)

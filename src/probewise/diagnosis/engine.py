@@ -169,7 +169,7 @@ def _facts_for_reason(
         words=prepared.apparatus.words,
         n_readings=len(prepared.usable_rows),
         least_readings=prepared.least_readings,
-        form=searched.nulls[max(orders, key=lambda n: orders[n])].form,
+        form=searched.nulls[max(orders, key=lambda n: orders[n])].ssf_in_words,
         sentences={effect.name: effect.sentence for effect in found},
         like=tuple(sentence_from_samples(e, own) for e, own in zip(formulas, columns, strict=True)),
         family=max(shares, key=lambda family: shares[family], default=""),

@@ -82,9 +82,9 @@ class SensorAndShape:
         return self.sensor.effective_n_gaussians
 
     @property
-    def form(self) -> str:
+    def ssf_in_words(self) -> str:
         """Description of the sensor's SSF, in words."""
-        return self.sensor.form
+        return self.sensor.ssf_in_words
 
     @property
     def predicts_in_bulk(self) -> bool:
@@ -97,9 +97,9 @@ class SensorAndShape:
         return False
 
     @property
-    def exchangeable(self) -> bool:
+    def has_exchangeable_gaussians(self) -> bool:
         """Whether the sensor's Gaussians are exchangeable."""
-        return self.sensor.exchangeable
+        return self.sensor.has_exchangeable_gaussians
 
     @property
     def nuisance_names(self) -> tuple[str, ...]:

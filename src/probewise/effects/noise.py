@@ -128,7 +128,7 @@ class RandomWalk(NoiseEffect):
         return Product({"sd_per_row": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        """Return the noise with steps of this sd; the sd of a reading about the walk does not change."""
+        """Return the noise parameters with a random walk of the offset added; its steps have the sd in theta."""
         return replace(
             value, walk=theta[:, :1], walked=np.asarray(self.n_before + 1.0 + np.arange(len(plan)), dtype=np.float64)
         )

@@ -106,7 +106,7 @@ class OutputPort:
         return (*asked, self.tacho_count, self.block_count, self.rotation_count)
 
     def simulate_millisecond(self, battery_mv: float) -> None:
-        """Simulate a millisecond of motor and firmware."""
+        """Simulate a millisecond of motor and firmware, without regulation and synchronisation."""
         self.motor.step(1e-3, self.power, brake=self._brake, battery_mv=battery_mv)
         seen = self._encoder_deg
         turned, self._seen_deg = seen - self._seen_deg, seen

@@ -12,7 +12,7 @@ AD_MAX = 1023
 
 
 class AnalogSensor(Protocol):
-    """A sensor with a voltage output."""
+    """What an input port's AD converter reads: a sensor with a voltage output, or an empty port."""
 
     def counts(self, *, lit: bool) -> int:
         """Return the output of the AD converter, 0 to 1023 for 0 to 5 V; `lit`: whether the LED is on."""

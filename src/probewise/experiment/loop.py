@@ -216,7 +216,7 @@ def _goal_less_arm_error(experiment: Experiment, arm: ArmError | None) -> Goal |
 def _may_stop_and_chance_off(
     experiment: Experiment, posterior: Weighted, arm: ArmError | None, likely: str, rng: np.random.Generator
 ) -> tuple[bool, float]:
-    """Return whether a posterior with the arm's error meets the stopping rule, and the chance that a length is off."""
+    """Return whether a posterior with the arm's error meets the stopping rule, and its `probability_of_length_off`."""
     _, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     if arm is not None:
         sd = np.hypot(sd, arm.sd)

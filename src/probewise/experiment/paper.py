@@ -17,7 +17,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
-from probewise.calibration.sensor_file import require_sensor
+from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.experiment.configuration import Experiment, OneScan
 from probewise.experiment.kinds import HypothesisKind
@@ -186,7 +186,7 @@ def paper_experiment(
     ParameterError
         If a name is unknown, the naive model has no levels, or an option does not go with the model.
     """
-    require_sensor(sensor, "in the order paper_experiment(sensor, shape, field)")
+    require_fitted_sensor(sensor, "in the order paper_experiment(sensor, shape, field)")
     for name, value, allowed in (("model", model, get_args(Model)), ("nested_stop", nested_stop, tuple(NESTED_STOP))):
         if value not in allowed:
             raise ParameterError(name, value, " or ".join(map(repr, allowed)))
@@ -236,7 +236,7 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
         If there are fewer than two readings over either colour.
     """
     require_recording(recording)
-    require_sensor(sensor)
+    require_fitted_sensor(sensor)
     require_patterns_described(recording.plan)
     mixture, patterns = sensor.with_leading_effects().mean_mixture(), KnownScene(recording.plan.patterns)
     share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)

@@ -61,7 +61,7 @@ class Fits:
 
     @cached_property
     def good_fit_rows(self) -> IntArray:
-        """Rows of the fits at most 8 nats behind the best, best first; empty if every fit failed."""
+        """Rows of the fits whose `score` is less than 8 nats below the best, best first; empty if every fit failed."""
         order = np.argsort(-self.score)
         return (
             order[self.score[order] > self.score[order[0]] - _WORSE] if math.isfinite(self.score.max()) else order[:0]
@@ -69,7 +69,7 @@ class Fits:
 
     @property
     def n_as_good_as_best(self) -> int:
-        """Number of fits within 0.5 nats of the best, the best included."""
+        """Number of fits whose `score` is within 0.5 nats of the best, the best included."""
         return int(np.count_nonzero(self.score > self.score.max() - _AS_GOOD))
 
     @cached_property

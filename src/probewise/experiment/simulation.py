@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import did_you_mean
 from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
-from probewise.calibration.sensor_file import require_sensor
+from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
@@ -79,7 +79,7 @@ class RandomStreams(NamedTuple):
 
 def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
     """Return a journal's entries for the sensor: the sha256 of its JSON, and the path of its file if given."""
-    require_sensor(sensor)
+    require_fitted_sensor(sensor)
     named = {} if path is None else {"sensor_file": os.fspath(path)}
     return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
 
@@ -177,7 +177,7 @@ def experiment_for(
     ParameterError
         If an option does not go with the model or the sensor.
     """
-    require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
+    require_fitted_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
     sensor = sensor.with_leading_effects()  # a mean over several hypotheses describes none of them
@@ -314,7 +314,7 @@ def scale_of(instrumentation: Instrumentation) -> ReadingScale:
 
 def world_like(sensor: FittedSensor) -> World:
     """Build the simulated world of a fitted sensor: its mean field as the footprint, its levels, noise and height."""
-    require_sensor(sensor)
+    require_fitted_sensor(sensor)
     field, means = sensor.field, sensor.mean()
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
     # A fitted free-form field may be slightly negative; a physical footprint is not.

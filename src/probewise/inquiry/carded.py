@@ -19,7 +19,7 @@ from probewise.inquiry.forecast import (
 from probewise.recordings.plan import Plan
 from probewise.scene.cards import Card, CardedScene, mean_albedo_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
-from probewise.sensor.chain import SceneLayout, response
+from probewise.sensor.chain import RegionsAndPoses, response
 from probewise.sensor.stages import Poses, SensorModel
 
 _REACH = 6.0  # sds of the footprint
@@ -87,7 +87,7 @@ class CardedModel:
                 there = Poses(*(a[:, rows] for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
                 part = plan.take(rows)
                 regions = dict.fromkeys(part.pattern_names, card.region)
-                out[:, rows] = response(SceneLayout(regions, there, part), footprint, n_nodes=self.chain.n_nodes)
+                out[:, rows] = response(RegionsAndPoses(regions, there, part), footprint, n_nodes=self.chain.n_nodes)
             found.append(out)
         return found
 

@@ -174,7 +174,7 @@ class TabulatedForecast:
     def _dark_and_bright_at_height(self, height: float) -> tuple[float, float]:
         """Return the readings outside and deep inside a shape at `height` times that of the calibration.
 
-        Light falls with the square of the height.
+        The reading outside does not change; the difference between the two falls with the square of the height.
         """
         return self.levels.i_min, self.levels.i_min + (self.levels.i_max - self.levels.i_min) / height**2
 

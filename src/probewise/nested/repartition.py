@@ -153,7 +153,10 @@ class _PriorNearPosterior:
         return self.whole.to_principal_axes(self.space.enter(theta), 0)
 
     def leave(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters, (n, n_params); also return this prior's log density in them, (n,)."""
+        """Map coordinates to parameters, (n, n_params); also return this prior's log density in the coordinates.
+
+        The density, (n,), is -inf where that of the original prior is zero.
+        """
         x = self.whole.center[0] + e @ self.whole.root[0].T
         theta, log_plain = self.space.leave(x)
         log_density = self.parts.log_density(x) + self.whole.log_det_of_roots[0]

@@ -73,7 +73,7 @@ def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:
     Raises
     ------
     FileError
-        If there is no room.
+        If it cannot be written or synced, as on a full disk.
     """
     left_over = memoryview(content)
     try:

@@ -28,7 +28,7 @@ from probewise.report.words import (
     unit_name,
     value_and_interval_texts,
     value_with_error,
-    without_unit,
+    words_without_unit,
 )
 
 
@@ -189,7 +189,7 @@ def ssf_centre_and_width_table(sensor: FittedSensor) -> Markup:
     return table(
         ("SSF", "unit", "median", "95 % interval"),
         (
-            (without_unit(q.name), _printed_unit(q.unit), *value_and_interval_texts(q.median, *q.interval95))
+            (words_without_unit(q.name), _printed_unit(q.unit), *value_and_interval_texts(q.median, *q.interval95))
             for q in sensor.ssf_quantities()
         ),
         caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "

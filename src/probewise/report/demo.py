@@ -26,7 +26,7 @@ from probewise.report.html import (
     slideshow,
     table,
 )
-from probewise.report.paper_view import paper_view, window_mm
+from probewise.report.paper_view import paper_view, window_around_runs_mm
 from probewise.report.plots import (
     AxesGrid,
     arm_and_sensor,
@@ -200,7 +200,7 @@ def encoded_diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
 
 def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
     """Draw the paper's view after each of `numbers` readings (rows) of each search (columns); return the axes."""
-    window = window_mm([s.run for s in searches], numbers[0])
+    window = window_around_runs_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
     size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
     axes = grid_of_axes(len(numbers), len(searches), size_in=size)

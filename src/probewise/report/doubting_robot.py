@@ -9,7 +9,7 @@ import numpy as np
 from probewise.experiment import left_out_after_step
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Section, figure, paragraph, table
-from probewise.report.paper_view import window_mm
+from probewise.report.paper_view import window_around_runs_mm
 from probewise.report.plots import PAGE_IN, draw_field_legend, effect_probabilities_by_reading, grid_of_axes, png
 from probewise.report.robot_search import RobotSearch
 from probewise.report.words import count_with_noun, number_text
@@ -30,7 +30,7 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
 
 def encoded_figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
     """Draw both robots' final posteriors, and the doubting one's probabilities of effects; return PNGs by file name."""
-    ends = np.array([window_mm([s.run], len(s.run.steps)) for s in searches])
+    ends = np.array([window_around_runs_mm([s.run], len(s.run.steps)) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
     axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.4 + 3.3 * (high - low) / (right - left)))

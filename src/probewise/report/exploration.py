@@ -37,7 +37,7 @@ from probewise.report.words import (
     unit_name,
     unit_of,
     value_with_error,
-    without_unit,
+    words_without_unit,
 )
 from probewise.scene import outlines, with_angles_near
 from probewise.scene.any_of import shape_and_columns
@@ -171,7 +171,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, ± its posterior sd; those without a truth are left out."""
     step, truth = run.last, _truth_with_angles_near_estimate(run, truth)
     return ", ".join(
-        f"{without_unit(_without_shape_prefix(step, name))} "
+        f"{words_without_unit(_without_shape_prefix(step, name))} "
         f"{value_with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
@@ -194,7 +194,7 @@ def summary_sentence(run: Exploration) -> str:
     found = found_shape(run)
     several = f" (probability {probability_text(found.probability)})" if run.last.shapes else ""
     known = ", ".join(
-        f"{without_unit(p.name)} {value_with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters
+        f"{words_without_unit(p.name)} {value_with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters
     )
     if not run.reached:
         taken = count_with_noun(len(run.steps), "reading")
@@ -205,7 +205,10 @@ def summary_sentence(run: Exploration) -> str:
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
-    """Build the table of the shape found: each parameter's mean, sd, 95 % interval, and the truth where known."""
+    """Build the table of the shape that an exploration found.
+
+    Columns: each parameter's unit, mean, sd, the arm's part of the sd if known, 95 % interval; the truth if given.
+    """
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm_error is not None else ()
@@ -214,7 +217,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
         header,
         (
             (
-                without_unit(p.name),
+                words_without_unit(p.name),
                 unit_of(p.name),
                 *value_with_error(p.mean, p.sd).partition(" ± ")[::2],
                 *(() if p.arm_sd is None else (f"{p.arm_sd:.2g}",)),
@@ -295,7 +298,7 @@ def page_html(
     if truth:
         facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run, truth)))
     sensor = [
-        (without_unit(name), unit_of(name), *value_with_error(mean, sd).partition(" ± ")[::2])
+        (words_without_unit(name), unit_of(name), *value_with_error(mean, sd).partition(" ± ")[::2])
         for name, (mean, sd) in run.last.sensor.items()
     ]
     learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)

@@ -31,7 +31,7 @@ from probewise.report.plots import (
     recorded_against_predicted,
     spatial_sensitivity,
 )
-from probewise.report.words import count_with_noun, unit_name, unit_of, value_with_error, without_unit
+from probewise.report.words import count_with_noun, unit_name, unit_of, value_with_error, words_without_unit
 from probewise.sensor import SSFField
 from probewise.systems import SystemPrediction
 from probewise.systems.table import RunRecording
@@ -106,7 +106,9 @@ def _nested_result_html(value: NestedResult) -> str:
 def _weighted_html(value: Weighted) -> str:
     names = value.names[:MOST_PARAMETERS]
     believed = zip(names, value.mean(), value.sd(), strict=False)
-    known = ", ".join(f"{without_unit(n)} {value_with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed)
+    known = ", ".join(
+        f"{words_without_unit(n)} {value_with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed
+    )
     drawn = corner_plot(value, parameters=names)
     return _div(
         figure(png(drawn, dpi=DPI), "Posterior: each parameter by itself, and each pair"),

@@ -89,7 +89,7 @@ def paper_view(
     return ax
 
 
-def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:
+def window_around_runs_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:
     """Return limits of a window that holds all readings and each run's circles sampled after reading `first`.
 
     Parameters

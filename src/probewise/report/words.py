@@ -52,7 +52,7 @@ def unit_of(name: str) -> str:
     return _UNITS.get(suffix, "") if stem else ""
 
 
-def without_unit(name: str) -> str:
+def words_without_unit(name: str) -> str:
     """Write a parameter's name without its unit, spaces for underscores and dots."""
     stem = name.rpartition("_")[0] if unit_of(name) else name
     return stem.replace("_", " ").replace(".", " ")

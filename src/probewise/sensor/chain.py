@@ -274,7 +274,7 @@ class Chain:
         moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
         return None if len(first) < len(theta) and any(moved) else _HypothesesByGeometry(first, which)
 
-    def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> SceneLayout:
+    def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> RegionsAndPoses:
         """Return the regions and the poses over them; cached for the last plan if no parameter moves scene or poses."""
         fixed = not self.scene.names and all(effect.stage > Stage.SCENE for effect in self.effects)
         known = self._layout_cache.get(plan) if fixed else None
@@ -286,14 +286,14 @@ class Chain:
         poses = self.poses(theta, plan)
         view: SceneView = apply(Stage.SCENE, SceneView(regions))
         x_mm, y_mm = poses.x_mm - view.dx_mm, poses.y_mm - view.dy_mm
-        layout = SceneLayout(view.regions, Poses(x_mm, y_mm, poses.orientation_rad), plan)
+        layout = RegionsAndPoses(view.regions, Poses(x_mm, y_mm, poses.orientation_rad), plan)
         if fixed:
             self._layout_cache.clear()
             self._layout_cache[plan] = layout
         return layout
 
     @cached_property
-    def _layout_cache(self) -> dict[Plan, SceneLayout]:
+    def _layout_cache(self) -> dict[Plan, RegionsAndPoses]:
         """Layout of the last plan, by that plan, where no parameter changes it; otherwise empty."""
         return {}
 
@@ -329,7 +329,7 @@ class Chain:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneLayout:
+class RegionsAndPoses:
     """The region under each reading and the sensor's pose relative to it: all that does not depend on the SSF.
 
     Using the layout raises ParameterError if the plan has a pattern that the regions lack.
@@ -392,7 +392,7 @@ class SceneLayout:
         ]
 
 
-def response(layout: SceneLayout, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
+def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
     """Integrate the footprint over each reading's pattern (paper, eq. R), by closed forms.
 
     Parameters
@@ -440,7 +440,7 @@ class _HypothesesByGeometry:
     first: IntArray
     which: IntArray
 
-    def response(self, layout: SceneLayout, footprint: Footprint, *, n_nodes: int) -> FloatArray:
+    def response(self, layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int) -> FloatArray:
         """Integrate as `response` does, but each Gaussian of each geometry only once.
 
         Parameters
@@ -471,7 +471,7 @@ class _HypothesesByGeometry:
         return np.stack([own @ parts[at] for own, at in zip(weight, self.which, strict=True)])
 
 
-def _discrete_response(layout: SceneLayout, ssf: DiscreteSSF) -> FloatArray:
+def _discrete_response(layout: RegionsAndPoses, ssf: DiscreteSSF) -> FloatArray:
     poses, found = layout.poses, []
     for rows, region in layout.rows_and_regions:
         there = Poses(*(select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))

@@ -205,7 +205,7 @@ class SSFField(ShowsItself):
 
 @dataclass(frozen=True)
 class DiscreteSSF:
-    """The SSF of a chain given as a field of pixels: the response is the paper's sum over the pixels."""
+    """A fixed SSF, a field of pixels without free parameters; responses to it are the paper's sum over pixels."""
 
     field: SSFField
 

@@ -379,13 +379,13 @@ def _stepping_function(
     passing = time_gaps(steps.places, columns)[:, steps.gap_of_step]
     stepper = Stepper(motion, steps.schedule.method, between, passing.reshape(len(passing), -1))
 
-    def states_after(begins: FloatArray) -> FloatArray:
+    def states_after_each_step(begins: FloatArray) -> FloatArray:
         shape = begins.shape
         s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
         after = stepper.step(s, steps.begin_share_of_gap, steps.length_share_of_gap)
         return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
 
-    return states_after
+    return states_after_each_step
 
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:

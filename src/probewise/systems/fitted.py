@@ -99,7 +99,7 @@ class FittedSystem(NamedSamples):
         object.__setattr__(self, "noise_sd", noise_sd)
 
     def summary(self) -> str:
-        """Return a plain-text summary with each parameter's median and 95 % interval."""
+        """Return a plain-text summary: simulator, effects, number of samples, noise sd, and the table of parameters."""
         own, unit = self.simulator, self.simulator.unit
         effects = f", with {', '.join(self.effects)}" if self.effects else ""
         lines = [f"{own.source or 'a simulator'} of {own.reading} ({unit}){effects}; {len(self.samples)} samples"]

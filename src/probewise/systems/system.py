@@ -188,12 +188,12 @@ class System:
         return 0
 
     @property
-    def form(self) -> str:
+    def ssf_in_words(self) -> str:
         """Empty: it has no SSF."""
         return ""
 
     @property
-    def exchangeable(self) -> bool:
+    def has_exchangeable_gaussians(self) -> bool:
         """False: it has no Gaussians."""
         return False
 

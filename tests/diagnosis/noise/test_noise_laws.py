@@ -35,7 +35,7 @@ def heavy(share: float, times: float, n: int = 50) -> NoiseLaw:
 def found_with(noise: np.ndarray, slope: np.ndarray | None = None) -> tuple[Fit, Recording]:
     """Make a fit of one parameter at its prior's centre."""
     slopes = np.zeros((N, 1)) if slope is None else slope[:, None]
-    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(exchangeable=False)))
+    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(has_exchangeable_gaussians=False)))
     return Fit(model, np.zeros(1), MEAN, noise, slopes, SD, 0.0), Recording(PLAN, MEAN + noise)
 
 

@@ -28,7 +28,9 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     rng = np.random.default_rng(5)
     z = 0.3 * rng.standard_normal(free.n_params) + 0.02 * rng.standard_normal((500, free.n_params))
     chain = free.chain(PLAN, (), n_nodes=16)
-    samples = ModelSamples(chain, free.theta(z), np.full(500, 0.5), (), free.n_gaussians, exchangeable=False)
+    samples = ModelSamples(
+        chain, free.theta(z), np.full(500, 0.5), (), free.n_gaussians, has_exchangeable_gaussians=False
+    )
     readings = chain.predict(samples.theta[:1], PLAN)[0]
     sensor = samples.fitted_sensor(Recording(PLAN, readings + 0.5 * rng.standard_normal(len(PLAN))), rng=rng)
     assert sensor.is_free_form
@@ -82,7 +84,9 @@ def test_a_posterior_against_the_bound_of_its_prior_is_drawn_from():
     """An earlier sensor whose white level is twenty of its sds off: the fit rests at six of them."""
     rng = np.random.default_rng(0)
     center = default_sensor(Extent(10.0, 60.0, PLAN), 1).center
-    tight = GaussianMixtureSensor(1, center, np.diag([0.05, 0.05, 0.01, 0.01, 0.02, 0.05, 0.05]), exchangeable=False)
+    tight = GaussianMixtureSensor(
+        1, center, np.diag([0.05, 0.05, 0.01, 0.01, 0.02, 0.05, 0.05]), has_exchangeable_gaussians=False
+    )
     truth = tight.theta(np.zeros((1, 7)))
     truth[:, -1] += 20 * 0.05
     readings = tight.chain(PLAN, (), n_nodes=16).predict(truth, PLAN)[0] + 0.3 * rng.standard_normal(len(PLAN))

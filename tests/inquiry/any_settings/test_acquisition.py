@@ -70,21 +70,21 @@ def test_the_expected_fall_of_a_gaussians_sd_is_the_closed_form():
     x, predictive = linear(slopes)
     goal = np.array([0.01])
     expected = -0.5 * np.log(1 + slopes**2) - math.log(0.01)
-    np.testing.assert_allclose(predictive.distance_from_goal(x[:, None], goal), expected, atol=0.02)
+    np.testing.assert_allclose(predictive.expected_nats_above_goal(x[:, None], goal), expected, atol=0.02)
 
 
 def test_what_is_within_its_goal_counts_no_more():
     x, predictive = linear([3.0])
-    assert predictive.distance_from_goal(x[:, None], np.array([2.0]))[0] == 0.0
-    both = predictive.distance_from_goal(np.stack([x, x], axis=1), np.array([2.0, 0.01]))
-    assert both[0] == pytest.approx(predictive.distance_from_goal(x[:, None], np.array([0.01]))[0])
+    assert predictive.expected_nats_above_goal(x[:, None], np.array([2.0]))[0] == 0.0
+    both = predictive.expected_nats_above_goal(np.stack([x, x], axis=1), np.array([2.0, 0.01]))
+    assert both[0] == pytest.approx(predictive.expected_nats_above_goal(x[:, None], np.array([0.01]))[0])
 
 
 def test_settings_are_valued_alike_in_blocks_and_alone(monkeypatch):
     slopes = np.linspace(0.1, 2.0, 7)
     x, together = linear(slopes)
-    whole = together.information(), together.distance_from_goal(x[:, None], np.array([0.1]))
+    whole = together.information(), together.expected_nats_above_goal(x[:, None], np.array([0.1]))
     monkeypatch.setattr("probewise.inquiry.any_settings.acquisition._BLOCK", 1)
     _, alone = linear(slopes)
     np.testing.assert_allclose(alone.information(), whole[0], rtol=1e-12)
-    np.testing.assert_allclose(alone.distance_from_goal(x[:, None], np.array([0.1])), whole[1], rtol=1e-12)
+    np.testing.assert_allclose(alone.expected_nats_above_goal(x[:, None], np.array([0.1])), whole[1], rtol=1e-12)

@@ -100,6 +100,6 @@ def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProb
     A problem with the same evidence; the problem itself if its sensor has no exchangeable Gaussians.
     """
     sensor = problem.model.sensor
-    if not (isinstance(sensor, GaussianMixtureSensor) and sensor.exchangeable and sensor.n_gaussians > 1):
+    if not (isinstance(sensor, GaussianMixtureSensor) and sensor.has_exchangeable_gaussians and sensor.n_gaussians > 1):
         return problem
     return FoldedProblem(problem, FoldedNormal(problem.model.n_params, sensor, near))

@@ -67,7 +67,7 @@ class CalibratedSensor(ABC):
 
     @property
     @abstractmethod
-    def form(self) -> str:
+    def ssf_in_words(self) -> str:
         """Description of its SSF, in words."""
 
     @property
@@ -81,7 +81,7 @@ class CalibratedSensor(ABC):
         return False
 
     @property
-    def exchangeable(self) -> bool:
+    def has_exchangeable_gaussians(self) -> bool:
         """Whether its Gaussians are exchangeable."""
         return False
 
@@ -95,7 +95,7 @@ class CalibratedSensor(ABC):
 
     @property
     def starts(self) -> FloatArray:
-        """One starting point: the centre of the prior, (1, n_params)."""
+        """One starting point: 0 in the coordinates z, the centre of the prior, (1, n_params)."""
         return np.zeros((1, self.n_params))
 
     @property
@@ -146,13 +146,13 @@ class CalibratedSensor(ABC):
 class GaussianMixtureSensor(CalibratedSensor):
     """A sensor whose SSF is a mixture: 6 n_gaussians + 1 coordinates, one less than the paper's parameters.
 
-    Only ratios of amplitudes matter. The evidence counts the permutations of `exchangeable` Gaussians.
+    Only ratios of amplitudes matter. The evidence counts the permutations of exchangeable Gaussians.
     """
 
     n_gaussians: int
     center: FloatArray
     factor: FloatArray
-    exchangeable: bool = True
+    has_exchangeable_gaussians: bool = True
     calibrated_height_mm: float | None = field(default=None, kw_only=True)
 
     @property
@@ -166,7 +166,7 @@ class GaussianMixtureSensor(CalibratedSensor):
         return self.n_gaussians
 
     @property
-    def form(self) -> str:
+    def ssf_in_words(self) -> str:
         """Number of Gaussians of the SSF, in words."""
         return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
 

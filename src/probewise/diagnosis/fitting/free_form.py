@@ -58,7 +58,7 @@ class FreeFormSensor(CalibratedSensor):
         return 2
 
     @property
-    def form(self) -> str:
+    def ssf_in_words(self) -> str:
         """Description of its SSF: "an SSF of free form"."""
         return "an SSF of free form"
 

@@ -67,12 +67,12 @@ class Null(Protocol):
         return 0
 
     @property
-    def form(self) -> str:
+    def ssf_in_words(self) -> str:
         """Description of its SSF, in words; by default empty."""
         return ""
 
     @property
-    def exchangeable(self) -> bool:
+    def has_exchangeable_gaussians(self) -> bool:
         """Whether permuting the Gaussians of its SSF changes neither prior nor predictions; by default False."""
         return False
 
@@ -119,4 +119,4 @@ class Null(Protocol):
 
 def log_multiplicity(null: Null) -> float:
     """Return log N! for N exchangeable Gaussians, whose permutations are modes of equal height; otherwise 0."""
-    return math.lgamma(null.n_gaussians + 1) if null.exchangeable else 0.0
+    return math.lgamma(null.n_gaussians + 1) if null.has_exchangeable_gaussians else 0.0

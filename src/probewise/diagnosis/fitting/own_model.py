@@ -82,7 +82,7 @@ class OwnModel(Null):
         """Map standard-normal coordinates to parameters, (n_samples, n_params) both."""
         return self.prior.from_unit_cube(ndtr(z))
 
-    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> _OwnChain:
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> _OwnModelWithEffects:
         """Return the model with effects; `n_nodes` is not used.
 
         Raises
@@ -93,11 +93,11 @@ class OwnModel(Null):
         wrong = [effect.name for effect in effects if not self.admits(effect)]
         if wrong:
             raise ParameterError("effects", wrong, "effects on the readings, or at Stage.SCENE on the parameters")
-        return _OwnChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
+        return _OwnModelWithEffects(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
 
 @dataclass(frozen=True)
-class _OwnChain:
+class _OwnModelWithEffects:
     """A user's simulator with effects, as a chain: parameters, readings, offsets, lag, saturation."""
 
     model: OwnModel

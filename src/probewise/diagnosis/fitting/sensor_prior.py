@@ -52,7 +52,9 @@ def sensor_from_posterior(
     return (
         FreeFormSensor(center, factor, calibrated_height_mm=height_mm)
         if free
-        else GaussianMixtureSensor(n_gaussians, center, factor, exchangeable=False, calibrated_height_mm=height_mm)
+        else GaussianMixtureSensor(
+            n_gaussians, center, factor, has_exchangeable_gaussians=False, calibrated_height_mm=height_mm
+        )
     )
 
 

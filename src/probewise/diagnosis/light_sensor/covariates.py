@@ -127,7 +127,7 @@ def _place_covariate_of_larger_change(change: FloatArray, plan: Plan) -> Covaria
 
 
 def _edge_distance_mm(plan: Plan) -> FloatArray:
-    """Return the distance of each row from the nearest described edge, mm; infinite if there is none."""
+    """Return the distance of each row from the nearest edge of its pattern, mm; infinite without a described edge."""
     out = np.full(len(plan), np.inf)
     for name, rows in plan.rows_by_pattern():
         if name in plan.patterns:

@@ -328,7 +328,10 @@ class Tail:
         return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.fisher_information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the second derivative of the log likelihood by log sigma, at least 0.2 per reading, (k,)."""
+        """Return minus the second derivative of the log likelihood by log sigma at its peak, (k,).
+
+        `sigma` must be the likeliest one; the result is at least 0.2 per reading.
+        """
         squares = (whitened / sigma) ** 2
         wide = self.wide_probability(squares)
         less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)

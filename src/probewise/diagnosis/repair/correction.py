@@ -41,8 +41,10 @@ class Correction:
         return bool(self.held_out.by_scan) and self.held_out.per_reading <= 0
 
 
-def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, scan: IntArray) -> Correction:
-    """Return the correction of a fit by one basis: of those within 5 nats of the best, that of the fewest columns.
+def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, part: IntArray) -> Correction:
+    """Return the correction of a fit by one basis, with its gain on held-out parts.
+
+    Of the bases whose evidence is within 5 nats of the best, that of the fewest columns is taken.
 
     Parameters
     ----------
@@ -50,7 +52,7 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
         The fit, and its linearisation under the noise model found.
     bases
         The candidate bases, as templates of several columns.
-    scan
+    part
         Number of the part of each usable row, to hold parts out in turn, (n_usable,).
     """
     scores = bases.log_bayes_factors(problem)[:, 0]
@@ -69,7 +71,7 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
             found, problem, plain, out
         )
 
-    return Correction(change, columns, mean_gain_over_parts(scan, gain_per_reading))
+    return Correction(change, columns, mean_gain_over_parts(part, gain_per_reading))
 
 
 def improvement_and_correction(

@@ -41,7 +41,7 @@ class HypothesisSamples:
 
     def averaged_over_orders(self, candidate: WeighedFit) -> ModelSamples:
         """Return posterior samples of a candidate's hypothesis, averaged over its probable numbers of Gaussians."""
-        key = candidate.names, candidate.found.model.sensor.exchangeable
+        key = candidate.names, candidate.found.model.sensor.has_exchangeable_gaussians
         if key not in self._known:
             alike = self._candidates_of_same_form(candidate, candidate.names)
             log_z = np.array([c.evidence[self.noise].log_z for c in alike])
@@ -88,11 +88,11 @@ class HypothesisSamples:
 
     def _candidates_of_same_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
         """List the refits of a combination whose SSF has the best candidate's form, one per number of Gaussians."""
-        form = best.found.model.sensor.exchangeable
+        form = best.found.model.sensor.has_exchangeable_gaussians
         return [
             c
             for (_, key), c in self.searched.evidences.fits.items()
-            if key == names and c.found.model.sensor.exchangeable == form
+            if key == names and c.found.model.sensor.has_exchangeable_gaussians == form
         ]
 
     def _draw_samples(self, candidate: WeighedFit) -> ModelSamples:

@@ -53,8 +53,8 @@ class ModelSamples:
 
     `theta` (n_samples, n_params) has columns `chain.names`; `noise_sd` (n_samples,) is that of one reading; `effects`
     names all effects, including noise effects, in the order of their columns; `n_gaussians` is that of the SSF, 0
-    without; `nuisance` names parameters of this recording only; `exchangeable`: whether permuting the Gaussians changes
-    nothing; `absent` marks, by effect, the samples without it, (n_samples,).
+    without; `nuisance` names parameters of this recording only; `has_exchangeable_gaussians`: whether permuting the
+    Gaussians changes nothing; `absent` marks, by effect, the samples without it, (n_samples,).
     """
 
     chain: Predictor
@@ -63,7 +63,7 @@ class ModelSamples:
     effects: tuple[str, ...]
     n_gaussians: int
     nuisance: tuple[str, ...] = ()
-    exchangeable: bool = True
+    has_exchangeable_gaussians: bool = True
     absent: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -81,7 +81,9 @@ class ModelSamples:
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Convert a light sensor's samples to a FittedSensor, as in sensor.json; `recording` is what was fitted."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
-        from_chain = gaussians_sorted_by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
+        from_chain = (
+            gaussians_sorted_by_mass(self.theta, self.n_gaussians) if self.has_exchangeable_gaussians else self.theta
+        )
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_median_step_mm(recording))
         field = posterior_mean_ssf_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable
@@ -178,7 +180,13 @@ def sample_model(
     else:
         noise_sd = _sd_without_rounding(noise_sd, rounding, law.n_kept)
     return ModelSamples(
-        chain, theta, noise_sd, names, null.n_gaussians, nuisance=null.nuisance_names, exchangeable=null.exchangeable
+        chain,
+        theta,
+        noise_sd,
+        names,
+        null.n_gaussians,
+        nuisance=null.nuisance_names,
+        has_exchangeable_gaussians=null.has_exchangeable_gaussians,
     )
 
 

@@ -84,7 +84,7 @@ class SearchState:
 
     @property
     def null(self) -> WeighedFit:
-        """The most probable candidate without effects."""
+        """The candidate without effects whose number of Gaussians has the largest evidence."""
         return max(self.nulls, key=lambda c: c.log_z)
 
     @property

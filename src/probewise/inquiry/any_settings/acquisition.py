@@ -77,7 +77,7 @@ class Predictive:
             given = (1 - share) * given + share * own
         return np.asarray(np.maximum(given - mixed, 0.0) / math.log(2))
 
-    def distance_from_goal(self, values: FloatArray, goal: FloatArray) -> FloatArray:
+    def expected_nats_above_goal(self, values: FloatArray, goal: FloatArray) -> FloatArray:
         """Return the expected distance from the goal after a reading, nats, (n_settings,).
 
         The distance is the sum over quantities of ln(sd / goal), 0 where an sd is below its goal.

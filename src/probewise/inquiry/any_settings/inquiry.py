@@ -276,7 +276,7 @@ class Inquiry(ShowsItself):
             return predictive.information()
         values, goal = theta[:, [self._posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
         now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
-        return np.asarray(now - predictive.distance_from_goal(values, np.array(goal)))
+        return np.asarray(now - predictive.expected_nats_above_goal(values, np.array(goal)))
 
     @property
     def _last_setting(self) -> Any:

@@ -32,7 +32,7 @@ from probewise.report.plots.canvas import (
     label_axes,
     new_figure,
 )
-from probewise.report.words import unit_of, value_and_interval_texts, value_with_error, without_unit
+from probewise.report.words import unit_of, value_and_interval_texts, value_with_error, words_without_unit
 
 Posterior: TypeAlias = NestedResult | Weighted
 
@@ -321,13 +321,13 @@ def _parameter_label(name: str) -> str:
     """Return a parameter's axis label: its name, its unit in brackets, an index as a subscript."""
     unit = unit_of(name)
     if unit:
-        return f"{without_unit(name)} ({unit})"
+        return f"{words_without_unit(name)} ({unit})"
     symbol = re.fullmatch(r"([A-Za-z])_(\w+)", name)
     if symbol:
         letter, index = symbol.groups()
         lowered = rf"${letter}_{{{index}}}$" if index.isdigit() else rf"${letter}_\mathrm{{{index}}}$"
         return f"{lowered} ({_SSF_UNITS[letter]})" if index.isdigit() and letter in _SSF_UNITS else lowered
-    return without_unit(name)
+    return words_without_unit(name)
 
 
 def _mass_per_nat(result: NestedResult) -> FloatArray:

@@ -157,7 +157,7 @@ def frequency_prior(frequencies: FloatArray) -> LogUniform:
 
 
 def sinusoid_modulation(table: RunTable, time_unit: str) -> Modulation:
-    """Return a sinusoid in time: a sin(2 pi hz t + phase), hz per unit of time, t from `time_origin`."""
+    """Return the modulation a sin(2 pi hz t + phase), all three free; hz per unit of time, t from `time_origin`."""
     origin = time_origin(table)
     frequencies = trial_frequencies(table.time_s, table.rows_by_scan())
 

@@ -141,7 +141,7 @@ class _Integration:
         return at
 
     def _delayed_column(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
-        """Return a column at earlier times `t`, (n_samples, n_runs): held or linear; constant before a run's start."""
+        """Return a column at times `t`, (n_samples, n_runs), held or linear as the law says; constant before a run."""
         law = self.kind.law
         assert law is not None
         column = self.columns[name]

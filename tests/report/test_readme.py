@@ -83,7 +83,7 @@ def test_the_readme_quotes_what_the_command_says_of_the_pendulum(tmp_path):
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
 def test_pictures_that_the_front_pages_show_are_there(page):
     shown = re.findall(r"(?:!\[.*?\]\(|```\{figure\} )([^)\s]+)", (ROOT / page).read_text(encoding="utf-8"))
-    assert len(shown) == (3 if page == "README.md" else 2)
+    assert len(shown) == 3
     assert all(((ROOT / page).parent / name).is_file() for name in shown)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -61,9 +62,24 @@ def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
     )
 
 
+def are_names_right(result: Result, names: Sequence[str], *, noise: bool = True) -> bool:
+    """Return whether a hypothesis is right: its names match those of the effects or their aliases, or it is an alias.
+
+    `noise`: whether noise effects have to be named. A hypothesis is an alias if the case holds its loss on the
+    noise-free readings ("alternative_nats", by names joined with "+") and that is below `HONEST_NATS`.
+    """
+    if names_match(names, right_names_of_each_effect(result, merged=True, noise=noise)):
+        return True
+    nats = result.get("alternative_nats", {}).get("+".join(sorted(set(names) - NOISE)), math.inf)
+    due = set(result["truth"]) & NOISE if noise else set()
+    return bool(nats < HONEST_NATS) and set(names) & NOISE == due
+
+
 def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
     """Return whether the credible set holds the truth or, if `merged`, aliases of it."""
-    wanted = right_names_of_each_effect(result, merged=merged)
+    if merged:
+        return any(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
+    wanted = right_names_of_each_effect(result, merged=False)
     return any(names_match(names_in_label(label), wanted) for label in result["credible_set"])
 
 
@@ -118,7 +134,7 @@ def is_leading_name_right(result: Result) -> bool:
         if key or not due:
             joined[key] = joined.get(key, 0.0) + p
     first = max(joined, key=lambda key: joined[key], default=())
-    return names_match(first, right_names_of_each_effect(result, merged=True, noise=False))
+    return are_names_right(result, first, noise=False)
 
 
 def leading_probability_and_correctness(result: Result) -> tuple[float, bool]:

@@ -23,6 +23,7 @@ from probewise.challenge.scoring import (
     NOISE,
     Result,
     acts_on_mean,
+    are_names_right,
     credible_set_holds_truth,
     has_false_extra_effect,
     is_distinguishable_from_ssf,
@@ -194,10 +195,7 @@ def _rows_on_stated_probabilities(done: list[Result]) -> list[ScoreRow]:
 
 def credible_set_size_with_aliases_merged(result: Result) -> float:
     """Count the hypotheses of a credible set; the right one and its aliases count as one."""
-    right = sum(
-        names_match(names_in_label(label), right_names_of_each_effect(result, merged=True))
-        for label in result["credible_set"]
-    )
+    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
     return float(len(result["credible_set"]) - max(right - 1, 0))
 
 

@@ -74,6 +74,16 @@ def test_what_explains_the_same_within_three_nats_is_right_too():
     assert [_row([r], "wrong name stated above .9").found.value for r in told] == [0.0, 1.0]
 
 
+def test_other_words_for_the_same_readings_are_right():
+    """Within three nats of the concealed effects, whatever the names; noise beside them still counts."""
+    said = ["limit:v"]
+    same, apart = (_single("saturation", said=said, alternative_nats={"limit:v": nats}) for nats in (0.4, 3.5))
+    assert [_row([r], "right name and target first, lambda 12").found.value for r in (same, apart)] == [1.0, 0.0]
+    assert [_row([r], "wrong name stated above .9").found.value for r in (same, apart)] == [0.0, 1.0]
+    both = {**same, "credible_set": ["saturation", "limit:v", "limit:v+outliers"]}
+    assert _row([both], "size of the credible set, the truth and its aliases as one, lambda 12").found.value == 2.0
+
+
 def test_an_oracle_tells_two_that_are_eight_nats_apart_as_often_as_the_normal_law_says():
     """Distance 4 sds: Phi(2) = 0.977. An alias, within three nats, does not count; cases without rivals have no row."""
     own = _hidden("lag") | {"cosines": {"delay": 1.0}, "rival_nats": {"delay": 0.1, "settling": 8.0}}

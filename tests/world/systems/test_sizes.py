@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from probewise.world.systems import KINDS, cases, draw_system, draw_system_case, system_stratum_of, truth_json
+from probewise.world.systems import (
+    KINDS,
+    cases,
+    draw_system,
+    draw_system_case,
+    nats_of_alternative,
+    system_stratum_of,
+    truth_json,
+)
 from probewise.world.systems.cases import _draw_effect_of_size
 from probewise.world.systems.rivals import rivals_with_nats
 from probewise.world.systems.strata import SYSTEMS_WHEEL
@@ -61,6 +69,23 @@ def test_an_offset_that_depends_on_a_column_is_a_sensitivity_by_another_name():
     assert all(nats < 12 for nats in rivals.values())
     found = replace(effect, rivals={"drifts:zero_kpa": 2.9, "lag": 3.1})
     assert found.aliases == {"drifts:zero_kpa": 2.9}
+
+
+@pytest.mark.parametrize("number", [808, 1128])
+def test_the_concealed_effects_explain_their_readings_and_an_alias_of_one_beside_the_other_does(number):
+    """A pair: its own names lose nothing; one alone loses most of half its squared size."""
+    case = draw_system_case(251203, number)
+    own = [effect.name for effect in case.effects]
+    assert nats_of_alternative(case, own) < 0.1
+    assert nats_of_alternative(case, own[:1]) > 30.0
+    for effect, other in zip(case.effects, reversed(own), strict=True):
+        for name in list(effect.aliases)[:1]:
+            assert nats_of_alternative(case, [name, other]) == pytest.approx(effect.aliases[name], abs=0.1)
+
+
+@pytest.mark.parametrize("names", [[], ["lag", "delay", "settling"], ["outliers"], ["limit:elsewhere"]])
+def test_what_this_system_does_not_have_explains_nothing(names):
+    assert nats_of_alternative(draw_system_case(251203, 808), names) == np.inf
 
 
 def test_half_of_the_wheel_is_clean():

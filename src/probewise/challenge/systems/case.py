@@ -6,17 +6,28 @@ import math
 import tempfile
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 from probewise.challenge.case import Task, statements_to_score
 from probewise.challenge.coverage import effect_truths_and_intervals
+from probewise.challenge.scoring import NOISE, names_in_label
 from probewise.challenge.systems.held_out import log_densities_of_runs
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.systems import read_run_table, read_simulator
-from probewise.world.systems import SystemCase, SystemEffect, draw_system_case, system_stratum_of, write_system_case
+from probewise.world.systems import (
+    SystemCase,
+    SystemEffect,
+    draw_system_case,
+    nats_of_alternative,
+    system_stratum_of,
+    write_system_case,
+)
+
+_LIKELY = 0.05
 
 
 def run_system_case(task: Task) -> dict[str, Any]:
@@ -96,13 +107,31 @@ def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
     found = {effect.name: effect for effect in diagnosis.effects}
     named = [e for e in case.effects if e.name in diagnosis.combination and e.name in found]
     return {
-        **statements_to_score(diagnosis),
+        **(said := statements_to_score(diagnosis)),
+        "alternative_nats": nats_of_alternatives(case, said),
         "where": [place.covariate for place in diagnosis.where],
         "parameters": {e.name: effect_truths_and_intervals(e.parameters, found[e.name]) for e in named},
         "formula": _has_formula(diagnosis),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, rng=later),
         "cpu_s": cpu_s,
     }
+
+
+def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any]) -> dict[str, float]:
+    """Return how much worse what was said in other words explains a case, by its names joined with "+".
+
+    Said are the hypotheses of more than 5 % and those of the credible set (`statements_to_score`), without effects on
+    the noise. The loss is that of `world.systems.nats_of_alternative`; infinite ones are left out, and so are all
+    where an effect is outside the vocabulary.
+    """
+    if not case.effects or not all(effect.in_vocabulary for effect in case.effects):
+        return {}
+    likely = [tuple(names) for names, probability in said["hypotheses"] if probability > _LIKELY]
+    labels = {*likely, *map(names_in_label, said["credible_set"])}
+    own = tuple(sorted(effect.name for effect in case.effects))
+    others = {tuple(sorted(set(names) - NOISE - {"unknown"})) for names in labels} - {(), own}
+    nats = {"+".join(names): nats_of_alternative(case, names) for names in sorted(others)}
+    return {label: loss for label, loss in nats.items() if math.isfinite(loss)}
 
 
 def _has_formula(diagnosis: Diagnosis) -> bool:

@@ -13,6 +13,7 @@ from probewise.challenge.oracle_baseline import oracle_credible_set_size, oracle
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     Result,
+    are_names_right,
     credible_set_holds_truth,
     is_leading_name_right,
     is_out_of_vocabulary,
@@ -125,9 +126,7 @@ def _effects_with_rivals(singles: Sequence[Result]) -> list[Result]:
 
 def _is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong effect, not an alias of the truth, has a probability above 0.9."""
-    return is_confidently_wrong(result) and not names_match(
-        leading_hypothesis(result, clean=True)[0], right_names_of_each_effect(result, merged=True)
-    )
+    return is_confidently_wrong(result) and not are_names_right(result, leading_hypothesis(result, clean=True)[0])
 
 
 def _rows_on_intervals(done: list[Result]) -> list[ScoreRow]:

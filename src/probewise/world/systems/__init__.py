@@ -4,6 +4,7 @@ It produces what a user would provide (a table and a short simulator file) and, 
 the integration of laws, the effects and the fits a second time.
 """
 
+from probewise.world.systems.alternatives import nats_of_alternative
 from probewise.world.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, draw_system_case
 from probewise.world.systems.files import simulator_file_text, truth_json, write_system_case
 from probewise.world.systems.noise import OTHER_NOISE
@@ -19,6 +20,7 @@ __all__ = [
     "SystemEffect",
     "draw_system",
     "draw_system_case",
+    "nats_of_alternative",
     "right_predictions",
     "simulator_file_text",
     "system_stratum_of",

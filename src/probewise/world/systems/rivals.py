@@ -43,7 +43,9 @@ def _has_costly_fit(form: Form) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _StartOfFit:
+class StartOfFit:
+    """Where the fit of a form begins: start values of its parameters, and the linearised loss there, nats."""
+
     form: Form
     start: dict[str, float]
     nats: float
@@ -76,8 +78,7 @@ def rivals_with_nats(
     -------
     Loss of log likelihood in nats by name, for those below 12, the smallest first; below TELLING_NATS (3): aliases.
     """
-    left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
-    near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], left, fitted, model)
+    near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], target, fitted, model)
     found: dict[str, float] = {}
     hard = any(_has_costly_fit(b.form) for b in model.added)
     for candidate in near:
@@ -111,10 +112,24 @@ def rivals_with_nats(
 
 
 def _best_by_linearisation(
-    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
-) -> list[_StartOfFit]:
+    true: TrueSystem, forms: Sequence[Form], target: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
+) -> list[StartOfFit]:
     """Return up to six candidates for full fits, smallest linearised loss first, with at most two starts per form."""
+    left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
     size = float(left @ left)
+    near = [
+        candidate
+        for candidate in linearised_starts(true, forms, target, fitted, model)
+        if candidate.nats < _NEAR or 1 - 2 * candidate.nats / size > _COSINE**2
+    ]
+    return sorted(near, key=lambda c: c.nats)[:_MOST_FITS]
+
+
+def linearised_starts(
+    true: TrueSystem, forms: Sequence[Form], target: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
+) -> list[StartOfFit]:
+    """Return up to two starts of each form for a fit beside `model`: those of the smallest linearised loss."""
+    left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
     out = []
     for form, changes in templates_of(true, forms, fitted, model).items():
         own = []
@@ -130,10 +145,9 @@ def _best_by_linearisation(
             amounts, *_ = np.linalg.lstsq(columns, left, rcond=1e-9)
             rest = left - columns @ amounts
             nats = 0.5 * float(rest @ rest)
-            if nats < _NEAR or 1 - 2 * nats / size > _COSINE**2:
-                own.append(_StartOfFit(form, form.start_values(group, np.asarray(amounts, dtype=np.float64)), nats))
+            own.append(StartOfFit(form, form.start_values(group, np.asarray(amounts, dtype=np.float64)), nats))
         out += sorted(own, key=lambda c: c.nats)[:2]
-    return sorted(out, key=lambda c: c.nats)[:_MOST_FITS]
+    return out
 
 
 def templates_of(

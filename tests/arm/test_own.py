@@ -173,6 +173,26 @@ def test_one_that_is_a_context_manager_is_entered_and_left_as_such():
     assert own.closed == 0
 
 
+def test_what_gave_the_instrument_on_entering_is_kept_until_the_end_and_then_left():
+    """A function with `yield`, once forgotten, would run to its end and switch off before the first reading."""
+    log = []
+
+    @contextlib.contextmanager
+    def connect():
+        try:
+            yield Own(close=lambda: log.append("closed"))
+        finally:
+            log.append("off")
+
+    with OwnInstrument(connect) as arm:
+        assert arm.measure(HERE).value == 41.5
+        assert log == []
+    assert log == ["off"]
+    with pytest.raises(ValueError, match="x"), OwnInstrument(connect):
+        raise ValueError("x")
+    assert log == ["off", "off"]
+
+
 def test_an_error_in_closing_does_not_hide_what_went_wrong_before():
     def stuck():
         raise OSError("the port is gone")

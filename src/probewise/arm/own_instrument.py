@@ -67,6 +67,7 @@ class OwnInstrument:
         require_callable("connect", connect, "a function without arguments that returns an object with measure(pose)")
         self._connect, self.source, self._start_s, self._clock = connect, source, start_s, clock
         self._own: Any = None
+        self._entered: Any = None  # what is left or closed at the end
         self.mounted_rad = 0.0
         self._zero_s = clock.monotonic() - start_s
         self._speed = Speed()
@@ -91,10 +92,11 @@ class OwnInstrument:
         """Connect; an object without `measure` is closed and refused."""
         with self._errors_located("connect"):
             own = self._connect() if self._own is None else self._own
+            manager = own
             if hasattr(own, "__enter__") and hasattr(own, "__exit__"):
                 entered = own.__enter__()
                 own = entered if hasattr(entered, "measure") else own
-        self._own = own
+        self._own, self._entered = own, manager
         try:
             with self._errors_located(""):
                 require_measures("what connect() returned", own)
@@ -108,7 +110,8 @@ class OwnInstrument:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Exit or close the connected object, once; if an exception is pending, errors here become warnings."""
-        own, self._own = self._own, None
+        own = self._own if self._entered is None else self._entered
+        self._own = self._entered = None
         leave = getattr(own, "__exit__", None)
         close = getattr(own, "close", None)
         try:

@@ -166,6 +166,16 @@ def test_a_mixture_takes_each_hypothesis_from_its_own_kind():
         RegionsOfMixedKinds(np.array([0, 1]), (disc, half))
 
 
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_polygon_has_one_closed_outline_whichever_way_its_vertices_go(way):
+    vertices = np.array([[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]])[::way]
+    for region in (PolygonRegion.from_vertices(vertices[None]), PolygonRegion.from_even_odd_vertices(vertices)):
+        (trace,) = outlines(region)
+        np.testing.assert_array_equal(trace[0], trace[-1])
+        assert {tuple(place) for place in trace.tolist()} == {tuple(place) for place in vertices.tolist()}
+        assert len(trace) == 5
+
+
 def test_outlines_lie_on_the_edge():
     ellipse = EllipseRegion(np.array([[1.0, 2.0]]), np.array([[5.0, 3.0]]), np.array([0.4]))
     square = PolygonRegion.from_vertices(np.array([[[0.0, 0], [4, 0], [4, 4], [0, 4]]]))

@@ -130,6 +130,8 @@ def _outlines_of_polygon(region: PolygonRegion, *, n_vertices: int = 96) -> list
 
 
 def _outline_of_edges(edges: FloatArray) -> FloatArray:
+    if np.array_equal(edges[1, 1], edges[0, 0]):  # given clockwise: each edge was turned round in its place
+        edges = edges[::-1]
     points = [edges[0, 0]]
     for start, end in edges:
         if not np.array_equal(points[-1], start):

@@ -55,6 +55,11 @@ def test_a_lamp_that_begins_as_calibrated_may_fade():
     np.testing.assert_allclose(faded[-1], 50.0 * (1 - 0.5 * (1 - np.exp(-56.0 / 800.0))))
 
 
+@pytest.mark.parametrize(("tau_s", "told"), [(10.0, "falls by 10 % in the end, 10 % in the"), (6000.0, "0.1 % in the")])
+def test_a_lamp_never_fades_by_more_in_a_minute_than_in_the_end(tau_s, told):
+    assert told in GainLoss().sentence(np.array([-0.1, tau_s]), np.zeros(2))
+
+
 def test_the_ways_of_one_name_share_what_it_has():
     experiment = replace(experiment_of(REFERENCE), trust=0.9)
     shares: dict[str, float] = {}

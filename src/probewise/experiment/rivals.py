@@ -147,8 +147,9 @@ class GainLoss(GainDrift):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Describe the change of the signal in percent, and its speed."""
         way = "rises" if mean[0] > 0 else "falls"
+        in_the_end = 100 * abs(mean[0])
         return (
-            f"the signal {way} by {100 * abs(mean[0]):.2g} % in the end, {100 * abs(mean[0]) / mean[1] * 60:.2g} % in "
+            f"the signal {way} by {in_the_end:.2g} % in the end, {-in_the_end * math.expm1(-60 / mean[1]):.2g} % in "
             "the first minute of this: the lamp or its battery changes"
         )
 

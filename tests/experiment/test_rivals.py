@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -237,6 +238,16 @@ def test_what_leads_is_said_with_its_numbers(stepped):
     assert said.leading == "backlash"
     assert said.credible_set == ("backlash",)
     assert "gear play of" in said.sentence
+
+
+def test_a_step_of_the_light_is_told_by_the_clock_of_the_readings(stepped):
+    info = leading(stepped[-1], "ambient_step")
+    early, late = (
+        left_out_after_step(replace(info, pace=replace(info.pace, start_s=start_s)), 0.9).sentence
+        for start_s in (0.0, 5000.0)
+    )
+    at_s = [float(re.search(r" at (\d+) ", said)[1]) for said in (early, late)]
+    assert at_s[1] - at_s[0] == pytest.approx(5000.0, abs=1.0)
 
 
 def test_a_name_that_the_warier_odds_leave_open_is_in_the_credible_set(stepped):

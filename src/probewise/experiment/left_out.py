@@ -96,7 +96,9 @@ def _effect_sentence(last: Step, name: str) -> str:
     mean, sd = (
         theta_in_seconds_of(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd())
     )
-    return kind.effect.sentence(mean, sd)
+    # A change is told by the clock of the readings, while paced time begins at the first of them.
+    is_a_time = np.array([parameter == "at_s" for parameter in kind.effect.prior.names])
+    return kind.effect.sentence(mean + last.pace.start_s * is_a_time, sd)
 
 
 def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:

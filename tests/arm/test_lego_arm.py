@@ -213,6 +213,16 @@ def test_a_rehearsal_of_homing_goes_to_the_stops_first():
     assert {line.split()[0] for line in said[3:6]} == {"base", "shoulder", "elbow"}
 
 
+def test_a_stop_well_beyond_a_limit_is_found_from_the_other_limit(paper_brick, clock):
+    geometry = dataclasses.replace(SHIPPED, base=dataclasses.replace(SHIPPED.base, stop_rad=math.radians(60.0)))
+    motor = paper_brick.motors[0]
+    motor.position = motor.target = round(21 * (-190.0 + 90.0))
+    motor.blocked_at = round(21 * (60.0 + 90.0) + 21 * 0.3 / 2)  # the motor takes up half the play
+    with BrickMachine(Brick(Link(paper_brick, clock=clock), clock=clock), geometry) as machine:
+        machine.find_stop(0, 1)
+        assert machine.limits.last_counts[0] == motor.position == motor.blocked_at
+
+
 def test_a_joint_can_be_turned_alone_as_far_as_the_guard_allows(bench):
     with bench.arm as arm:
         start = arm.angles_rad

@@ -75,9 +75,11 @@ class BrickMachine:
         mechanics = self._joints[joint]
         motor = self._motors[joint]
         with_gears: Side = side if mechanics.gear_ratio > 0 else -side
-        range_counts = (mechanics.high_rad - mechanics.low_rad) * abs(mechanics.counts_per_rad)
-        found = motor.find_stop(with_gears, round(range_counts) + 2 * ROOM_COUNTS)
         at_stop = mechanics.stop_counts
+        far_limit_rad = mechanics.low_rad if side > 0 else mechanics.high_rad
+        range_counts = (mechanics.high_rad - mechanics.low_rad) * abs(mechanics.counts_per_rad)
+        way_counts = abs(at_stop - mechanics.counts_at(far_limit_rad))  # more, if the stop is well beyond its limit
+        found = motor.find_stop(with_gears, max(round(range_counts) + 2 * ROOM_COUNTS, way_counts + ROOM_COUNTS))
         self._zeros[joint] = found - at_stop
         self.limits.record_present_count(joint, at_stop)
 

@@ -140,6 +140,21 @@ def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
     assert again.count("[accuracy]") == 1
 
 
+@pytest.mark.parametrize(
+    ("line", "instead", "name"),
+    [
+        ("upper_mm = 350", '"upper_mm" = 350', "links.upper_mm"),
+        ('[joints.base]\nport = "A"\n', '[joints]\nbase = { port = "A", home_deg = -90 }\n', "joints.base.home_deg"),
+    ],
+)
+def test_a_number_that_cannot_be_replaced_in_its_file_is_refused(line, instead, name):
+    """It would stay, beside the accuracy of the fitted one."""
+    text = shipped_geometry_path().read_text(encoding="utf-8")
+    assert line in text
+    with pytest.raises(ParameterError, match=rf"{name} is 'written in another way'; allowed: .* on a line of its own"):
+        text_with_fitted_values(text.replace(line, instead, 1), GEOMETRY)
+
+
 def test_marks_come_back_from_their_file(tmp_path):
     marks = [TouchedMark((0.1, -0.2, 0.3), (100.0, 60.0, 32.0)), TouchedMark((0.4, 0.5, -0.6), (520.0, 60.0, math.nan))]
     write_marks(marks, tmp_path / "m.csv")

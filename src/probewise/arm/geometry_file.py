@@ -99,6 +99,11 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
         Text of the file before the fit; its comments are kept.
     geometry
         The fitted geometry.
+
+    Raises
+    ------
+    ParameterError
+        If a number is not on a line of its own below the header of its table, as in an inline table: it would stay.
     """
     numbers: dict[tuple[str, str], float] = {
         ("base", "x_mm"): geometry.axis_mm[0],
@@ -113,7 +118,7 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
         numbers |= {
             (f"joints.{name}", f"{key}_deg"): math.degrees(angle) for key, angle in angles.items() if angle is not None
         }
-    lines, table = [], ""
+    lines, table, left = [], "", dict.fromkeys(numbers)
     for line in text.splitlines():
         if header := _HEADER.match(line):
             table = header[1]
@@ -122,7 +127,12 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
             continue
         if entry and (table, entry[2]) in numbers:
             line = f"{entry[1]}{numbers[table, entry[2]]:.4f}{entry[4]}"
+            left.pop((table, entry[2]), None)
         lines.append(line)
+    if left:
+        table, key = next(iter(left))
+        allowed = f'"{key} = NUMBER" on a line of its own below [{table}], so that the fitted number can replace it'
+        raise ParameterError(f"{table}.{key}", "written in another way", allowed)
     known = geometry.accuracy
     if known is not None:
         lines += [

@@ -376,6 +376,26 @@ def test_a_repaired_sensor_holds_the_effect_that_leads(sensor, stepped):
     assert any("dropouts" in note for note in told.notes)
 
 
+def test_an_effect_that_a_diagnosis_left_open_is_held_once_a_run_finds_it(sensor, stepped):
+    """The run's model is the most probable combination of effects, which had the response bent but no saturation."""
+    level, softness = np.full(500, 90.0), np.full(500, 1.0)
+    few = np.arange(500) % 5 > 0
+    open_ = replace(
+        sensor,
+        names=(*sensor.names, "nonlinearity.gamma", "saturation.level", "saturation.softness"),
+        samples=np.column_stack([sensor.samples, np.full(500, 1.1), level, softness]),
+        effects=("nonlinearity", "saturation"),
+        absent={"saturation": few, "nonlinearity": ~few},
+    )
+    info = leading(stepped[-1], "saturation")
+    mended = repaired_sensor(open_, info, rng=np.random.default_rng(1))
+    assert mended.effects == ("nonlinearity", "saturation")
+    assert not mended.absent
+    found = info.kinds.particles[[kind.left_out for kind in info.kinds.kinds].index("saturation")].weighted
+    assert mended.mean()["saturation.level"] == pytest.approx(found.mean()[-2], rel=0.1)
+    assert type(sensor).from_json(mended.to_json()).effects == mended.effects
+
+
 def test_an_effect_found_in_a_run_counts_from_0_beside_one_from_far_away(sensor, stepped):
     """A bright margin of the run's field: over black it adds its gradients times the run's own places."""
     far = replace(

@@ -105,7 +105,9 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
     """Return the sensor with the effect that a run found, with samples of its parameters after step `last`.
 
     If no effect has a probability of one half or more, the sensor is returned as it is. A noise effect, an effect in
-    the time of the run, or an effect that the sensor has already, is only mentioned in a note.
+    the time of the run, or an effect that the sensor has already, is only mentioned in a note. Where a diagnosis left
+    it open whether the sensor has this effect, the run's answer counts: of the combinations of effects, the most
+    probable one is kept, with the effect.
     """
     name, p = max(last.left_out.items(), key=lambda item: item[1])
     if not name or p < _NAMED:
@@ -114,6 +116,8 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
     best = max(kinds, key=lambda k: last.kinds.log_odds[k])
     effect = last.kinds.kinds[best].effect
     note = f"a run that explored with it found {spoken_name(name)} (probability {p:.3g})"
+    if name in sensor.absent and effect is not None and name not in _OF_THE_RUN:
+        sensor = sensor.with_leading_effects()  # the run's own model, which did not hold it
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
     # What the sensor knew keeps its origins; the effect that was found has none, since a run's model counts from 0.

@@ -299,13 +299,14 @@ def test_only_places_within_reach_are_measured(small):
     assert arm.reachable(np.array([[p.x_mm, p.y_mm] for p in arm.poses])).all()
 
 
-def test_a_reading_whose_true_place_is_just_beyond_the_reach_ends_no_run(small):
+@pytest.mark.parametrize("beyond_s", [np.nan, np.inf])
+def test_a_reading_whose_true_place_is_just_beyond_the_reach_ends_no_run(small, beyond_s):
     class Own:
         def reachable(self, places_mm):
             return places_mm[:, 0] >= 100.0
 
         def travel_s(self, start, places_mm):
-            return np.where(self.reachable(places_mm), 2.0, np.nan)
+            return np.where(self.reachable(places_mm), 2.0, beyond_s)
 
         def measure(self, pose):
             return {"value": 10.0, "x_mm": 99.9}

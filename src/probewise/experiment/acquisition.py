@@ -81,7 +81,7 @@ def predict_readings_and_utilities(
         here = np.array([[at.pose.x_mm, at.pose.y_mm]])
         read_s = float(field.travel_s(at.pose, here)[0])
         travel_s = field.travel_s(at.pose, experiment.grid.places_mm)
-        if math.isnan(read_s):  # the true place, just beyond the reach
+        if not math.isfinite(read_s):  # the true place, just beyond the reach
             read_s = float(travel_s[field.reachable].min())
         cost_s = designs.cost_s(travel_s, read_s)
     plan = designs.plan(PATTERN, time_s=0.0 if at is None else at.time_s)

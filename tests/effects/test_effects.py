@@ -163,6 +163,13 @@ def test_a_spot_shows_alike_on_its_line_however_far_beside_it_lies():
     np.testing.assert_allclose(readings, np.repeat(readings[:1], 5, axis=0), atol=1e-12)
 
 
+def test_a_spot_without_a_radius_has_no_density():
+    prior = VOCABULARY["glint"].for_extent(EXTENT).prior
+    theta = np.array([[1.0, 5.0, 0.0, 8.0], [1.0, 5.0, 0.0, 0.0], [1.0, 5.0, 0.0, -8.0]])
+    assert np.isfinite(prior.log_prob(theta)[0])
+    np.testing.assert_array_equal(prior.log_prob(theta)[1:], -np.inf)
+
+
 def test_a_heavy_tail_is_exact_at_both_ends():
     prior = HeavyTailedPrior(0.5)
     u = np.array([1e-9, 1e-3, 0.2, 0.5, 0.8, 0.999, 1 - 1e-9])

@@ -128,10 +128,12 @@ class PatchPrior:
         return self._prior_seen_by_scan.to_unit_cube(self._parameters_seen_by_scan(theta))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the natural log of the density, (n_samples, 4) -> (n_samples,)."""
-        shown = self._parameters_seen_by_scan(theta)
+        """Return the natural log of the density, (n_samples, 4) -> (n_samples,); -inf for a radius of 0 or below."""
+        possible = theta[:, 3] > 0
+        shown = self._parameters_seen_by_scan(np.where(possible[:, None], theta, 1.0))
         # d(on_line, beside) / d(height, y) = exp(-beside^2 / 2) / r
-        return self._prior_seen_by_scan.log_prob(shown) - 0.5 * shown[:, 2] ** 2 - np.log(shown[:, 3])
+        log_density = self._prior_seen_by_scan.log_prob(shown) - 0.5 * shown[:, 2] ** 2 - np.log(shown[:, 3])
+        return np.where(possible, log_density, -np.inf)
 
     def _parameters_seen_by_scan(self, theta: FloatArray) -> FloatArray:
         """Convert height, x, y, r to height on the line, place along it, distance in radii, radius: (n_samples, 4)."""

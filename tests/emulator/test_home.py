@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from probewise.emulator import (
     set_up_bench,
     shipped_geometry_path,
 )
+from probewise.errors import FileError
 from probewise.recordings import Disc
 from probewise.world.shipped import true_world
 
@@ -89,6 +91,20 @@ def test_an_arm_with_stops_comes_home_from_wherever_it_was(clock: VirtualClock, 
     with connected(bench, clock, geometry) as lego:  # the counters on the brick are those of home
         truly = [math.degrees(joint.angle_rad) for joint in bench.arm.joints]
         np.testing.assert_allclose(np.degrees(lego.angles_rad), truly, atol=HOME_DEG)
+
+
+@pytest.mark.parametrize("stop_deg", [-190.0, -205.0, 25.0])
+def test_a_stop_stands_where_the_arm_s_file_has_it(tmp_path: Path, clock: VirtualClock, stop_deg: float) -> None:
+    file = tmp_path / "arm.toml"
+    text = shipped_geometry_path().read_text(encoding="utf-8")
+    file.write_text(text.replace("play_deg = 0.3", f"play_deg = 0.3\nstop_deg = {stop_deg}", 1), encoding="utf-8")
+    bench = set_up_bench(read_geometry(file), true_world("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1)
+    with connected(bench, clock, arm.read_geometry(file)) as lego:
+        lego.home()
+        assert math.degrees(bench.arm.joints[0].angle_rad) == pytest.approx(-90.0, abs=HOME_DEG)
+    file.write_text(file.read_text(encoding="utf-8").replace(f"= {stop_deg}", "= 0"), encoding="utf-8")
+    with pytest.raises(FileError, match=r"base.stop_deg is 0; allowed: at or beyond a limit, -190 or 10"):
+        read_geometry(file)
 
 
 def test_joints_without_a_stop_keep_their_counters(clock: VirtualClock) -> None:

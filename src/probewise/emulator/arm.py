@@ -9,7 +9,7 @@ from typing import Self
 from probewise.emulator.geometry import Geometry, JointParameters
 from probewise.emulator.motor import Motor, MotorParameters
 
-_BEYOND_LIMITS_DEG = 3.0  # a joint's mechanical stops lie this far outside the file's limits
+_BEYOND_LIMITS_DEG = 3.0  # a mechanical stop that the file does not give lies this far outside the limit
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,12 @@ class Joint:
     @classmethod
     def create_at_home(cls, numbers: JointParameters) -> Self:
         """Make a joint at its home position, with the motor at 0."""
-        ends = sorted(
-            (angle_deg - numbers.home_deg) * numbers.gear_ratio
-            for angle_deg in (numbers.low_deg - _BEYOND_LIMITS_DEG, numbers.high_deg + _BEYOND_LIMITS_DEG)
-        )
+        low_deg, high_deg = numbers.low_deg - _BEYOND_LIMITS_DEG, numbers.high_deg + _BEYOND_LIMITS_DEG
+        if numbers.stop_deg is not None and numbers.stop_deg >= numbers.high_deg:
+            high_deg = numbers.stop_deg
+        elif numbers.stop_deg is not None:
+            low_deg = numbers.stop_deg
+        ends = sorted((angle_deg - numbers.home_deg) * numbers.gear_ratio for angle_deg in (low_deg, high_deg))
         play_deg = numbers.play_deg * abs(numbers.gear_ratio)
         # The stops are the joint's: its motor turns half the backlash further.
         stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)

@@ -20,7 +20,7 @@ LARGEST = 1e6
 
 @dataclass(frozen=True)
 class JointParameters:
-    """One joint: motor port, gear ratio (motor turns per joint turn), angle at count 0, limits, backlash."""
+    """One joint: motor port, gear ratio (motor turns per joint turn), angle at count 0, limits, backlash, stop."""
 
     port: str
     gear_ratio: float
@@ -28,6 +28,7 @@ class JointParameters:
     low_deg: float
     high_deg: float
     play_deg: float
+    stop_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,11 @@ def read_geometry(path: Path) -> Geometry:
         home, low, high, play = (number("joints", name, f"{key}_deg") for key in ("home", "low", "high", "play"))
         if not low <= home <= high:
             raise FileError(path, f"joints.{name}.home_deg is {home:g}", f"within its limits, {low:g} to {high:g}")
-        return JointParameters(port, ratio, home, low, high, play)
+        stop = number("joints", name, "stop_deg") if "stop_deg" in table["joints"][name] else None
+        if stop is not None and low < stop < high:
+            allowed = f"at or beyond a limit, {low:g} or {high:g}"
+            raise FileError(path, f"joints.{name}.stop_deg is {stop:g}", allowed)
+        return JointParameters(port, ratio, home, low, high, play, stop)
 
     elbow = _value_in_file(path, table, ("links", "elbow"))
     if elbow not in ("absolute", "relative"):

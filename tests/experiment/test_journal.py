@@ -75,6 +75,17 @@ def test_whatever_byte_the_writer_is_killed_at_no_whole_reading_is_lost(tmp_path
         assert kept == 2 or journal.entries[2].summary is None
 
 
+def test_a_reading_survives_whatever_its_covariates_are_called(tmp_path):
+    known = Reading(10.0, Pose(1.0, 2.0), 3.0, {"gain": 2.0, "belief": 0.5})
+    with JournalWriter.begin(tmp_path / "j", SETTINGS) as writer:
+        writer.write_reading(1, known)
+        writer.write_summary(summary(1))
+    whole = (tmp_path / "j").read_bytes()
+    for n_bytes in range(whole.rindex(b', "belief": '), len(whole)):
+        (tmp_path / "j").write_bytes(whole[:n_bytes])
+        assert read_journal(tmp_path / "j").readings == (known,), n_bytes
+
+
 def test_resuming_goes_on_behind_the_last_reading_which_stays_in_the_file(tmp_path):
     """Cut anywhere in the last line: a reading that is there is never taken out again, not even for a moment."""
     path = tmp_path / "journal.jsonl"

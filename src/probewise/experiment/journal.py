@@ -195,7 +195,8 @@ def _parse_line(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
 def _line_without_summary(tail: bytes) -> bytes:
     """Return the start of an incomplete line, up to its reading, without the written part of the posterior summary."""
     mark = _SUMMARY_KEY.encode()
-    head = tail.split(mark)[0]
+    head, found, _ = tail.partition(b"}" + mark)  # the brace closes the covariates, one of which may have this name
+    head += b"}" if found else b""
     torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
     return head[: len(head) - torn]
 

@@ -22,12 +22,13 @@ from probewise.nested import (
     RemainingEvidence,
     RoundSummary,
     SliceMove,
+    make_problem,
     run,
 )
 from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import insertion_p_value, integrate
-from probewise.nested.sampler import replace_worst_live_points
+from probewise.nested.sampler import replace_worst_live_points, run_once
 from probewise.priors import Empty
 
 # A right sampler is further off than this many of its own errors less than once in 10 000 runs.
@@ -214,6 +215,25 @@ def test_rare_possible_hypotheses_are_doubtful_but_used(rng: np.random.Generator
         result = run(problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng, n_live=100, max_cost=1.0)
     assert abs(result.log_z - math.log(0.002)) < N_ERRORS * result.log_z_error
     assert "doubtful" in result.summary()
+
+
+@pytest.mark.parametrize("n_possible", [1, 2, 3])
+def test_a_run_of_one_parameter_may_begin_with_few_possible_draws(n_possible: int) -> None:
+    """One, two or three of the twenty draws that the limit allows; the chains supply the rest."""
+    first = np.sort(np.random.default_rng(6).random(20))
+    low, high = 0.0, float(0.5 * (first[n_possible - 1] + first[n_possible]))
+
+    def log_likelihood(x: np.ndarray) -> np.ndarray:
+        return np.where((x[:, 0] >= low) & (x[:, 0] < high), 0.0, -np.inf)
+
+    result = run_once(
+        make_problem(log_likelihood, [(0.0, 1.0)], vectorized=True),
+        rng=np.random.default_rng(6),
+        n_live=20,
+        max_calls=20,
+    )
+    assert result.log_start == pytest.approx(math.log(n_possible / 20))
+    assert (result.theta < high).all()
 
 
 def test_a_hypothesis_space_that_excludes_the_readings_is_an_error(rng: np.random.Generator) -> None:

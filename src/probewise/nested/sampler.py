@@ -347,7 +347,8 @@ def _initial_run_state(
     if found < n_live:
         bound = Bound(-math.inf, 1.0)
         start = points.take_rows(rng.integers(found, size=n_live - found))
-        cloud = points.u if found > n_params else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
+        # Differences of live points need two besides the start.
+        cloud = points.u if found > max(n_params, 2) else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
         more, _ = move.draw(start, bound, cloud, evaluate, rng)
         points = Points.join(points, more)
         for _ in range(_MIXING):

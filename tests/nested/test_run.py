@@ -23,7 +23,10 @@ from probewise.nested import (
     RoundSummary,
     SliceMove,
     make_problem,
+    refine,
+    repartitioned,
     run,
+    update,
 )
 from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.clusters import Clusters, find_clusters
@@ -300,6 +303,17 @@ def test_a_problem_without_parameters_is_its_likelihood(rng: np.random.Generator
     result = run(problems.Known(Empty(), lambda t: np.full(len(t), -3.5), -3.5), rng=rng)
     assert (result.log_z, result.log_z_error, result.theta.shape) == (-3.5, 0.0, (1, 0))
     assert "log Z" in result.summary()
+
+
+def test_a_problem_without_parameters_is_updated_by_its_likelihood_and_refused_elsewhere() -> None:
+    problem, seeded = problems.Known(Empty(), lambda t: np.full(len(t), -3.5), -3.5), np.random.default_rng(2)
+    result = run(problem, rng=seeded)
+    more = problems.Known(Empty(), lambda t: np.full(len(t), -4.5), -4.5)
+    assert update(result, more, rng=seeded, fall_back=lambda: run(more, rng=seeded)).log_z == -4.5
+    with pytest.raises(ParameterError, match="the evidence is exact without"):
+        refine(result, problem, rng=seeded)
+    with pytest.raises(ParameterError, match="without parameters"):
+        repartitioned(problem, result.theta)
 
 
 @pytest.mark.parametrize("options", [{"n_live": 5}, {"n_replaced": 30, "n_live": 50}, {"max_calls": 10, "n_live": 50}])

@@ -207,7 +207,8 @@ def update(
     # Rows of weight above 1 / 1000 were drawn several times and kept once: their weight makes up for it.
     log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
     n_eff, k = n_effective(log_weight), math.inf
-    if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
+    # Without parameters there is no density to fit: the fallback evaluates the only hypothesis.
+    if evaluate.names and n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
         proposal = fit_wide_and_narrow_proposals(
             resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
         )[-1]

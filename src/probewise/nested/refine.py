@@ -79,6 +79,8 @@ def refine(
     evaluate = Evaluator(problem)
     if result.names != evaluate.names:
         raise ParameterError("result.names", result.names, f"the problem's names {evaluate.names}")
+    if not result.names:
+        raise ParameterError("result", "a run without parameters", "one with some; the evidence is exact without")
     if n_draws < 100:
         raise ParameterError("n_draws", n_draws, "100 or more")
     if n_pilots < 1:

@@ -211,6 +211,8 @@ def repartitioned(
     n_params = len(problem.prior.names)
     if theta.ndim != 2 or theta.shape[1] != n_params:
         raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_samples, {n_params})")
+    if not n_params:
+        raise ParameterError("problem", "one without parameters", "one with some; its prior cannot be narrower")
     if not 1.0 <= widening < math.inf:
         raise ParameterError("widening", widening, "1 or more, finite")
     n_different, least = len(np.unique(theta, axis=0)), _LEAST_SAMPLES * n_params

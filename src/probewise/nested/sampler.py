@@ -348,7 +348,9 @@ def _initial_run_state(
         bound = Bound(-math.inf, 1.0)
         start = points.take_rows(rng.integers(found, size=n_live - found))
         # Differences of live points need two besides the start.
-        cloud = points.u if found > max(n_params, 2) else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
+        cloud = (
+            points.u if found > max(n_params, 2) else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
+        )
         more, _ = move.draw(start, bound, cloud, evaluate, rng)
         points = Points.join(points, more)
         for _ in range(_MIXING):

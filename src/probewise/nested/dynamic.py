@@ -26,6 +26,7 @@ from probewise.nested.merging import JoinedRecord, combined_p_value, generator_s
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, software_versions
 from probewise.nested.sampler import generator_state_as_json, least_live, move_at_volume, replace_worst_live_points
+from probewise.priors import require_prior
 
 Goal: TypeAlias = Literal["posterior", "evidence"]
 
@@ -76,7 +77,7 @@ def intensified(
     Raises
     ------
     ParameterError
-        If the run is incomplete or of another problem, or an option is out of range.
+        If the run is incomplete or of another problem, an option is out of range, or the prior has no `to_unit_cube`.
     ShapeError
         If the problem has other parameters.
     NotConvergedError
@@ -127,6 +128,8 @@ def _require_complete_run_of(result: NestedResult, evaluate: Evaluator) -> None:
         raise ParameterError(
             "result", f"an incomplete run ({result.stop_reason})", "a run that its stopping rule ended"
         )
+    if not hasattr(evaluate.problem.prior, "coordinates"):
+        require_prior("problem.prior", evaluate.problem.prior, "to_unit_cube")
     known = float(result.log_likelihood[-1])
     again = float(evaluate.log_likelihood(result.theta[-1:])[0])
     if abs(again - known) > _SAME * max(1.0, abs(known)):

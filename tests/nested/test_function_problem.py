@@ -16,7 +16,7 @@ from scipy.special import i0e
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
 from probewise.nested import NestedResult, SliceMove, make_problem, refine, run
 from probewise.nested.evaluate import Bound, Evaluator
-from probewise.priors import Normal, Product, Uniform
+from probewise.priors import Joint, Normal, Product, Uniform
 
 SD = 0.3
 LOG_Z = 2 * math.log(1 / 4)  # a unit of likelihood in a square of side 4
@@ -139,6 +139,8 @@ def test_chains_step_over_the_end_of_a_circle_and_stay_even() -> None:
         (one_point, 3.0, {}, "prior is 3.0; allowed: a prior such as"),
         (one_point, to_square, {}, r"names is None; allowed: .*names=\['x', 'y'\]"),
         (one_point, to_square, {"names": "xy"}, "allowed: a list of names"),
+        (one_point, to_square, {"names": ["x", "x"]}, "names is .*each name once"),
+        (one_point, Joint((Product({"x": Uniform(0, 1)}), Product({"x": Uniform(0, 1)}))), {}, "each name once"),
         (one_point, lambda u: u[:1], {"names": ["x", "y"]}, "prior is 'a function that makes one point"),
         (one_point, [stats.norm(0, 1)], {"names": ["x", "y"]}, "allowed: 1 names"),
         (one_point, SQUARE, {"names": ["y", "x"]}, "those of the prior"),

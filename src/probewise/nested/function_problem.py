@@ -173,9 +173,13 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
         if given is None:
             allowed = "the names of the parameters, since the prior is a function: names=['x', 'y']"
             raise ParameterError("names", None, allowed)
+        if len(set(given)) != len(given):
+            raise ParameterError("names", names, "each name once")
         return _TransformPrior(given, prior, vectorized)  # type: ignore[return-value]
     else:
         raise ParameterError("prior", prior, _ALLOWED_PRIOR)
+    if len(set(made.names)) != len(made.names):
+        raise ParameterError("names of the prior", made.names, "each name once")
     if given is not None and given != made.names:
         raise ParameterError("names", names, f"those of the prior, {made.names}, or none")
     return made

@@ -85,3 +85,14 @@ def test_a_sd_that_is_not_positive_or_of_another_shape_is_refused():
         ReadingNoise(lambda y: y).scale(np.array([[2.0, -1.0]]), None)
     with pytest.raises(ShapeError, match=r"returns shape \(3,\); allowed: \(2,\)"):
         ReadingNoise(lambda y: np.ones(3)).scale(np.array([[2.0, 1.0]]), None)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_tail_far_above_is_as_small_as_the_one_far_below(name):
+    """Also where one minus the probability of a smaller reading would be nought."""
+    law, at = LAWS[name], np.array([[2.5]])  # the middle of the outliers' range
+    sds = np.array([1.0, 8.0, 9.0, 20.0])
+    above, below = (law.smaller_tail(2.5 + 0.5 * z, at, ONE)[0] for z in (sds, -sds))
+    np.testing.assert_allclose(above, below, rtol=1e-9)
+    if name == "gaussian":
+        np.testing.assert_allclose(above, stats.norm.sf(sds), rtol=1e-9)

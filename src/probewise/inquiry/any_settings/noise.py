@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -121,6 +121,14 @@ class ReadingNoise:
             return np.asarray(core)
         low, high = self._outlier_range
         return np.asarray((1 - self.outliers) * core + self.outliers * np.clip((readings - low) / (high - low), 0, 1))
+
+    def smaller_tail(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
+        """Return the probability of a smaller or of a greater reading, whichever is less; arrays that broadcast."""
+        # One minus the probability of a smaller reading would be 0 from 8.3 sds above on.
+        mirrored = (
+            self if not self.outliers else replace(self, between=(-self._outlier_range[1], -self._outlier_range[0]))
+        )
+        return np.asarray(np.minimum(self.cdf(readings, predicted, scale), mirrored.cdf(-readings, -predicted, scale)))
 
     def draw(self, predicted: FloatArray, scale: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw a reading for each prediction, with sd `scale`; arrays of one shape."""

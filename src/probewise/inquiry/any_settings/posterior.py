@@ -145,8 +145,8 @@ class ReadingsProblem:
         """
         predicted = self.model.predict(theta, self.settings)
         scale = self.model.scale(theta, predicted)
-        below = self.model.noise.cdf(self.values, predicted[0, self.row], scale[0, self.row])
-        z = np.abs(ndtri(np.clip(np.minimum(below, 1 - below), 1e-300, 0.5)))
+        tail = self.model.noise.smaller_tail(self.values, predicted[0, self.row], scale[0, self.row])
+        z = np.abs(ndtri(np.clip(tail, 1e-300, 0.5)))
         return float(chdtrc(len(z), float(z @ z))), int(np.argmax(z))
 
 

@@ -23,6 +23,7 @@ _ALLOWED_SD = (
     "LogUniform(0.1, 10.0)"
 )
 _LOG_2PI = math.log(2 * math.pi)
+_OUTERMOST = 0.01  # of the outliers' range, at each end: a tail is not smaller
 _N_GAUSSIAN, _N_HEAVY = 7, 16  # nodes of the quadrature over the noise
 
 
@@ -125,10 +126,14 @@ class ReadingNoise:
     def smaller_tail(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
         """Return the probability of a smaller or of a greater reading, whichever is less; arrays that broadcast."""
         # One minus the probability of a smaller reading would be 0 from 8.3 sds above on.
-        mirrored = (
-            self if not self.outliers else replace(self, between=(-self._outlier_range[1], -self._outlier_range[0]))
-        )
-        return np.asarray(np.minimum(self.cdf(readings, predicted, scale), mirrored.cdf(-readings, -predicted, scale)))
+        if not self.outliers:
+            return np.minimum(self.cdf(readings, predicted, scale), self.cdf(-readings, -predicted, scale))
+        low, high = self._outlier_range
+        mirrored = replace(self, between=(-high, -low))
+        tail = np.minimum(self.cdf(readings, predicted, scale), mirrored.cdf(-readings, -predicted, scale))
+        # An outlier at the very end of its range, such as a reading of 0, is no less probable than others.
+        least = np.where((readings >= low) & (readings <= high), _OUTERMOST * self.outliers, 0.0)
+        return np.maximum(tail, least)
 
     def draw(self, predicted: FloatArray, scale: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw a reading for each prediction, with sd `scale`; arrays of one shape."""

@@ -227,6 +227,8 @@ def test_an_inquiry_is_at_the_top_of_the_package():
         ({"prior": {"slope": 1.0, "offset": Normal(0, 1)}}, "slope.* is 1.0; allowed: Uniform"),
         ({"prior": [0, 1]}, "allowed: Uniform"),
         ({"settings": []}, "settings is .*; allowed: one knob"),
+        ({"settings": [("low", 1.0), ("high", 2.0)]}, "settings is .*; allowed: one knob"),
+        ({"settings": {"a": ["low", 1.0]}}, "settings.* is .*; allowed: one knob"),
         ({"settings": [0.0, np.nan]}, "settings is nan; allowed: finite numbers"),
         ({"settings": {"a": [1, 2], "b": [1]}}, "settings is {'a': 2, 'b': 1}; allowed: one knob"),
         ({"noise": -1.0}, "noise sd is -1.0; allowed: a number greater than 0"),

@@ -46,6 +46,7 @@ class Settings:
         except ValueError as error:
             raise ParameterError("settings", given, _ALLOWED) from error
         if array.ndim == 2 and array.shape[1] >= 1 and len(array):
+            _require_texts_given("settings", given, array)
             columns = {str(k): _checked_column("settings", column) for k, column in enumerate(array.T)}
             return cls(columns, "several")
         return cls({"setting": _checked_column("settings", array)}, "one")
@@ -102,6 +103,7 @@ def _checked_column(name: str, values: Any) -> Column:
     array = np.asarray(values)
     if array.ndim != 1 or not array.size or array.dtype.kind not in "biufU":
         raise ParameterError(name, values, _ALLOWED)
+    _require_texts_given(name, values, array)
     if array.dtype.kind != "U":
         array = array.astype(np.float64)
         if not np.isfinite(array).all():
@@ -109,6 +111,12 @@ def _checked_column(name: str, values: Any) -> Column:
     array = array.copy()
     array.flags.writeable = False
     return array
+
+
+def _require_texts_given(name: str, values: Any, array: Column) -> None:
+    """Raise ParameterError where `array`, of `values`, has numbers among names, which NumPy has made texts."""
+    if array.dtype.kind == "U" and not all(isinstance(one, str) for one in np.asarray(values, dtype=object).flat):
+        raise ParameterError(name, values, _ALLOWED)
 
 
 def _plain_value(value: Any) -> float | str:

@@ -122,3 +122,10 @@ def test_errors_are_honest_over_many_seeds(name: str) -> None:
         found = run_in_few_calls(known, rng=rng(100 + seed), error=0.05)
         z.append((found.log_z - known.log_z) / math.hypot(found.log_z_error, known.log_z_error))
     assert np.mean(np.square(z)) < 3.26
+
+
+def test_a_limit_that_the_first_draws_would_exceed_is_refused_at_once() -> None:
+    counted = Counted(problems.gaussian(40, 0.5))
+    with pytest.raises(ParameterError, match="max_calls is 5000; allowed: 5500 or more for 40 parameters"):
+        run_in_few_calls(counted, rng=rng(), max_calls=5000)
+    assert counted.n_evaluations == 0

@@ -118,8 +118,9 @@ def run_in_few_calls(
         Standard error of log Z at which the draws end; in more than three dimensions at least 0.1. The draws claim no
         smaller error.
     max_calls
-        Limit of likelihood evaluations, 5000 or more; at the limit the error may be larger than `error`. If half of it
-        does not suffice for draws to reach the posterior, an ordinary run with 100 live points or more follows.
+        Limit of likelihood evaluations, 5000 or more, and 700 or more beside 120 for each parameter; at the limit the
+        error may be larger than `error`. If half of it does not suffice for draws to reach the posterior, an ordinary
+        run with 100 live points or more follows.
     progress
         Called with the number of evaluations after every batch of draws.
     executor, n_workers
@@ -146,6 +147,9 @@ def run_in_few_calls(
     evaluate = Evaluator(posed, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     report = progress or (lambda n_calls: None)
     n_params = len(evaluate.names)
+    least = 2 * _n_first_draws(n_params) + max(least_live(n_params), _N_LIVE_ALONE)
+    if max_calls < least:
+        raise ParameterError("max_calls", max_calls, f"{least} or more for {n_params} parameters")
     again = partial(run_once, rng=rng, executor=executor, n_workers=n_workers, return_interrupted=False)
     space = unbounded_space_of(posed.prior) if n_params else None
     explored = None
@@ -244,7 +248,7 @@ def _draw_at_rising_powers(
 ) -> _WeightedDraws | None:
     """Draw at rising powers of the likelihood until enough draws represent the posterior; None beyond `max_calls`."""
     n_params = len(evaluate.names)
-    n_draws, wanted = 300 + 60 * n_params, 150 + 25 * n_params
+    n_draws, wanted = _n_first_draws(n_params), 150 + 25 * n_params
     draws = _DrawsOfAllSources(evaluate, space)
     draws.evaluate_and_add(space.draw(2 * n_draws, rng=rng), None)
     power, least, n_last, kept = 0.0, math.inf, 0, list[Proposal]()
@@ -271,6 +275,11 @@ def _draw_at_rising_powers(
         draws.evaluate_and_add(proposal.draw(n_draws, rng=rng), proposal)
         if power < 2 * last:
             n_draws = int(min(_GROWTH * n_draws, _MOST_DRAWS))
+
+
+def _n_first_draws(n_params: int) -> int:
+    """Return the number of draws of the first density; twice as many come from the prior before."""
+    return 300 + 60 * n_params
 
 
 class _DrawsOfAllSources:

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested import RemainingEvidence, diversify, intensified, refine, repartitioned, run
+from probewise.nested import RemainingEvidence, diversify, intensified, merge, refine, repartitioned, run, update
 from probewise.priors import Product, Uniform
 
 SQUARE = Product({"a": Uniform(-3.0, 3.0), "b": Uniform(-3.0, 3.0)})
@@ -119,3 +119,21 @@ def test_a_prior_without_its_inverse_runs_and_is_refused_where_the_inverse_is_ne
     with pytest.raises(ParameterError, match="a prior with log_prob"):
         diversify(result.theta[:5], problem, rng=seeded())  # type: ignore[arg-type]
     assert n_asked == 0
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda result, problem: refine(result, problem, rng=None), "rng is None"),
+        (lambda result, problem: refine(result, problem, rng=seeded(), n_draws=500.0), "n_draws is 500.0"),
+        (lambda result, problem: merge([result, result], rng=5), "rng is 5"),
+        (lambda result, problem: update(result, problem, rng=seeded(), fall_back=result), "fall_back is"),
+        (lambda result, problem: update(result, problem, rng=seeded(), fall_back=list, n_draws=0), "n_draws is 0"),
+        (lambda result, problem: diversify(result.theta[-5:], problem, rng=seeded(), n_steps=5.0), "n_steps is 5.0"),
+    ],
+)
+def test_an_argument_of_the_wrong_kind_is_refused_in_words(call: Callable[..., object], said: str) -> None:
+    problem = Posed(lambda theta: NORMAL.logpdf(theta))
+    result = run(problem, rng=seeded(), n_live=20, max_cost=1.0)
+    with pytest.raises(ParameterError, match=said):
+        call(result, problem)

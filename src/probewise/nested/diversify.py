@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray, floats
-from probewise._kinds import require_rng
+from probewise._kinds import checked_whole, require_rng
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.priors import require_prior
@@ -72,8 +72,7 @@ def diversify(
     require_prior("problem.prior", problem.prior, "log_prob")
     if start.ndim != 2 or start.shape[1] != len(evaluate.names) or len(start) == 0:
         raise ShapeError(f"theta has shape {start.shape}; allowed: (n_samples, {len(evaluate.names)})")
-    if n_steps < 0:
-        raise ParameterError("n_steps", n_steps, "0 or more")
+    n_steps = checked_whole("n_steps", n_steps, least=0)
     n_samples, n_params = start.shape
     if n_params == 0 or n_steps == 0:
         return start, DiversifyTally(0, 0, 0.0, len(np.unique(start, axis=0)), 0.0)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, read_only_floats
-from probewise._kinds import require_rng
+from probewise._kinds import checked_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.proposal import Proposal, find_disconnected_clusters, fit_wide_and_narrow_proposals
@@ -194,7 +194,11 @@ def update(
         If `previous` has other parameters, or `prior_share` is out of range.
     """
     require_rng(rng)
-    if not 0 <= prior_share < 1:
+    require_callable(
+        "fall_back", fall_back, "a function that solves the problem, such as lambda: run(problem, rng=rng)"
+    )
+    n_draws = checked_whole("n_draws", n_draws)
+    if not 0 <= checked_number("prior_share", prior_share) < 1:
         raise ParameterError("prior_share", prior_share, "0 or more, below 1")
     evaluate = Evaluator(problem)
     if previous.names != evaluate.names:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import weighted_mean_and_error
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
@@ -52,6 +53,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         If there are fewer than two runs, or their parameters differ, or they share a seed or lack a complete record of
         births and deaths.
     """
+    require_rng(rng)
     parts = tuple(results)
     seeds = _seed_states_of_mergeable_runs(parts)
     record = JoinedRecord.from_records([(r.log_likelihood, r.label, r.log_birth, r.birth_label) for r in parts])

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from probewise._kinds import checked_whole, require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.importance import (
@@ -76,15 +77,14 @@ def refine(
     ParameterError
         If an option is out of range or the run has other parameters.
     """
+    require_rng(rng)
+    n_draws = checked_whole("n_draws", n_draws, least=100)
+    n_pilots = checked_whole("n_pilots", n_pilots)
     evaluate = Evaluator(problem)
     if result.names != evaluate.names:
         raise ParameterError("result.names", result.names, f"the problem's names {evaluate.names}")
     if not result.names:
         raise ParameterError("result", "a run without parameters", "one with some; the evidence is exact without")
-    if n_draws < 100:
-        raise ParameterError("n_draws", n_draws, "100 or more")
-    if n_pilots < 1:
-        raise ParameterError("n_pilots", n_pilots, "1 or more")
     space = unbounded_space_of(problem.prior)
     n_lineages = effective_lineages(result)
     fitted, held = split_off_held_out(result, n_lineages, space, rng)

@@ -11,7 +11,7 @@ from nested_sampling import problems
 from scipy.stats import chi2, norm
 
 from probewise.errors import ParameterError, ShapeError
-from probewise.nested import Goal, NestedResult, intensified, merge, n_alive_at_death, run
+from probewise.nested import Agreement, Goal, NestedResult, intensified, merge, n_alive_at_death, run
 from probewise.priors import Normal, Product
 
 
@@ -93,6 +93,13 @@ def test_it_can_be_done_again_and_merged(first: NestedResult) -> None:
     assert 90 < twice.n_at_death.max() <= 120
     other = run(posed, rng=np.random.default_rng(10), n_live=60, max_cost=1.0)
     assert 150 < merge([twice, other], rng=rng).n_at_death.max() <= 180
+
+
+def test_the_error_of_merged_runs_that_disagree_stays_as_wide_as_their_scatter(first: NestedResult) -> None:
+    apart = Agreement((-9.0, -5.0), (0.1, 0.1), 800.0, 0.0)
+    merged = dataclasses.replace(first, agreement=apart, log_z_error=apart.log_z_sd)
+    more = intensified(merged, problems.problem("Gaussian 4-D"), n_live=20, rng=np.random.default_rng(3))
+    assert more.log_z_error == apart.log_z_sd
 
 
 def test_the_same_seed_gives_the_same_points(first: NestedResult, tmp_path) -> None:

@@ -22,7 +22,12 @@ from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integrate
-from probewise.nested.merging import JoinedRecord, combined_p_value, generator_states_of
+from probewise.nested.merging import (
+    JoinedRecord,
+    combined_p_value,
+    error_with_scatter_of_runs,
+    generator_states_of,
+)
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, software_versions
 from probewise.nested.sampler import generator_state_as_json, least_live, move_at_volume, replace_worst_live_points
@@ -233,6 +238,8 @@ def _join_thread_to_run(
         log_start_error=result.log_start_error,
     )
     error = evidence.log_z_error(result.memory)
+    if result.agreement is not None:
+        error = error_with_scatter_of_runs(error, result.agreement)
     check = result.check
     if check is not None:
         apart = (evidence.log_z - check.log_z) / max(math.hypot(error, check.log_z_error), 1e-12)

@@ -115,7 +115,7 @@ def _error_and_doubts(
             f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
             "the error is widened to their scatter; use more n_live or longer chains"
         )
-        error = max(error, agreement.log_z_sd)
+    error = error_with_scatter_of_runs(error, agreement)
     if p_value < DOUBTFUL_P_VALUE:
         doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
     if check is not None and abs(check.distance) > DISAGREE:
@@ -125,6 +125,11 @@ def _error_and_doubts(
             "does not average out; use longer chains"
         )
     return error, doubts
+
+
+def error_with_scatter_of_runs(error: float, agreement: Agreement) -> float:
+    """Return an error of the joint log Z, widened to the scatter of the runs where they disagree."""
+    return max(error, agreement.log_z_sd) if agreement.p_value < _DISAGREE else error
 
 
 def agreement_of(results: Iterable[NestedResult]) -> Agreement:

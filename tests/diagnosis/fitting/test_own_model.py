@@ -1,5 +1,6 @@
 """A model that has nothing to do with light, diagnosed by the same machinery."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
@@ -9,7 +10,7 @@ import pytest
 from probewise.diagnosis import OwnModel, Parameters, diagnose, diagnosis_json
 from probewise.effects import VOCABULARY, Backlash, Extent, Known, NamedEffect, OffsetDrift, Saturation
 from probewise.errors import NotConvergedError, ParameterError, ShapeError
-from probewise.priors import LogUniform, Product
+from probewise.priors import LogUniform, Normal, Product
 from probewise.recordings import Instrumentation, Plan, Recording
 from probewise.sensor import Stage
 
@@ -97,6 +98,19 @@ def test_a_users_own_model_that_is_right_is_clean():
     assert found.verdict == "clean"
     assert "Gaussian" not in found.reason
     np.testing.assert_allclose(found.null.theta.mean(axis=0), (60.0, 120.0), rtol=0.02)
+
+
+def test_lost_readings_that_show_only_beside_a_large_effect_are_named_with_it():
+    """About the null they are no farther off than the rest: a noise model that it cannot have was taken for it."""
+    plan = dataclasses.replace(plan_of(), instrumentation=Instrumentation(unit="degree", min=0.0, max=200.0))
+    readings = np.where(np.arange(96) < 50, 40.0, 100.0) + 0.2 * np.random.default_rng(1).standard_normal(96)
+    readings[[7, 20, 33, 60, 81]] = 0.0
+    level = OwnModel(lambda p, plan: p["level"] * np.ones((1, len(plan))), Product({"level": Normal(60.0, 40.0)}))
+    known = {name: VOCABULARY[name] for name in ("ambient_step", "dropouts")}
+    found = diagnose(Recording(plan, readings), null=level, effects=known, rng=np.random.default_rng(0))
+    assert found.combination == ("ambient_step", "dropouts")
+    assert found.null.effects == ()
+    assert np.isfinite(found.improvement.log_evidence)
 
 
 def test_effects_act_in_the_order_of_their_stages_on_parameters_and_readings():

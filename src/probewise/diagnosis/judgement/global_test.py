@@ -43,7 +43,7 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
         If the fit of the null did not converge, with enough readings to tell.
     """
     prepared, null, noise = searched.prepared, searched.null, searched.posterior.likeliest_noise()
-    problem = Linearised.of(null.found, null.evidence[noise].likeliest_law)
+    problem = Linearised.of(null.found, null.evidence[null.possible_noise(noise)].likeliest_law)
     if not prepared.has_too_little_data:
         require_converged_fit(null.found, Linearised.of(null.found, null.law))
     draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
@@ -72,7 +72,7 @@ def _max_p_value_over_orders(
             break
         found = rival.found
         beside = prepared.apparatus.fine_structure_slopes(found, prepared.usable_rows) if fine else None
-        problem = Linearised.of(found, rival.evidence[noise].likeliest_law, beside)
+        problem = Linearised.of(found, rival.evidence[rival.possible_noise(noise)].likeliest_law, beside)
         draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
         p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_global_test(found), draws))
     return p_value

@@ -42,6 +42,7 @@ class BestRepair:
         rng: np.random.Generator,
     ) -> BestRepair:
         """Build from a fit and its noise effects, and measure the fit's gain over the null."""
+        noise = fit.possible_noise(noise)
         after = Linearised.of(fit.found, fit.evidence[noise].likeliest_law)
         gain = improvement_of(searched, test, fit, noise, after, rng=rng)
         return cls(fit, noise, after, gain, out_of_vocabulary)

@@ -99,7 +99,7 @@ def improvement_and_correction(
     change = np.zeros(len(fixed.change))
     if fixed.gains_nothing:
         return best.improvement, change
-    plain_z = test.null.evidence[best.noise].log_z
+    plain_z = test.null.evidence[test.null.possible_noise(best.noise)].log_z
     key = (best.fit.n_gaussians, best.fit.names, best.noise)
     log_evidence = searched.evidences.unknown.get(key, plain_z) - plain_z
     for step in range(_MOST_BASES):

@@ -44,9 +44,11 @@ class HypothesisSamples:
         key = candidate.names, candidate.found.model.sensor.has_exchangeable_gaussians
         if key not in self._known:
             alike = self._candidates_of_same_form(candidate, candidate.names)
-            log_z = np.array([c.evidence[self.noise].log_z for c in alike])
+            noises = [c.possible_noise(self.noise) for c in alike]
+            log_z = np.array([c.evidence[noise].log_z for c, noise in zip(alike, noises, strict=True)])
             weights = np.exp(log_z - log_z.max())
             kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
+            kept &= np.array([noise == noises[int(np.argmax(log_z))] for noise in noises])
             parts = [self._draw_samples(c) for c in itertools.compress(alike, kept)]
             self._known[key] = mix_over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
         return self._known[key]
@@ -96,7 +98,8 @@ class HypothesisSamples:
         ]
 
     def _draw_samples(self, candidate: WeighedFit) -> ModelSamples:
-        evidence, recording = candidate.evidence[self.noise], self.searched.prepared.recording
+        evidence = candidate.evidence[candidate.possible_noise(self.noise)]
+        recording = self.searched.prepared.recording
         return sample_model(
             candidate.found, evidence, recording, weights=candidate.weights, rng=self.rng, progress=self.progress
         )

@@ -74,6 +74,16 @@ class WeighedFit:
         """Log evidence under the best noise model."""
         return max(e.log_z for e in self.evidence.values())
 
+    def possible_noise(self, noise: Names) -> Names:
+        """Return a noise model or, where it is impossible about this fit, the best of those with part of its effects.
+
+        Lost readings, for instance, are not seen about a fit that is far off.
+        """
+        if np.isfinite(self.evidence[noise].log_z):
+            return noise
+        parts = [names for names in self.evidence if {*names} < {*noise}]
+        return max(parts, key=lambda names: self.evidence[names].log_z, default=noise)
+
     def leading_noises(self) -> Iterator[tuple[Names, NoiseEvidence]]:
         """Iterate over the noise models within three nats of the best, and the simplest one: names and evidence.
 

@@ -82,6 +82,16 @@ def placed(effect, change, without, plan, covariates):
     return places_of_effect(effect, change, shows_in, scans, plan, change, p_value=0.001, size=8.0, sd=0.5)
 
 
+def test_an_effect_of_scans_of_which_one_has_no_usable_reading_is_located_in_the_others():
+    plan = line(scans=4).plan
+    effect = replace(VOCABULARY["scan_angle_error"].for_extent(Extent(0.0, 1.0, plan)), choices=(("s1", "s2"),))
+    (bound,) = effect.variants()
+    kept = plan.take(plan.scan != 1)  # as of usable readings
+    scans = Covariate("scan", kept.scan.astype(float), np.arange(len(kept)), groups=True)
+    change = np.where(kept.scan == 1, 2.0, 0.0)
+    assert [place.scan for place in placed(bound, change, change, kept, [scans])] == ["s2"]
+
+
 @pytest.mark.parametrize("n_gaussians", [1, 2, 3])
 def test_sensor_coordinates_round_trip(n_gaussians):
     sensor = default_sensor(EXTENT, n_gaussians)

@@ -259,7 +259,8 @@ def places_of_effect(
 
 def _scans_with_effect(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
     """List the scans in which an effect's change is a twentieth of its largest or more, strongest first."""
-    rows = {scan: plan.scan == plan.scan_names.index(scan) for scan in scans}
+    # A scan without usable readings is not in the plan, and a name may return.
+    rows = {scan: np.array([name == scan for name in plan.scan_names])[plan.scan] for scan in scans}
     strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
     significant = [scan for scan in scans if strength[scan] >= _SIGNIFICANT * max(strength.values())]
     return sorted(significant, key=lambda scan: -strength[scan])

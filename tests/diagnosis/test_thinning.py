@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from probewise.diagnosis.judgement.judged import Hypothesis
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.prepared import prepare
 from probewise.diagnosis.thinning import rows_to_diagnose
+from probewise.diagnosis.verdict_report import findings
 from probewise.recordings import HalfPlane, Plan, Recording
 
 
@@ -44,3 +50,17 @@ def test_of_few_long_scans_stretches_are_taken_from_each():
     assert len(rows) == pytest.approx(1000, rel=0.05)
     np.testing.assert_allclose(np.bincount(whole.plan.scan[rows]), len(rows) / 3, rtol=0.05)
     assert np.mean(np.diff(rows) == 1) > 0.8
+
+
+def test_scans_of_an_effect_have_their_numbers_in_the_whole_recording(monkeypatch):
+    prepared = prepare(recording(100, 40), apparatus=LightSensorApparatus())
+    assert prepared.is_thinned
+    last = next(e for e in prepared.effects["scan_angle_error"].variants() if e.scans == ("s99",))
+    samples = SimpleNamespace(effects=("scan_angle_error",), effect_samples=lambda name: np.full((500, 1), 2.0))
+    best = SimpleNamespace(fit=SimpleNamespace(found=SimpleNamespace(model=SimpleNamespace(effects=(last,)))), noise=())
+    monkeypatch.setattr(findings, "_lambda_of", lambda *_: 9.0)
+    hypotheses = (Hypothesis(("scan_angle_error",), 1.0),)
+    searched = SimpleNamespace(prepared=prepared)
+    (found,) = findings.effects_found(searched, hypotheses, best, samples, rng=np.random.default_rng(0))
+    assert found.parameters[-1].name == "scans"
+    assert found.parameters[-1].interval95 == (99.0, 99.0)

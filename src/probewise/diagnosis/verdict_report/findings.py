@@ -87,7 +87,7 @@ def effects_found(
         Source of randomness.
     """
     prepared = searched.prepared
-    out, plan = [], prepared.recording.plan
+    out, plan = [], prepared.everything.plan
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
     beside = searched.effect_probabilities_given_unknown() if unknown >= _IS_UNKNOWN else {}
     unit = plan.instrumentation.unit

@@ -87,7 +87,7 @@ class Dropouts(NoiseEffect):
 
         There is no node, (0, 2), unless an outlying value occurs twice or is an end of the declared range.
         """
-        far = (rows.predicted + rows.sd * residuals)[np.abs(residuals) > _FAR]
+        far = rows.with_residuals(residuals)[np.abs(residuals) > _FAR]
         # Floats differ in their last digits, so the value is one of the readings, not their mean.
         n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
         at_end = (np.abs(far[:, None] - np.array(self.ends)) <= 1e-6 * rows.sd).any(axis=1)

@@ -54,7 +54,7 @@ class Quantisation(NoiseEffect):
 
     def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
         """Return the step of the readings' lattice as the only node, (1, 1); (0, 1) for a step below 0.3 noise sds."""
-        step = lattice_step(rows.predicted + rows.sd * residuals)
+        step = lattice_step(rows.with_residuals(residuals))
         return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

@@ -194,6 +194,27 @@ def test_an_own_effect_may_lose_readings_too():
     np.testing.assert_array_equal(np.flatnonzero(law.lost), [30, 90, 200])
 
 
+class OfDeclaredSds(Recording):
+    """Readings of which each has a declared sd of its own."""
+
+    @property
+    def relative_sd(self):
+        return np.geomspace(0.25, 4.0, N)
+
+
+def test_lost_readings_are_found_where_every_reading_has_a_declared_sd_of_its_own():
+    """Their value is that of the readings, and no two residuals over their own sds agree."""
+    predicted = np.linspace(40.0, 60.0, N)
+    readings = predicted + 0.1 * np.geomspace(0.25, 4.0, N) * np.random.default_rng(0).standard_normal(N)
+    lost = [10, 21, 33, 160, 291]
+    readings[lost] = 12.0
+    recording = OfDeclaredSds(PLAN, readings)
+    model = NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
+    nodes = model.nodes_for_predictions(predicted)
+    np.testing.assert_allclose(nodes.settings[:, 1], 12.0)
+    np.testing.assert_array_equal(np.flatnonzero(nodes.laws[0].lost), lost)
+
+
 def test_where_nothing_is_lost_there_is_no_such_law():
     found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
     evidence = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))

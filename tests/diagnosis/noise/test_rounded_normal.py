@@ -150,6 +150,27 @@ def test_no_reading_is_known_better_from_those_before_it_than_a_lattice_allows(n
         assert conditional.min() == pytest.approx(0.6 * STEP)
 
 
+def test_the_nodes_of_the_noise_beside_rounding_hold_its_likeliest_sd_where_readings_declare_their_own():
+    """Residuals are divided by the declared sds once, by the law itself."""
+    plan = paper_plan()
+
+    class OfDeclaredSds(Recording):
+        @property
+        def relative_sd(self):
+            return np.tile([0.25, 1.0, 1.0, 4.0], len(plan) // 4)
+
+    predicted = np.linspace(10.0, 90.0, len(plan))
+    spread = np.tile([0.25, 1.0, 1.0, 4.0], len(plan) // 4)
+    noise = 1.2 * spread * np.random.default_rng(0).standard_normal(len(plan))
+    recording = OfDeclaredSds(plan, STEP * np.round((predicted + noise) / STEP))
+    nodes = NoiseModel((), recording, rounding=STEP, least_sd=1e-3).nodes_for_predictions(predicted)
+    whitened = ((recording.readings - predicted) / spread)[:, None]
+    halves = np.exp(np.arange(-3.0, 3.0, 0.05))
+    sds = 0.5 * STEP / halves
+    misfit = RoundedNormal(halves, sds).minus_log_likelihood(whitened, sds, len(plan))
+    assert min(law.sigma for law in nodes.laws) < sds[np.argmin(misfit)] < max(law.sigma for law in nodes.laws)
+
+
 @pytest.mark.parametrize("noise_sd", [0.3, 0.9, 1.6, 30.0])
 def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
     """Route two: a fine grid of its logarithm, each reading the probability of its cell.

@@ -102,7 +102,9 @@ class NoiseModel:
         if self.rounding:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
-            halves, beside = _sd_nodes_with_rounding(law(residuals), 0.5 * self.rounding, law.n_kept)
+            halves, beside = _sd_nodes_with_rounding(
+                law(self._usable_readings - predicted), 0.5 * self.rounding, law.n_kept
+            )
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
             return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
         return NoiseNodes(settings, laws, log_weights)

@@ -447,6 +447,16 @@ def test_joined_recordings_keep_scans_and_patterns_apart():
     assert join([first]) is first
 
 
+def test_scans_that_were_joined_before_keep_apart_where_their_recording_comes_second():
+    """One of them has the very name that the other would get."""
+    joined = join([line(12), replace(line(12), readings=np.linspace(1.0, 3.0, 24))])
+    first = Recording(line(4).plan, line(4).readings)
+    names = join_plans([first.plan, joined.plan]).scan_names
+    assert len(set(names)) == len(names) == 6
+    returning = replace(first.plan, scan_names=("s0", "s0"))
+    assert join_plans([first.plan, returning]).scan_names == ("s0", "s1", "s0 (2)", "s0 (2)")
+
+
 def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tmp_path):
     joined = join([line(12), replace(line(12), readings=np.linspace(1.0, 3.0, 24))])
     write_recording(joined, tmp_path / "recording.csv")

@@ -83,7 +83,7 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
             renamed.append(names.index(own))
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
-        scan_names += [unused_name(s, scan_names) for s in plan.scan_names]
+        scan_names += _unused_scan_names(plan.scan_names, scan_names)
     commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
     return Plan(
         x_mm=np.concatenate([p.x_mm for p in plans]),
@@ -99,6 +99,14 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
         instrumentation=first.instrumentation,
         sessions=_joined_sessions(plans) if own_sessions or any(plan.sessions for plan in plans) else (),
     )
+
+
+def _unused_scan_names(names: Sequence[str], taken: Sequence[str]) -> list[str]:
+    """Return a plan's scan names, those that are taken renamed; names that differ stay different."""
+    new: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        new[name] = unused_name(name, {*taken, *new.values(), *({*names} - {name})})
+    return [new[name] for name in names]
 
 
 def _joined_sessions(plans: Sequence[Plan]) -> tuple[int, ...]:

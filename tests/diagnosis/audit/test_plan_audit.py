@@ -190,6 +190,17 @@ def test_a_plan_over_a_pattern_that_is_not_described_is_refused():
         audit_plan(replace(plan, patterns={k: v for k, v in plan.patterns.items() if k != "quadrant_a"}))
 
 
+def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():
+    plan = thinned(two_way_plan(), 8)
+    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
+    theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 58.0, 11.0])
+    samples = theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8))
+    sensor = SimpleNamespace(names=names, samples=samples)
+    audit = audit_plan(plan, sensor=sensor, effects={"backlash": Backlash})
+    assert audit.effects[0].detectability == "fine"
+    assert "noise 0.47 LEGO" in audit.assumed
+
+
 def test_a_recording_joined_with_one_in_the_dark_is_lit_where_it_does_not_say():
     plan = paper_plan().take(np.arange(30))
     usual = Recording(plan, np.full(30, 20.0))

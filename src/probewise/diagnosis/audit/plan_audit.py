@@ -367,6 +367,7 @@ def _expected_sensor_and_description(
         null = sensor_from_samples(sensor)
         z = np.zeros(null.n_params)
         low, high = (float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
+        low, high = min(low, high), max(low, high, low + 1e-9)
         said = "the sensor as calibrated"
     else:
         inst = plan.instrumentation

@@ -569,6 +569,15 @@ def test_recordings_of_other_heights_are_joined_each_at_its_own():
     assert "height_mm" not in join([low, replace(low, readings=low.readings + 0.1)]).plan.covariates
 
 
+def test_a_flat_surface_read_alike_from_another_angle_or_in_the_dark_is_another_recording():
+    flat = replace(line(), readings=np.full(24, 42.0))
+    turned = replace(flat, plan=replace(flat.plan, orientation_rad=np.full(24, 1.5)))
+    dark = replace(flat, plan=replace(flat.plan, covariates={"led": np.zeros(24)}))
+    assert len(join([flat, turned, dark])) == 72
+    with pytest.raises(ParameterError, match="these are the same"):
+        join([flat, turned, replace(turned, source="copy.csv")])
+
+
 def test_recordings_of_other_units_are_not_joined():
     with pytest.raises(ParameterError, match="volt"):
         join([line(), line(unit="volt")])

@@ -173,11 +173,17 @@ def _is_same_pattern(one: Pattern, other: Pattern) -> bool:
 
 
 def _is_same_recording(one: Recording, other: Recording) -> bool:
-    """Return whether two recordings hold the same readings at the same places and times."""
+    """Return whether two recordings hold the same readings at the same poses and times, with the same commands."""
+    first, second = one.plan.covariates, other.plan.covariates
+    commanded = {*COMMANDED, *one.plan.instrumentation.controls} & {*first, *second}
     return (
         len(one) == len(other)
         and np.array_equal(one.readings, other.readings, equal_nan=True)
-        and all(np.array_equal(getattr(one.plan, k), getattr(other.plan, k)) for k in ("x_mm", "y_mm", "time_s"))
+        and all(
+            np.array_equal(getattr(one.plan, k), getattr(other.plan, k))
+            for k in ("x_mm", "y_mm", "orientation_rad", "time_s")
+        )
+        and all(k in first and k in second and np.array_equal(first[k], second[k], equal_nan=True) for k in commanded)
     )
 
 

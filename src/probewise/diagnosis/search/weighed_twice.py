@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from probewise.effects import name_without_copy_suffix
+
 A_NAT = 1.0
 
 
@@ -26,7 +28,7 @@ class Weighing:
     @property
     def label(self) -> str:
         """Effects joined by "+", or "clean"."""
-        return "+".join(self.effects) or "clean"
+        return "+".join(sorted(map(name_without_copy_suffix, self.effects))) or "clean"
 
     @property
     def gap(self) -> float:

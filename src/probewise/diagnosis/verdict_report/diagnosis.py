@@ -20,6 +20,7 @@ from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.verdict_report.beyond import Formula, Remainder
 from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound
 from probewise.diagnosis.verdict_report.words import p_in_words
+from probewise.effects import name_without_copy_suffix
 from probewise.recordings.plan import Recording
 
 _MOVED = {
@@ -158,7 +159,8 @@ class Diagnosis(ShowsItself):
         lines += [f"  {h.probability:9.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
         # The reason is not repeated.
         lines += [
-            f"{e.name} (probability {e.probability:.3f}, all explanations together): {e.sentence}"
+            f"{name_without_copy_suffix(e.name)} (probability {e.probability:.3f}, all explanations together): "
+            f"{e.sentence}"
             for e in self.effects
             if e.probability > 0.05 and e.sentence.lower() not in self.reason.lower()
         ]
@@ -181,7 +183,8 @@ class Diagnosis(ShowsItself):
         ]
         if self.repair.combination_shares:
             shares = ", ".join(
-                f"{' with '.join(n) or 'no effect'} in {p:.0%}" for n, p in self.repair.combination_shares.items()
+                f"{' with '.join(map(name_without_copy_suffix, n)) or 'no effect'} in {p:.0%}"
+                for n, p in self.repair.combination_shares.items()
             )
             lines.append(f"samples of the repaired model: {shares}")
         return "\n".join(lines)

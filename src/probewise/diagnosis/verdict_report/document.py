@@ -109,7 +109,7 @@ def _public_names(effects: Iterable[str]) -> list[str]:
 
 def _weighing_json(twice: Weighing) -> dict[str, Any]:
     return {
-        "effects": list(twice.effects),
+        "effects": _public_names(twice.effects),
         "n_gaussians": twice.n_gaussians,
         "log_evidence_laplace": twice.laplace,
         "log_evidence_nested": twice.nested,

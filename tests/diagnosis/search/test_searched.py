@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.searched import Evidences, posterior_of
+from probewise.diagnosis.search.searched import Evidences, Searched, posterior_of
 
 PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 
@@ -67,3 +67,11 @@ def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_sta
     assert found.likeliest_noise() == ("outliers",)
     assert found.likeliest_noise(()) == ()  # a noise that has no name counts as none
     assert found.likeliest_noise(("outliers",)) == ("outliers",)
+
+
+def test_too_few_readings_leave_no_second_copy_of_an_effect_alone():
+    prepared = SimpleNamespace(effects=dict.fromkeys(("lag", "wave", "wave~again")), noise_effect_names=frozenset())
+    searched = Searched(prepared, PRIOR, {}, (), {}, None, None, EVIDENCES, posterior()).with_prior_probabilities()
+    by_mean = searched.posterior.marginal_over_noise
+    assert set(by_mean) == {(), ("unknown",), ("lag",), ("wave",)}
+    assert sum(by_mean.values()) == pytest.approx(1.0)

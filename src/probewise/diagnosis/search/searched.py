@@ -26,7 +26,7 @@ from probewise.diagnosis.search.weighed_fit import (
     expected_log_bayes_factor,
     noise_effects_in_vocabulary,
 )
-from probewise.effects import PROPOSAL, is_out_of_vocabulary
+from probewise.effects import PROPOSAL, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
 
 _NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, as a smaller misfit beside it would
@@ -236,7 +236,9 @@ class Searched:
         on_mean = [
             name
             for name in effects
-            if name not in self.prepared.noise_effect_names and not effects_out_of_vocabulary((name,))
+            if name not in self.prepared.noise_effect_names
+            and not effects_out_of_vocabulary((name,))
+            and name_of_first_copy(name) is None
         ]
         probabilities = self.prior.single_effect_priors(on_mean, self.certain)
         return replace(self, posterior=replace(self.posterior, probabilities=probabilities))

@@ -209,6 +209,8 @@ def test_the_reason_says_whether_they_agree():
         sentence_with_agreement("A reason.", (near,)) == "A reason; nested sampling agrees to a nat and its own error."
     )
     assert "clean by −2.0 nats" in sentence_with_agreement("A reason.", (near, far))
+    of_column = replace(far, effects=("depends:gain:flow-in",))
+    assert "depends:gain:flow-in by −2.0 nats" in sentence_with_agreement("A reason.", (near, of_column))
 
 
 @pytest.mark.slow

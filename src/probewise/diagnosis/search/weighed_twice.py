@@ -45,7 +45,7 @@ def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
     """Extend a verdict's reason by whether nested sampling agrees, by how many nats not, and its first warning."""
     if not weighings:
         return reason
-    apart = ", ".join(f"{w.label} by {w.gap:+.1f} nats".replace("-", "−") for w in weighings if not w.agree)
+    apart = ", ".join(f"{w.label} by {_signed(w.gap)} nats" for w in weighings if not w.agree)
     doubt = next((f"{w.label}: {doubt}" for w in weighings for doubt in w.doubts), None)
     if not apart:
         said = "nested sampling agrees to a nat and its own error"
@@ -54,3 +54,7 @@ def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
     else:
         said = f"nested sampling moves {apart}, and the probabilities are by its evidence"
     return f"{reason.rstrip('.')}; {said}{'' if doubt is None else f', but it doubts itself ({doubt})'}."
+
+
+def _signed(nats: float) -> str:
+    return f"{nats:+.1f}".replace("-", "−")

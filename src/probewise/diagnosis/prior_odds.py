@@ -72,7 +72,10 @@ class PriorOdds:
         return log_p
 
     def _log_prior_per_combination(self, n: int) -> float:
-        return math.log(self.by_size[n - 1] / math.comb(self.n_named, n) if n else self.clean_mean)
+        if not n:
+            return math.log(self.clean_mean)
+        # A model of chosen effects may have more of them than a diagnosis would combine.
+        return math.log(self.by_size[min(n, len(self.by_size)) - 1] / math.comb(self.n_named, n))
 
     def log_prior_with_unknown(self, names: Names) -> float:
         """Return the log prior of an unknown effect without a formula, together with effects on the mean."""
@@ -90,7 +93,7 @@ class PriorOdds:
         noise
             Names of the certain noise effects, the same for all.
         """
-        each = self.by_size[0] / self.n_named
+        each = self.by_size[0] / max(self.n_named, 1)
         believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}
         believed |= {(name,): each for name in names}
         total = sum(believed.values())

@@ -7,12 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from probewise.diagnosis import OwnModel, diagnose
 from probewise.diagnosis.judgement.judged import Hypothesis
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import prepare
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.diagnosis.verdict_report import findings
+from probewise.effects import VOCABULARY
+from probewise.priors import Normal, Product
 from probewise.recordings import HalfPlane, Plan, Recording
+from probewise.report.covariate import covariate_values_by_place
 
 
 def recording(n_scans: int, per_scan: int) -> Recording:
@@ -64,3 +68,21 @@ def test_scans_of_an_effect_have_their_numbers_in_the_whole_recording(monkeypatc
     (found,) = findings.effects_found(searched, hypotheses, best, samples, rng=np.random.default_rng(0))
     assert found.parameters[-1].name == "scans"
     assert found.parameters[-1].interval95 == (99.0, 99.0)
+
+
+def test_places_of_a_thinned_recording_are_drawn_over_all_of_it_and_scans_have_their_own_numbers():
+    """A page of more than 2,400 readings could not be written."""
+    whole = recording(30, 100)
+    noise = np.random.default_rng(0).standard_normal(3000)
+    whole = Recording(whole.plan, noise + 2.0 * (whole.plan.scan >= 20))
+    level = OwnModel(lambda p, plan: p["level"] * np.ones((1, len(plan))), Product({"level": Normal(0.0, 10.0)}))
+    known = {"ambient_step": VOCABULARY["ambient_step"]}
+    found = diagnose(whole, null=level, effects=known, rng=np.random.default_rng(0))
+    values = covariate_values_by_place(found)
+    rows = rows_to_diagnose(whole)
+    assert len(rows) < len(whole)
+    np.testing.assert_array_equal(values["witness_time.svg"][rows], whole.plan.time_s[rows])
+    (scan,) = (place for place in found.where if place.covariate == "scan")
+    np.testing.assert_array_equal(values[scan.figure_name][rows], whole.plan.scan[rows])
+    assert np.isfinite(values[scan.figure_name]).sum() == len(rows)
+    np.testing.assert_array_equal(scan.curve_at, np.unique(whole.plan.scan[rows]))

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.judgement.global_test import N_DRAWS, GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.residuals.locate import Place, places_of_effect, significant_places
 from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.thinning import rows_to_diagnose
 
 
 def locate_effects_and_residuals(
@@ -60,4 +63,18 @@ def locate_effects_and_residuals(
     first: dict[str, Place] = {}
     for place in [*named, *scanned]:
         first.setdefault(place.figure_name, place)
-    return tuple(first.values())
+    return tuple(_place_in_everything(place, prepared) if prepared.is_thinned else place for place in first.values())
+
+
+def _place_in_everything(place: Place, prepared: Prepared) -> Place:
+    """Return a place found in some of the readings with values at all usable ones, and scans by their numbers there."""
+    values, at = place.values, place.curve_at
+    if values is None:
+        return place
+    if place.covariate == "scan":
+        number = np.unique(prepared.everything.plan.scan[rows_to_diagnose(prepared.everything)])
+        values, at = (number[codes.astype(np.int64)].astype(np.float64) for codes in (values, at))
+    everywhere = np.full(int(prepared.everything.usable.sum()), np.nan)
+    usable = np.flatnonzero(prepared.everything.usable)
+    everywhere[np.searchsorted(usable, prepared.usable_rows_of_everything)] = values
+    return replace(place, values=everywhere, curve_at=at)

@@ -138,7 +138,8 @@ def diagnose_prepared(
     grounds = _facts_for_reason(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
     reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
     if prepared.is_thinned:
-        reason += f" (From {len(prepared.recording)} of {len(prepared.everything)} readings, evenly spread.)"
+        n_usable = int(prepared.everything.usable.sum())
+        reason += f" (From {len(prepared.usable_rows)} of {n_usable} readings, evenly spread.)"
     return Diagnosis(
         recording=prepared.everything,
         judged=judged,

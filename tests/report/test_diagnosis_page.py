@@ -10,7 +10,7 @@ from mixtures import fixed_mixture
 
 from probewise.diagnosis import ParameterFound, Place, audit_plan_of_diagnosis, diagnose
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.recordings import Recording, paper_plan, read_plan, shipped
+from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page
 from probewise.report.covariate import axis_label, category_name_by_value, covariate_values_by_place
@@ -201,6 +201,12 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
     alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
     assert len(rows_of_scan_changed_most(alone, np.ones(4))) == 4
     assert not is_scan_along_line(plan, np.arange(1))
+
+
+def test_a_scan_whose_name_returns_is_shown_each_time():
+    plan = Plan.from_arrays(x_mm=[0, 1, 2] * 3, y_mm=0, patterns=HalfPlane(0.0, 0.0), unit="V", scan=list("aaabbbaaa"))
+    shown = covariate_view.view_along_scan(SimpleNamespace(recording=SimpleNamespace(plan=plan)), "a")
+    np.testing.assert_array_equal(shown.at, [0, 1, 2, np.nan, np.nan, np.nan, 0, 1, 2])
 
 
 def scans_of(plan):

@@ -166,7 +166,7 @@ def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None)
     A run of a simulator's table is shown along its time or rows. Residuals that change sign within the scan show here.
     """
     plan = diagnosis.recording.plan
-    rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
+    rows = np.flatnonzero(np.isin(plan.scan, [k for k, name in enumerate(plan.scan_names) if name == scan]))
     if isinstance(plan, RunTable):
         at = np.full(len(plan), np.nan)
         at[rows] = plan.time_s[rows]

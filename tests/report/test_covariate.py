@@ -7,7 +7,9 @@ import pytest
 
 from probewise.diagnosis import Place
 from probewise.report.covariate import covariate_in_words, covariate_unit
-from probewise.report.covariate_view import _probability_unknown_depends_on
+from probewise.report.covariate_view import ResidualNoise, _probability_unknown_depends_on
+from probewise.systems import RunTable
+from probewise.systems.table import RunRecording
 
 
 @pytest.mark.parametrize("name", ["k", "c", "v", "s", "mm", "deg", "percent", "_k"])
@@ -31,3 +33,16 @@ def test_an_unknown_effect_that_depends_on_the_run_is_found_by_its_run():
         apparatus=SimpleNamespace(words=SimpleNamespace(run="run")),
     )
     assert _probability_unknown_depends_on(diagnosis, place) == 0.7
+
+
+def test_the_band_of_chance_is_as_wide_as_each_readings_own_noise():
+    columns = {"y": np.zeros(4), "sd": np.array([1.0, 1.0, 1.0, 3.0]), "run": np.array(["a", "a", "b", "b"])}
+    recording = RunRecording(RunTable(columns, None, "run"), np.zeros(4), sd_column="sd")
+    chain = SimpleNamespace(predict=lambda theta, plan: np.zeros((len(theta), len(plan))))
+    diagnosis = SimpleNamespace(
+        recording=recording,
+        report=SimpleNamespace(noise=SimpleNamespace(parameters=[SimpleNamespace(name="values[b]", mean=2.0)])),
+        repaired=SimpleNamespace(noise_sd=np.array([0.5])),
+        null=SimpleNamespace(theta=np.zeros((3, 1)), chain=chain),
+    )
+    np.testing.assert_allclose(ResidualNoise.of_diagnosis(diagnosis).sd, [0.5, 0.5, 1.0, 3.0])

@@ -65,14 +65,16 @@ class ResidualNoise:
     def of_diagnosis(cls, diagnosis: Diagnosis) -> ResidualNoise:
         """Take the repaired model's noise sds and correlation, and posterior predictions of the calibrated model."""
         found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
-        sd = np.full(len(diagnosis.recording), float(diagnosis.repaired.noise_sd.mean()))
+        plan = diagnosis.recording.plan
+        sd = float(diagnosis.repaired.noise_sd.mean()) * diagnosis.recording.relative_sd
+        sd = sd * np.array([found.get(f"values[{name}]", 1.0) for name in plan.scan_names])[plan.scan]
         if "ratio" in found:
             level = diagnosis.repair.after.readings
             share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
             sd = sd * np.sqrt(1 + found["ratio"] * share)
         null = diagnosis.null
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
-        return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, diagnosis.recording.plan))
+        return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, plan))
 
     def mean_residuals(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
         """Average the calibrated model's residuals in bins of a view; with `after`, also the repaired model's."""

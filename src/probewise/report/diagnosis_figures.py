@@ -212,6 +212,6 @@ def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) 
     if name in ("correlated_noise", "random_walk"):
         return lambda ax: residual_autocorrelation(residuals, recording.plan.scan, rho=found.get("rho"), ax=ax)
     if name == "outliers":
-        return lambda ax: residual_histogram(residuals, float(chance.sd.mean()), ax=ax)
-    model_sd = chance.sd if "ratio" in found else None
+        return lambda ax: residual_histogram(residuals / chance.sd, 1.0, ax=ax)
+    model_sd = chance.sd if np.ptp(chance.sd) > 0 else None
     return lambda ax: spread_by_level(diagnosis.repair.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax)

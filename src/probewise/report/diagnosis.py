@@ -36,7 +36,14 @@ from probewise.report.effect_words import (
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
-from probewise.report.words import count_with_noun, number_text, probability_text, typeset_numbers, unit_name
+from probewise.report.words import (
+    count_with_noun,
+    number_text,
+    probability_text,
+    range_text,
+    typeset_numbers,
+    unit_name,
+)
 
 __all__ = ["encoded_figures", "page_html", "sections", "summary_sentence"]
 
@@ -457,7 +464,7 @@ def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> t
     low, high = found.interval95
     own = _unit_text(found) if unit else ""
     return typeset_numbers(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset_numbers(
-        f"{low:.4g} to {high:.4g}"
+        range_text(low, high)
     )
 
 
@@ -539,9 +546,7 @@ def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> 
     elif place.start is None or place.end is None:
         what = covariate
     else:
-        start, end = f"{place.start:.4g}", f"{place.end:.4g}"
-        ends = start if start == end else f"{start} to {end}"
-        what = f"{covariate}, {ends} {unit}".rstrip()
+        what = f"{covariate}, {range_text(place.start, place.end)} {unit}".rstrip()
     if place.scan and place.covariate != run:
         what += f", {run} {place.scan}"
     chance = "" if place.p_value < ALARM else ", possibly chance"

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import recorded_against_predicted, residuals_against_covariates, svg
-from probewise.report.words import number_text, typeset_numbers, unit_name
+from probewise.report.words import digits_of_range, number_text, typeset_numbers, unit_name
 from probewise.systems import RunTable
 
 _MOST_COLUMNS = 6
@@ -54,11 +54,12 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     median, interval = np.median(own.samples, axis=0), own.interval()
     error = f" ± {number_text(evidence.error, 2)}" if evidence.error else ""
     how = f"; {evidence.reason}" if evidence.reason else ""
+    digits = {name: digits_of_range(*interval[name], 5) for name in own.names}
     rows = [
         (
             name,
-            typeset_numbers(f"{median[k]:.5g}"),
-            typeset_numbers(f"{interval[name][0]:.5g} to {interval[name][1]:.5g}"),
+            typeset_numbers(f"{median[k]:.{digits[name]}g}"),
+            typeset_numbers(" to ".join(f"{end:.{digits[name]}g}" for end in interval[name])),
         )
         for k, name in enumerate(own.names)
     ]

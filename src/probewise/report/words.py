@@ -39,6 +39,22 @@ def interval_text(low: float, high: float) -> str:
     return f"{number_unsigned_zero(low, digits)} to {number_unsigned_zero(high, digits)}"
 
 
+def digits_of_range(low: float, high: float, least: int) -> int:
+    """Return the significant digits that show both ends to the second digit of their distance; `least` or more."""
+    width, largest = high - low, max(abs(low), abs(high))
+    if not 0 < width < math.inf:
+        return least
+    return min(max(math.floor(math.log10(largest)) - math.floor(math.log10(width)) + 2, least), 15)
+
+
+def range_text(low: float, high: float) -> str:
+    """Write the ends of a range to four significant digits, or as many as tell them apart; one number if equal."""
+    if math.isclose(low, high, rel_tol=1e-12):
+        return f"{low:.4g}"
+    digits = digits_of_range(low, high, 4)
+    return f"{low:.{digits}g} to {high:.{digits}g}"
+
+
 def value_and_interval_texts(value: float, low: float, high: float) -> tuple[str, str]:
     """Return texts of a value and of its interval, to the third significant digit of the interval's width."""
     ends = interval_text(low, high)

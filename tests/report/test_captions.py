@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -192,6 +193,11 @@ def test_the_page_of_a_calibration_names_what_is_there_and_prints_no_error_of_ze
     cells = re.search(r"A_1</td>.*?</tr>", page)[0]
     assert "0.031" in cells
     assert f"{sensor.sd()['A_1']:.3f}" not in cells
+
+
+def test_the_noise_of_a_sensor_that_reads_millivolts_is_not_written_as_zero():
+    sensor = replace(hand_made_sensor(), noise_sd=np.full(500, 0.0031), instrumentation=Instrumentation(unit="V"))
+    assert calibration_report.summary_sentence(sensor).endswith("by 2.5 mm (sd), noise 0.0031 V per reading.")
 
 
 def test_the_errors_of_a_rectangle_do_not_depend_on_which_side_is_its_width():

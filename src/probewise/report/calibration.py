@@ -22,6 +22,7 @@ from probewise.report.plots import (
 )
 from probewise.report.words import (
     count_with_noun,
+    decimals_to_show,
     number_text,
     number_unsigned_zero,
     typeset_numbers,
@@ -43,11 +44,13 @@ def summary_sentence(sensor: FittedSensor) -> str:
         error = math.hypot(chosen.log_z_error, others[0].log_z_error)
         said += f", ahead of {others[0].n_gaussians} by {value_with_error(lead, error)} in ln Z"
     center_x, center_y, widths = ssf_centre_and_axis_sds_mm(sensor)
+    digits, noise_sd = decimals_to_show(widths[0], 1), float(sensor.noise_sd.mean())
     return (
-        f"{said}: centred at ({number_unsigned_zero(center_x, 1)}, {number_unsigned_zero(center_y, 1)}) mm "
+        f"{said}: centred at ({number_unsigned_zero(center_x, digits)}, {number_unsigned_zero(center_y, digits)}) mm "
         "on the sensor, "
-        f"{number_text(widths[0], 1)} by {number_text(widths[1], 1)} mm (sd), "
-        f"noise {number_text(float(sensor.noise_sd.mean()), 2)} {unit_name(sensor.instrumentation.unit)} per reading."
+        f"{number_text(widths[0], digits)} by {number_text(widths[1], digits)} mm (sd), "
+        f"noise {number_text(noise_sd, decimals_to_show(noise_sd, 2))} "
+        f"{unit_name(sensor.instrumentation.unit)} per reading."
     )
 
 

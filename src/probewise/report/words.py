@@ -14,6 +14,13 @@ def number_text(value: float, digits: int) -> str:
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
 
 
+def decimals_to_show(value: float, least: int) -> int:
+    """Return the number of decimals that show two significant digits of a value; `least` or more."""
+    if not (math.isfinite(value) and value):
+        return least
+    return max(least, 1 - math.floor(math.log10(abs(value))))
+
+
 def value_with_error(value: float, error: float, unit: str = "") -> str:
     """Write a value with its error, both to the error's second significant digit, so that no error shows as zero.
 

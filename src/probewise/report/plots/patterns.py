@@ -12,7 +12,7 @@ from probewise.recordings.plan import require_recording
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, CYCLE, GREY, AxesGrid, axes_or_new, grid_of_axes
 from probewise.report.plots.readings import MARKERS, tracks_and_single_rows
-from probewise.report.words import number_text, number_unsigned_zero, unit_name
+from probewise.report.words import decimals_to_show, number_text, number_unsigned_zero, unit_name
 
 _DARK, _BRIGHT = "#1b1b1b", "#ffffff"
 _AROUND_MM = 16.0
@@ -106,7 +106,14 @@ def quadrant_patterns(recording: Recording) -> AxesGrid:
         (x, y), (dx, dy) = pattern.corner_mm, pattern.direction
         middle = ((x + dx * _AROUND_MM) / 2, (y + dy * _AROUND_MM) / 2)
         inside, around = (BLACK, "white") if pattern.inside >= pattern.outside else ("white", BLACK)
-        ax.text(*middle, number_text(mean, 1), ha="center", va="center", color=inside, fontsize="large")
+        ax.text(
+            *middle,
+            number_text(mean, decimals_to_show(mean, 1)),
+            ha="center",
+            va="center",
+            color=inside,
+            fontsize="large",
+        )
         said = f"({number_unsigned_zero(x, 0)}, {number_unsigned_zero(y, 0)}) mm"
         ax.text(x - dx * 1.2, y - dy * 1.2, said, ha="right" if dx > 0 else "left", va="top", color=around)
         ax.plot(0.0, 0.0, marker="+", markersize=10, markeredgewidth=1.4, color=GREY)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mixtures import fixed_mixture
 
-from probewise.diagnosis import ParameterFound, Place, audit_plan_of_diagnosis, diagnose
+from probewise.diagnosis import EffectFound, ParameterFound, Place, audit_plan_of_diagnosis, diagnose
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
@@ -249,6 +249,12 @@ def test_a_columns_values_are_no_categories_though_it_is_called_as_those_of_a_li
     for name in ("scan", "direction", "orientation"):
         assert category_name_by_value(found, place_of(name, 0.0)) is None
     assert category_name_by_value(found, place_of("run", 0.0)) == {0.0: "1", 1.0: "2"}
+
+
+def test_an_effect_that_is_there_twice_has_the_name_of_diagnosis_json_in_the_table():
+    parameter = ParameterFound("amp", "V", 1.0, 0.1, (0.8, 1.2))
+    twice = EffectFound("ambient_step~again", 0.9, 9.0, "a step", (parameter,))
+    assert "(ambient_step)</td>" in page._effect_table([twice])
 
 
 def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():

@@ -21,6 +21,7 @@ from probewise.diagnosis import (
     p_in_words,
 )
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.effects import name_without_copy_suffix
 from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import covariate_in_words_and_unit, term_family_in_words
@@ -456,7 +457,8 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
 def _effect_words_and_name(name: str) -> str:
     """Name an effect in words, followed by its name in diagnosis.json."""
     said = effect_in_words(name)
-    return f"{said} ({name})" if said != name else name
+    own = name_without_copy_suffix(name)
+    return f"{said} ({own})" if said != own else own
 
 
 def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:

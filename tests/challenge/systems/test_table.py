@@ -4,7 +4,7 @@ import pytest
 
 from probewise.challenge.systems import name_without_target, score_systems
 from probewise.challenge.systems.table import gains_on_held_out_runs
-from probewise.report.challenge import page_html
+from probewise.report.challenge import _case_cells, page_html
 
 
 def _hidden(name, size=12.0, *, rivals=None, on_the_list=True, shows_in=("time",)):
@@ -96,6 +96,16 @@ def test_an_oracle_tells_two_that_are_eight_nats_apart_as_often_as_the_normal_la
 def test_noise_said_beside_an_effect_does_not_make_it_wrong():
     said = _single(said=["offset_drift", "random_walk"])
     assert _row([said], "right name and target first, lambda 12").found.value == 1.0
+
+
+def test_a_case_of_which_clean_is_said_is_not_called_right_though_the_right_name_is_first_of_all_names():
+    doubted = _single(said=[], hypotheses=[[[], 0.6], [["offset_drift"], 0.4]])
+    beside_noise = _single(said=["offset_drift", "random_walk"])
+    assert _row([doubted], "right name and target first, lambda 12").found.value == 1.0
+    assert [_case_cells(0, r)[4:7] for r in (doubted, beside_noise)] == [
+        ("clean", "0.60", "no"),
+        ("offset_drift and random_walk", "0.97", "yes"),
+    ]
 
 
 def test_alarms_and_names_on_clean_recordings_are_counted():

@@ -85,6 +85,17 @@ def test_it_ends_when_the_budget_is_spent(diagnosed):
     assert sum(len(each.recording) for each in rounds[1:]) == 2 * n
 
 
+def test_it_says_when_the_minutes_are_spent_and_when_they_suffice_for_a_part(diagnosed):
+    found = [diagnosis(0.6) for _ in range(2)]
+    found[0].next_measurement.plan, found[1].next_measurement.plan = scans(1, 2), scans(3)
+    after_s = scans(0).time_s.max()
+    diagnosed(*found)
+    rounds = rounds_of(budget=Budget(minutes=(scans(1).time_s.max() - after_s) / 60 + 0.01))
+    n, both = len(scans(1)), len(scans(1, 2))
+    assert rounds[1].reason_for_readings == f"take it again; the budget allows {n} of {both} readings"
+    assert rounds[1].stop_reason == "the budget of minutes is spent"
+
+
 def test_it_ends_after_the_rounds_that_were_allowed(diagnosed):
     diagnosed(*[diagnosis(0.6)] * 2)
     assert rounds_of(rounds=2)[-1].stop_reason == "the limit of 2 rounds is reached"

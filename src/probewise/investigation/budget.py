@@ -43,6 +43,11 @@ class Budget:
             return plan
         return plan.take(kept) if kept.size else None
 
+    def exhausted_part(self, plan: Plan) -> str:
+        """Return which part of the budget a plan's first scan exceeds: "readings", otherwise "minutes"."""
+        first = next((rows for rows in plan.rows_by_scan() if rows.size), ())
+        return "readings" if len(first) > self.readings else "minutes"
+
     affordable = affordable_scans
     """The old name of `affordable_scans`."""
 

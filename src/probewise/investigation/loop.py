@@ -107,10 +107,12 @@ def _rounds_until_stop(
             settled
             or ("no further reading would tell more" if following is None else None)
             or (f"the limit of {rounds} rounds is reached" if number == rounds else None)
-            or ("the budget of readings is spent" if affordable is None else None)
+            or (f"the budget of {budget.exhausted_part(following.plan)} is spent" if affordable is None else None)
         )
         yield Round(number, recordings[-1], asked, diagnosis, reason, settled is not None)
         if reason is not None or following is None or affordable is None:
             return
         budget = budget.minus(affordable, over_s)
         asked, wanted = following.description, affordable
+        if affordable is not following.plan:
+            asked = f"{asked.rstrip('.')}; the budget allows {len(affordable)} of {len(following.plan)} readings"

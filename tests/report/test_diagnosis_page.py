@@ -10,7 +10,7 @@ from mixtures import fixed_mixture
 
 from probewise.diagnosis import EffectFound, ParameterFound, Place, audit_plan_of_diagnosis, diagnose
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_plan, shipped
+from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page
 from probewise.report.covariate import axis_label, category_name_by_value, covariate_values_by_place
@@ -255,6 +255,12 @@ def test_an_effect_that_is_there_twice_has_the_name_of_diagnosis_json_in_the_tab
     parameter = ParameterFound("amp", "V", 1.0, 0.1, (0.8, 1.2))
     twice = EffectFound("ambient_step~again", 0.9, 9.0, "a step", (parameter,))
     assert "(ambient_step)</td>" in page._effect_table([twice])
+
+
+def test_the_page_of_a_long_recording_counts_the_readings_that_were_diagnosed():
+    readings = np.append(np.full(4999, 7.0), np.nan)
+    recording = Recording.from_arrays(x_mm=np.arange(5000), y_mm=0, readings=readings, patterns=Uniform(0.5), unit="V")
+    assert page._n_readings_used(SimpleNamespace(recording=recording, apparatus=None)) < 2600
 
 
 def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():

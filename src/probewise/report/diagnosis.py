@@ -21,6 +21,7 @@ from probewise.diagnosis import (
     p_in_words,
 )
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import name_without_copy_suffix
 from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
@@ -95,7 +96,7 @@ def page_html(
             definition_list(
                 (
                     ("recordings", source),
-                    ("readings", f"{int(diagnosis.recording.usable.sum())} used of {len(diagnosis.recording)}"),
+                    ("readings", f"{_n_readings_used(diagnosis)} used of {len(diagnosis.recording)}"),
                     ("seed", str(seed)),
                     *_simulator_facts(diagnosis),
                 )
@@ -114,6 +115,14 @@ def page_html(
         key_figure=fragment(first, *explain_new_terms(f"{diagnosis.verdict} {first}", known)),
         sections=sections_with_terms_explained([*sections(diagnosis, drawn), *design, run], known),
     )
+
+
+def _n_readings_used(diagnosis: Diagnosis) -> int:
+    """Return the number of readings diagnosed: of a long recording by a light sensor, only a part."""
+    usable = diagnosis.recording.usable
+    if isinstance(diagnosis.apparatus, SimulatorApparatus):  # its recording has the readings that are used only
+        return int(usable.sum())
+    return int(usable[rows_to_diagnose(diagnosis.recording)].sum())
 
 
 def _first_figure_caption(diagnosis: Diagnosis) -> str:

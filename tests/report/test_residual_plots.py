@@ -58,6 +58,11 @@ def test_every_axis_says_what_it_carries(figures):
         assert np.atleast_1d(drawing)[-1].get_xlabel(), name
 
 
+def test_readings_without_a_unit_have_no_empty_brackets():
+    ax = plots.mean_residuals_along(means(), label="time (s)", unit="")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "mean residual")
+
+
 @pytest.mark.slow
 def test_no_legend_lies_over_data(figures, images):
     for name, drawing in figures.items():

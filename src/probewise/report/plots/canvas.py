@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import textwrap
 from collections.abc import Sequence
 from typing import Any, TypeAlias, cast
@@ -44,6 +45,7 @@ __all__ += [
 _LETTERS_PER_IN = 16.2  # letters per inch of a legend, about
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
+_EMPTY_BRACKETS = re.compile(r"\s*\(\)$")
 _LEAST_IN_FULL = 1e-5  # of an axis' length: shorter ones have labels with a power of ten
 
 AxesGrid: TypeAlias = NDArray[Any]
@@ -239,9 +241,12 @@ def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "no
 
 
 def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
-    """Label both axes, set the title, and hide the upper and right spines; return the axes."""
-    ax.set_xlabel(x)
-    ax.set_ylabel(y)
+    """Label both axes, set the title, and hide the upper and right spines; return the axes.
+
+    Brackets without a unit, "reading ()", are left out.
+    """
+    ax.set_xlabel(_EMPTY_BRACKETS.sub("", x))
+    ax.set_ylabel(_EMPTY_BRACKETS.sub("", y))
     if title:
         ax.set_title(title, fontsize="medium", loc="left")
     ax.spines[["top", "right"]].set_visible(False)

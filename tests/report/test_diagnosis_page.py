@@ -226,7 +226,9 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     sizes = {"slope": 1.0, "time": 5.0, "place": 3.0}
     where = [place_of(name, start) for name, start in (("slope", 0.0), ("time", 1.0), ("place", 2.0))]
     judged = SimpleNamespace(unknown_shares={"place, smooth": 0.9})
-    found = SimpleNamespace(verdict="unknown", judged=judged, where=(*where, dataclasses.replace(where[2], scan="s")))
+    apparatus = SimpleNamespace(words=SimpleNamespace(run="scan"))
+    where.append(dataclasses.replace(where[2], scan="s"))
+    found = SimpleNamespace(verdict="unknown", judged=judged, where=tuple(where), apparatus=apparatus)
     monkeypatch.setattr(
         covariate_view, "covariate_values_by_place", lambda d: {place.figure_name: np.arange(3.0) for place in d.where}
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from probewise.challenge import Estimate, ScoreRow, confusion_counts, detected_and_named_by_effect, reliability_bins
-from probewise.challenge.scoring import NOISE, leading_hypothesis, names_match, right_names_of_each_effect
+from probewise.challenge.scoring import NOISE, are_names_right, leading_hypothesis
 from probewise.challenge.systems import name_without_target
 from probewise.challenge.systems.table import gains_on_held_out_runs
 from probewise.recordings.table import csv_text_of_rows
@@ -136,7 +136,7 @@ def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
     names, probability = leading_hypothesis(result, clean=True)
     # Beside a concealed effect, all of which act on the mean, names of noise effects are ignored.
     physics = tuple(name for name in names if name not in NOISE) if result["hidden"] else names
-    right = names_match(physics, right_names_of_each_effect(result, merged=True, noise=not result["hidden"]))
+    right = are_names_right(result, physics, noise=not result["hidden"])
     gains = gains_on_held_out_runs(result, "right")
     said = " and ".join(names) or "clean"
     return (

@@ -66,10 +66,13 @@ def are_names_right(result: Result, names: Sequence[str], *, noise: bool = True)
     """Return whether a hypothesis is right: its names match those of the effects or their aliases, or it is an alias.
 
     `noise`: whether noise effects have to be named. A hypothesis is an alias if the case holds its loss on the
-    noise-free readings ("alternative_nats", by names joined with "+") and that is below `HONEST_NATS`.
+    noise-free readings ("alternative_nats", by names joined with "+") and that is below `HONEST_NATS`; one with more
+    names than there are effects is none: beside the right one, any name explains as much.
     """
     if names_match(names, right_names_of_each_effect(result, merged=True, noise=noise)):
         return True
+    if len(set(names) - NOISE) > len(result["hidden"]):
+        return False
     nats = result.get("alternative_nats", {}).get("+".join(sorted(set(names) - NOISE)), math.inf)
     due = set(result["truth"]) & NOISE if noise else set()
     return bool(nats < HONEST_NATS) and set(names) & NOISE == due

@@ -84,6 +84,12 @@ def test_other_words_for_the_same_readings_are_right():
     assert _row([both], "size of the credible set, the truth and its aliases as one, lambda 12").found.value == 2.0
 
 
+def test_a_false_name_beside_the_right_one_is_no_other_word_for_it():
+    more = _single("saturation", said=["lag", "saturation"], alternative_nats={"lag+saturation": 0.0})
+    assert _row([more], "right name and target first, lambda 12").found.value == 0.0
+    assert _row([more], "wrong name stated above .9").found.value == 1.0
+
+
 def test_an_oracle_tells_two_that_are_eight_nats_apart_as_often_as_the_normal_law_says():
     """Distance 4 sds: Phi(2) = 0.977. An alias, within three nats, does not count; cases without rivals have no row."""
     own = _hidden("lag") | {"cosines": {"delay": 1.0}, "rival_nats": {"delay": 0.1, "settling": 8.0}}

@@ -15,7 +15,7 @@ from probewise.report import covariate_view
 from probewise.report import diagnosis as page
 from probewise.report.covariate import axis_label, category_name_by_value, covariate_values_by_place
 from probewise.report.covariate_view import is_scan_along_line
-from probewise.report.diagnosis_figures import rows_of_scan_changed_most
+from probewise.report.diagnosis_figures import noun_of_held_out_part, rows_of_scan_changed_most
 from probewise.report.plots import heldout_gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
 from probewise.report.words import typeset_numbers
@@ -263,6 +263,17 @@ def test_the_page_of_a_long_recording_counts_the_readings_that_were_diagnosed():
     readings = np.append(np.full(4999, 7.0), np.nan)
     recording = Recording.from_arrays(x_mm=np.arange(5000), y_mm=0, readings=readings, patterns=Uniform(0.5), unit="V")
     assert page._n_readings_used(SimpleNamespace(recording=recording, apparatus=None)) < 2600
+
+
+def test_a_held_out_part_is_called_a_run_only_if_it_is_one():
+    def called(*held):
+        gain = SimpleNamespace(heldout_by_scan=[(name, 0.1) for name in held])
+        plan, words = SimpleNamespace(scan_names=("all", "b")), SimpleNamespace(run="run")
+        recording, apparatus = SimpleNamespace(plan=plan), SimpleNamespace(words=words)
+        return noun_of_held_out_part(SimpleNamespace(improvement=gain, recording=recording, apparatus=apparatus))
+
+    assert called("all", "b") == "run"
+    assert called("part 1 of 5", "part 2 of 5") == "part"
 
 
 def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():

@@ -27,7 +27,7 @@ from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import covariate_in_words_and_unit, term_family_in_words
 from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
-from probewise.report.diagnosis_figures import encoded_figures, first_figure_content
+from probewise.report.diagnosis_figures import encoded_figures, first_figure_content, noun_of_held_out_part
 from probewise.report.effect_words import (
     EFFECTS_IN_WORDS,
     effect_has_words,
@@ -384,8 +384,8 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
         (
             figure(
                 drawn["gain.svg"],
-                f"Gain in log predictive density of each held-out {diagnosis.apparatus.words.run}, both models fitted "
-                "to the others: blue where the repaired model predicts better, orange where worse. Grey: mean over "
+                f"Gain in log predictive density of each held-out {noun_of_held_out_part(diagnosis)}, both models "
+                "fitted to the others: blue where the repaired model predicts better, orange where worse. Grey: mean over "
                 "all, with standard error.",
             ),
         )

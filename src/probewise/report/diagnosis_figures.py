@@ -60,12 +60,18 @@ def encoded_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
                 gain.heldout_by_scan,
                 gain.heldout_log_density_per_reading,
                 gain.heldout_sd,
-                part=diagnosis.apparatus.words.run,
+                part=noun_of_held_out_part(diagnosis),
             )
         )
     for place in diagnosis.where:
         drawn[place.figure_name] = _place_svg(diagnosis, chance, place, values[place.figure_name])
     return drawn
+
+
+def noun_of_held_out_part(diagnosis: Diagnosis) -> str:
+    """Return what a held-out part is called: "scan" or "run" if each is one, else (a block, several scans) "part"."""
+    held = {name for name, _ in diagnosis.improvement.heldout_by_scan}
+    return diagnosis.apparatus.words.run if held <= {*diagnosis.recording.plan.scan_names} else "part"
 
 
 def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> CovariateView | str:

@@ -103,11 +103,14 @@ def _rounds_until_stop(
         settled, following = reason_if_settled(diagnosis), diagnosis.next_measurement
         over_s = max(float(each.plan.time_s.max()) for each in recordings)
         affordable = None if following is None else budget.affordable_scans(following.plan, over_s)
+        spent = None
+        if following is not None and affordable is None:
+            spent = f"the budget of {budget.exhausted_part(following.plan)} is spent"
         reason = (
             settled
             or ("no further reading would tell more" if following is None else None)
             or (f"the limit of {rounds} rounds is reached" if number == rounds else None)
-            or (f"the budget of {budget.exhausted_part(following.plan)} is spent" if affordable is None else None)
+            or spent
         )
         yield Round(number, recordings[-1], asked, diagnosis, reason, settled is not None)
         if reason is not None or following is None or affordable is None:

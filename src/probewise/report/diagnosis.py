@@ -385,8 +385,8 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
             figure(
                 drawn["gain.svg"],
                 f"Gain in log predictive density of each held-out {noun_of_held_out_part(diagnosis)}, both models "
-                "fitted to the others: blue where the repaired model predicts better, orange where worse. Grey: mean over "
-                "all, with standard error.",
+                "fitted to the others: blue where the repaired model predicts better, orange where worse. Grey: mean "
+                "over all, with standard error.",
             ),
         )
         if "gain.svg" in drawn

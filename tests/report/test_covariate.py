@@ -46,3 +46,5 @@ def test_the_band_of_chance_is_as_wide_as_each_readings_own_noise():
         null=SimpleNamespace(theta=np.zeros((3, 1)), chain=chain),
     )
     np.testing.assert_allclose(ResidualNoise.of_diagnosis(diagnosis).sd, [0.5, 0.5, 1.0, 3.0])
+    diagnosis.report.noise.parameters.append(SimpleNamespace(name="step", mean=12**0.5))
+    np.testing.assert_allclose(ResidualNoise.of_diagnosis(diagnosis).sd, np.hypot([0.5, 0.5, 1.0, 3.0], 1.0))

@@ -72,6 +72,7 @@ class ResidualNoise:
             level = diagnosis.repair.after.readings
             share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
             sd = sd * np.sqrt(1 + found["ratio"] * share)
+        sd = np.hypot(sd, found.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
         null = diagnosis.null
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
         return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, plan))

@@ -24,6 +24,7 @@ class PriorOdds:
     `complexity_penalty` (nats) is the penalty of an effect per Gaussian of the SSF that it makes superfluous, since
     physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is that of an unknown effect.
     `unknown_explains_most`: an unknown effect is the verdict only if it has more evidence than each named one alone.
+    `named_needs_half`: effects on the mean are `named` only with half the probability, whatever noise is beside them.
     `twofold` are the effects that may occur twice; `twice` is the probability that one does, given that it occurs;
     None: that of any second effect.
     """
@@ -42,6 +43,7 @@ class PriorOdds:
     complexity_penalty: float = 8.0
     unknown_complexity_penalty: float = 24.0
     unknown_explains_most: bool = False
+    named_needs_half: bool = False
     twice: float | None = None
     twofold: frozenset[str] = frozenset()
 

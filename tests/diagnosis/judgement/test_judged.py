@@ -8,10 +8,10 @@ from probewise.diagnosis.judgement.judged import Hypothesis, Judged, ranked_hypo
 NOISE = frozenset({"outliers"})
 
 
-def verdict(probabilities, *, p_value=1e-6, aliases=(), same=()):
+def verdict(probabilities, *, p_value=1e-6, aliases=(), same=(), **more):
     found = ranked_hypotheses(probabilities)
     return verdict_and_combination(
-        found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same)
+        found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same), **more
     )
 
 
@@ -52,6 +52,15 @@ def test_a_class_of_aliases_that_holds_half_is_not_told_apart():
     pair = Alias(("backlash", "lag"), 1.0, "scan faster", 26)
     assert verdict(two) == ("named", ("lag",))
     assert verdict(two, aliases=(pair,)) == ("cannot_tell", ("lag",))
+
+
+def test_of_a_simulator_nothing_is_named_below_one_half():
+    """Whatever noise is beside it counts; a light sensor's contract names the leader of several."""
+    three = {(("lag",), ()): 0.4, (("drift",), ()): 0.3, (("glint",), ()): 0.3}
+    assert verdict(three) == ("named", ("lag",))
+    assert verdict(three, named_needs_half=True) == ("cannot_tell", ("lag",))
+    noisy = {(("lag",), ()): 0.4, (("lag",), ("outliers",)): 0.2, (("glint",), ()): 0.4}
+    assert verdict(noisy, named_needs_half=True) == ("named", ("lag",))
 
 
 def test_what_fails_on_held_out_readings_is_withdrawn():

@@ -121,6 +121,7 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
             aliases=pairs,
             aliased_with=aliased_combinations,
             certain=frozenset(searched.certain),
+            named_needs_half=searched.prior.named_needs_half,
         )
     )
     if (
@@ -175,12 +176,19 @@ def verdict_and_combination(
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
     certain: frozenset[str] = frozenset(),
+    named_needs_half: bool = False,
 ) -> tuple[Verdict, Names]:
     """Return the verdict and the combination it names; effects on the mean also need a global test with p up to .01.
 
-    Effects in `certain`, which the readings show beyond doubt, need no significant test.
+    Effects in `certain`, which the readings show beyond doubt, need no significant test. With `named_needs_half`, they
+    also need half the probability, whatever effects on the noise are beside them; otherwise the verdict is
+    `cannot_tell`, with the combination.
     """
     verdict, combination = verdict_from_probabilities(hypotheses, noise_names, aliases, aliased_with)
+    if verdict == "named" and named_needs_half:
+        mean = {*combination} - noise_names
+        if sum(h.probability for h in hypotheses if {*h.effects} - noise_names == mean) < 0.5:
+            verdict = "cannot_tell"
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
 

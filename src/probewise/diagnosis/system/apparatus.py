@@ -142,6 +142,7 @@ class SimulatorApparatus:
             not_white_alone=_NOT_WHITE_ALONE,
             twice=_TWICE,
             unknown_explains_most=True,
+            named_needs_half=True,
         )
 
     def null_forms(self, recording: Recording) -> Any:

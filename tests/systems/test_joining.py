@@ -53,3 +53,24 @@ def test_a_renamed_run_is_not_merged_with_another_run_of_its_table():
     joined, _ = concatenate_tables([runs((20.0,)), runs((25.0, 26.0), names=("1", "1 (2)"))], ["a.csv", "b.csv"])
     assert joined.scan_names == ("1", "1 (3)", "1 (2)")
     assert len(set(joined.scan.tolist())) == 3
+
+
+def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
+    first = RunTable({"day": [1.0, 1.0, 2.0], "x": [1.0, 2.0, 3.0]}, run="day")
+    advised = RunTable({"day": ["1 again", "1 again"], "x": [1.0, 2.0]}, run="day")
+    joined, _ = concatenate_tables([first, advised], ["a.csv", "next.csv"])
+    assert joined.scan_names == ("1", "2", "1 again")
+    assert list(joined.columns) == ["day", "x"]
+    assert concatenate_tables([advised, first], ["next.csv", "a.csv"])[0].scan_names == ("1 again", "1", "2")
+
+
+def test_a_column_of_remarks_may_be_empty_in_one_table():
+    empty, written = RunTable({"x": [1.0], "note": [np.nan]}), RunTable({"x": [2.0], "note": ["rain"]})
+    for tables, expected in (([empty, written], ["", "rain"]), ([written, empty], ["rain", ""])):
+        assert concatenate_tables(tables, ["a.csv", "b.csv"])[0].columns["note"].tolist() == expected
+
+
+def test_a_text_that_is_a_number_in_the_second_table_is_the_same_text():
+    first, second = RunTable({"batch": ["2", "2b"]}), RunTable({"batch": [2.0, 3.0]})
+    joined, _ = concatenate_tables([first, second], ["a.csv", "b.csv"])
+    assert joined.columns["batch"].tolist() == ["2", "2b", "2", "3"]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise.errors import ParameterError
+from probewise.recordings.table import number_text
 from probewise.systems.table import RunTable
 
 _FILE = "file"
@@ -52,12 +53,14 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
         ]
         beyond = [name for name in table.columns if name not in first.columns]
         notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
+    run = first.run or unused_name(_FILE, first.columns)
+    names = np.array(list(_run_names_by_row(tables, sources, named=first.run is not None)))
     columns = {
-        name: _concatenated_column(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
-        for name in first.columns
+        name: names  # whether they were numbers or texts
+        if name == run
+        else _concatenated_column(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
+        for name in dict.fromkeys((*first.columns, run))
     }
-    run = first.run or unused_name(_FILE, columns)
-    columns[run] = np.array(list(_run_names_by_row(tables, sources, named=first.run is not None)))
     return replace(first, columns=columns, run=run), tuple(notes)
 
 
@@ -72,7 +75,8 @@ def _concatenated_column(
 ) -> NDArray[Any]:
     first = parts[0]
     assert first is not None
-    numeric = first.dtype == np.float64
+    has_texts = any(part is not None and part.dtype != np.float64 for part in parts)
+    numeric = first.dtype == np.float64 and not (has_texts and np.isnan(first).all())
     out: list[NDArray[Any]] = []
     for part, n, source in zip(parts, lengths, sources, strict=True):
         if part is None:
@@ -80,8 +84,12 @@ def _concatenated_column(
         elif numeric and part.dtype != np.float64:
             raise ParameterError(f"column {name!r} of {source}", str(part[0]), f"numbers, as in {sources[0]}")
         else:
-            out.append(part if numeric else np.array([str(value) for value in part.tolist()]))
+            out.append(part if numeric else np.array([_text(value) for value in part.tolist()]))
     return np.concatenate(out)
+
+
+def _text(value: object) -> str:
+    return number_text(value) if isinstance(value, float) else str(value)
 
 
 def _run_names_by_row(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> Iterable[str]:

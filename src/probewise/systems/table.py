@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from functools import cached_property
 from numbers import Real
 from typing import Any, ClassVar, cast
@@ -57,7 +58,11 @@ class RunTable:
         if not hasattr(self.columns, "items"):
             allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
             raise ParameterError("table", self.columns, allowed)
-        columns = {name: _checked_column(name, values) for name, values in self.columns.items()}
+        columns: dict[str, NDArray[Any]] = {}
+        for name, values in self.columns.items():
+            if name in columns:  # a data frame may have two of one name
+                raise ParameterError("columns", name, "each column once")
+            columns[name] = _checked_column(name, values)
         if not columns:
             raise ParameterError("columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -212,10 +217,13 @@ def relative_sds_of_column(table: RunTable, column: str, typical: float | None =
 
 
 def _checked_column(name: str, values: Any) -> NDArray[Any]:
+    if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
+        missing = np.nan if values.dtype.kind in "biufO" else ""
+        values = np.ma.filled(values.astype(np.object_), missing)
     array = np.asarray(values)
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
-    if array.dtype == object and all(value is None or isinstance(value, Real) for value in array.tolist()):
+    if array.dtype == object and all(value is None or isinstance(value, Real | Decimal) for value in array.tolist()):
         array = array.astype(np.float64)  # None is missing, NaN
     if array.dtype.kind in "biuf":
         return read_only_floats(array)
@@ -242,7 +250,7 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
             columns[name] = table.column_of_numbers(name)
             continue
         try:
-            columns[name] = table.column_of_numbers(name, missing=name != run)
+            columns[name] = table.column_of_numbers(name, missing=name != run, largest=None)
         except FileError:
             columns[name] = np.array(table.cells(name))
     return RunTable(columns, time, run)

@@ -80,7 +80,8 @@ class LawWithEffects:
         self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
     ) -> Mapping[str, Any]:
         """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`."""
-        given = self.law.rates(s, p, u)
+        own = u.copy() if isinstance(u, _ReadTracker) else dict(u)
+        given = self.law.rates(dict(s), dict(p), own)  # copies, which a user's function may change
         if self._has_no_effects:
             return given
         out = {state: given[state] for state in self.law.states}
@@ -405,6 +406,8 @@ class LawInputs:
         sloping: dict[str, FloatArray] = {}
         held: dict[str, NDArray[Any]] = {}
         for name in asked.names:
+            if name not in columns:  # one that the law adds itself
+                continue
             slopes = name == time or (law.hold == "linear" and columns[name].dtype == np.float64)
             (sloping if slopes else held)[name] = _values_at_rows(columns[name], rows)
         return cls(constant, moving, held, sloping)
@@ -445,6 +448,12 @@ class _ReadTracker(dict[str, Any]):
         if name in self:
             self.names[name] = None
         return super().__getitem__(name)
+
+    def copy(self) -> _ReadTracker:
+        """Return a copy whose reads are recorded here."""
+        out = _ReadTracker(dict(super().items()))
+        out.names = self.names
+        return out
 
     def get(self, name: str, default: Any = None) -> Any:
         if name in self:

@@ -72,7 +72,7 @@ class ReferenceFit:
         there = {name: values[None, :] for name, values in self.states.items()}
         nudged = there | {state: there[state] + _NUDGE * np.ptp(there[state])}
         with np.errstate(all="ignore"):
-            apart = np.subtract(*(law.rates(s, parameters, columns)[other] for s in (nudged, there)))
+            apart = np.subtract(*(law.rates(s, dict(parameters), dict(columns))[other] for s in (nudged, there)))
         return bool(np.any(np.abs(apart) > 0))
 
     @property

@@ -8,7 +8,7 @@ import pytest
 from heater import ABOUT, SIMULATOR, TABLE, fitted
 
 from probewise.errors import FileError, ParameterError
-from probewise.systems import FittedSystem
+from probewise.systems import FittedSystem, Simulator
 from probewise.systems.forms import bind_forms
 from probewise.systems.forms.rebinding import extract_stored_fit, rebind_forms
 
@@ -44,6 +44,14 @@ def test_fewer_than_500_samples_are_refused():
     whole = fitted()
     with pytest.raises(ParameterError, match="500 or more"):
         dataclasses.replace(whole, samples=whole.samples[:499], noise_sd=whole.noise_sd[:499])
+
+
+def test_a_parameter_may_have_brackets_in_its_name():
+    simulator = Simulator("y", "V", {"c[0]": (0, 1), "c[1]": (0, 1)}, simulate=lambda p, data: p["c[0]"] * data["x"])
+    made = FittedSystem(simulator, names=("c[0]", "c[1]"), samples=np.full((500, 2), 0.5), noise_sd=np.ones(500))
+    assert made.names == ("c[0]", "c[1]")
+    with pytest.raises(ParameterError, match=r"c\[1\] is missing"):
+        dataclasses.replace(made, names=("c[0]",), samples=made.samples[:, :1])
 
 
 def test_every_form_that_is_bound_again_does_what_it_did():

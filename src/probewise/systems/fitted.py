@@ -88,8 +88,12 @@ class FittedSystem(NamedSamples):
 
     def __post_init__(self) -> None:
         samples, noise_sd = checked_samples(self.samples, self.noise_sd, self.names)
-        own = {name.partition("[")[0] for name in self.names if name.partition("[")[0] in self.simulator.parameters}
-        lacking = [name for name in self.simulator.parameters if name not in own]
+        simulator = self.simulator
+        lacking = [
+            name
+            for name in simulator.parameters
+            if not any(own == name or (name in simulator.per_run and own.startswith(f"{name}[")) for own in self.names)
+        ]
         if lacking:
             raise ParameterError("names", self.names, f"all parameters of the simulator; {lacking[0]} is missing")
         if self.known is None and not set(self.effects) <= set(EFFECTS):

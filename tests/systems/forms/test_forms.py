@@ -1,5 +1,7 @@
 """Forms of the vocabulary: each does what its name says, by a route of its own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -85,6 +87,18 @@ def test_settings_of_a_bank_lie_within_the_prior_and_some_can_be_seen(name):
 @pytest.mark.parametrize(("level", "cut"), [(0.9, np.minimum), (-0.9, np.maximum)])
 def test_saturation_is_a_ceiling_above_the_middle_of_the_readings_and_a_floor_below(level, cut):
     np.testing.assert_allclose(_read("saturation", level), cut(NOTHING, level))
+
+
+def test_the_code_of_an_error_beyond_the_declared_range_is_no_end_of_the_readings():
+    simulator = replace(_simulator(), noise=Noise(sd=SD, range=(-10.0, 10.0)))
+    system = System.of(simulator, TABLE)
+    levels = []
+    for codes in ([], [9999.0, -9999.0]):
+        table = TABLE.with_columns({"y": np.append(np.linspace(-1, 2, N_ROWS - len(codes)), codes)})
+        form = bind_forms(ReferenceFit(system, table, np.zeros(system.n_params), SD))["saturation"]
+        levels.append((form.prior.from_unit_cube(np.array([[0.0], [1.0]])), form.bank()))
+    np.testing.assert_array_equal(levels[0][0], levels[1][0])
+    np.testing.assert_array_equal(levels[0][1], levels[1][1])
 
 
 def test_a_gain_counts_from_the_reading_of_nothing():

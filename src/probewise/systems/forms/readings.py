@@ -307,7 +307,12 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     if not low < high:
         return
     readings = about.table.columns[about.system.simulator.reading]
-    least, most = (float(end(readings[np.isfinite(readings)])) for end in (np.min, np.max))
+    readings = readings[np.isfinite(readings)]
+    lowest, highest = about.system.simulator.noise.range
+    within = readings >= (-np.inf if lowest is None else lowest)
+    within &= readings <= (np.inf if highest is None else highest)
+    # Outside the declared range are no readings of the quantity, such as 9999 for an error.
+    least, most = (float(end(readings[within] if within.any() else readings)) for end in (np.min, np.max))
 
     # Clipped readings end at the limit: a limit in the upper half of their range is a ceiling, in the lower half a
     # floor.

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis import diagnose_system
+from probewise.diagnosis import audit_system, diagnose_system
 from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.errors import ParameterError
 from probewise.systems import Law, Simulator, table_for
 
 _N = 40
@@ -78,3 +79,30 @@ def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column(
     prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": 1.0 + 2.0 * np.nan_to_num(x) + _Y - 1}))
     assert {"periodic_error:x", "input_gain:x", "sensitivity:x"} <= set(prepared.effects)
     assert np.isfinite(prepared.effects["periodic_error:x"].bank()).all()
+
+
+def test_an_sd_of_0_where_nothing_was_read_does_not_count():
+    """Where most rows had none, the noise was 0: a division by it ended the diagnosis, and the audit saw everything."""
+    read = np.arange(_N) % 3 == 0
+    table = {"x": _X, "sd": np.where(read, 0.05, 0.0), "y": np.where(read, _Y, np.nan)}
+    simulator = _line(noise={"sd": "sd"})
+    assert prepare_system(simulator, table_for(simulator, table)).apparatus.about.sd == 0.05
+    assert "noise 0.05 V" in audit_system(simulator, table).assumed
+
+
+def test_a_row_that_no_reading_can_be_predicted_for_is_refused():
+    """Without a reading too: no effect on the mean was looked for, since none had a finite change there."""
+    x = np.where(np.arange(_N) < 5, -1.0, _X + 1)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + np.log(u["x"]))
+    table = table_for(simulator, {"x": x, "y": np.where(x < 0, np.nan, _Y)})
+    with pytest.raises(ParameterError, match=r"no finite reading in 5 of 40 rows, first in row 2'"):
+        prepare_system(simulator, table)
+    assert prepare_system(simulator, table, with_effects=False).recording.usable.sum() == _N - 5
+
+
+def test_a_missing_reading_is_no_reason_why_a_law_predicts_nothing_later_in_the_run():
+    law = Law({"s": 0.0}, lambda s, p, u: {"s": p["a"] + 0 * s["s"]}, lambda s, p, u: s["s"] + np.sqrt(10 - u["t"]))
+    simulator = Simulator("y", "V", {"a": (0, 1)}, law=law, time="t")
+    table = table_for(simulator, {"t": _T, "y": np.where(np.arange(_N) == 2, np.nan, _Y)})
+    with pytest.raises(ParameterError, match=r"rates is 'no finite reading in 19 of 40 rows, first in row 23'"):
+        prepare_system(simulator, table)

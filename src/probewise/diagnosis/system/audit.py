@@ -111,8 +111,8 @@ def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: Float
     declared = simulator.noise.sd
     if isinstance(declared, str):
         values = table.columns.get(declared)
-        if values is not None and values.dtype == np.float64 and np.isfinite(values).any():
-            return float(np.nanmedian(values)), f"the median of {declared}"
+        if values is not None and values.dtype == np.float64 and (values > 0).any():
+            return float(np.median(values[np.isfinite(values) & (values > 0)])), f"the median of {declared}"
     elif declared is not None:
         return float(declared), "as declared"
     return _NOISE * float(np.ptp(predicted)), "a hundredth of the range of the readings, since none is declared"

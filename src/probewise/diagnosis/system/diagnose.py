@@ -124,7 +124,7 @@ def prepare_system(
     """Fit the simulator, and build the engine's input; effects are scaled to the fit, none unless `with_effects`."""
     recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
-    plan, recording = recording.plan, without_unpredictable_readings(system, recording)
+    plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)
     if recording.plan is not plan:
         table = replace(table, columns=cast(RunTable, recording.plan).columns)
     recording, stop = without_readings_at_stop(simulator, table, recording)
@@ -144,7 +144,7 @@ def _progress_with_call_count(progress: Progress, system: System) -> Progress:
     return progress if system.caller is None else ProgressWithCallCount(progress, system.caller)
 
 
-def without_unpredictable_readings(system: System, recording: RunRecording) -> RunRecording:
+def without_unpredictable_readings(system: System, recording: RunRecording, *, every_row: bool = False) -> RunRecording:
     """Leave out, with a note, the readings of rows in which a missing column makes a prediction impossible.
 
     If there is such a row, missing values of all columns are interpolated from the other rows of the run, so that
@@ -153,7 +153,8 @@ def without_unpredictable_readings(system: System, recording: RunRecording) -> R
     Raises
     ------
     ParameterError
-        If the simulator gives no finite reading in a row where no column is missing.
+        If the simulator gives no finite reading in a row where no column is missing: one with a reading or, if
+        `every_row`, any, since the change by an effect would not be finite there.
     """
     table = cast(RunTable, recording.plan)
     tried = system.chain(table, ()).predict(system.theta(system.starts), table)
@@ -163,24 +164,21 @@ def without_unpredictable_readings(system: System, recording: RunRecording) -> R
     if not unpredictable.any():
         return recording
     missing = np.zeros(len(table), dtype=np.bool_)
-    for values in table.covariates.values():
+    no_inputs = system.simulator.reading, system.simulator.noise.sd
+    inputs = {name: values for name, values in table.covariates.items() if name not in no_inputs}
+    for values in inputs.values():
         missing |= ~np.isfinite(values)
     if system.simulator.law is not None:  # what is missing once is missing to the end of its run
         for rows in table.rows_by_scan():
             missing[rows] = np.maximum.accumulate(missing[rows])
-    wrong = np.flatnonzero(lost & ~missing)
+    wrong = np.flatnonzero((unpredictable if every_row else lost) & ~missing)
     if wrong.size:
         what = "simulate" if system.simulator.law is None else "rates"
         where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + 2}"
-        raise ParameterError(what, where, "a finite reading in each row somewhere in the prior")
+        allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
+        raise ParameterError(what, where, allowed)
     note = f"{int(lost.sum())} readings left out: a column that the simulator reads is missing there"
-    filled = table.with_columns(
-        {
-            name: table.interpolated_within_runs(values)
-            for name, values in table.covariates.items()
-            if name not in (system.simulator.reading, system.simulator.noise.sd)
-        }
-    )
+    filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
     return replace(
         recording,
         plan=cast(Plan, filled),
@@ -334,7 +332,7 @@ def _noise_sd_of(simulator: Simulator, table: RunTable, recording: Recording, fo
     declared = simulator.noise.sd
     if isinstance(declared, str):
         values: FloatArray = table.covariates[declared]
-        return float(np.median(values[np.isfinite(values)]))
+        return float(np.median(values[np.isfinite(values) & (values > 0)]))  # 0 in rows without a reading
     if declared is not None:
         return float(declared)
     rough = rough_sd(recording)

@@ -8,9 +8,9 @@ import pytest
 from heater import ABOUT, SIMULATOR, TABLE, fitted
 
 from probewise.errors import FileError, ParameterError
-from probewise.systems import FittedSystem, Simulator
+from probewise.systems import FittedSystem, Law, RunTable, Simulator
 from probewise.systems.forms import bind_forms
-from probewise.systems.forms.rebinding import extract_stored_fit, rebind_forms
+from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit, rebind_forms
 
 
 def test_what_is_written_is_read_back_bit_for_bit():
@@ -65,3 +65,17 @@ def test_every_form_that_is_bound_again_does_what_it_did():
         theta = np.concatenate([ABOUT.theta, own], axis=1)
         first, second = (ABOUT.system.chain(TABLE, [f]).predict(theta, TABLE) for f in (form, again[name]))
         np.testing.assert_array_equal(first, second, err_msg=name)
+
+
+def test_forms_are_bound_again_without_a_call_of_rates():
+    """They were called at the middle of the prior, where they may raise."""
+
+    def rates(s, p, u):
+        raise ValueError("no such tank")
+
+    law = Law({"upper": 0.0, "lower": 0.0}, rates)
+    simulator = Simulator("y", "V", {"a": (0, 1)}, law=law, time="t")
+    level = np.linspace(0.0, 1.0, 20)
+    table = RunTable({"t": np.arange(20.0), "y": level}, "t")
+    known = StoredFit(table, level, {"upper": level, "lower": level**2})
+    assert rebind_forms(["limit:upper"], simulator, known).keys() == {"limit:upper"}

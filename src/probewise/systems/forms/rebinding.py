@@ -55,6 +55,9 @@ class _StoredReferenceFit(ReferenceFit):
     def can_fit_value_per_run(self) -> bool:
         return len(self.table.scan_names) > 1
 
+    def state_drives_rate(self, state: str, other: str) -> bool:
+        return False  # it matters to priors only
+
     def is_held_between_rows(self, column: str) -> bool:
         assert self.known is not None
         return column in self.known.held

@@ -64,3 +64,8 @@ def test_no_command_has_more_than_102_readings():
 def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
     table = runs((20.0, 21.0), names=("1", "1 again"))
     assert list(offered((), table)) == ["1 again (2)", "1 again again"]
+
+
+def test_runs_that_differ_in_a_small_control_are_each_taken_again():
+    table = TABLE.with_columns({"power_w": 1e-10 * TABLE.columns["power_w"]})
+    assert offered(table=table).keys() == offered().keys()

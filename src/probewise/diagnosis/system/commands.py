@@ -171,9 +171,10 @@ def plan_in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
 def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
     """Return the row numbers of the first four runs, of four rows or more, that differ in their controls."""
     seen: dict[tuple[object, ...], IntArray] = {}
+    size = {name: float(np.nanmax(np.abs(table.covariates[name]))) or 1.0 for name in controls}
     for rows in table.rows_by_scan():
         if len(rows) >= _LEAST_ROWS:
-            own = tuple(np.round(table.covariates[name][rows], 9).tobytes() for name in controls)
+            own = tuple(np.round(table.covariates[name][rows] / size[name], 9).tobytes() for name in controls)
             seen.setdefault(own or (int(table.scan[rows[0]]),), rows)
     return list(seen.values())[:_MOST_RUNS]
 

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_text, checked_texts, require_callable, require_kind, require_mapping
+from probewise.effects import EFFECTS
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
+from probewise.sensor import Stage
 from probewise.systems.table import RunTable
 
 Values: TypeAlias = Mapping[str, Any]
@@ -31,6 +33,8 @@ Observe: TypeAlias = Callable[[Values, Values, Values], Any]
 """Function of states, parameters and columns; returns the noise-free reading."""
 
 Hold: TypeAlias = Literal["previous", "linear"]
+
+_TAKEN = (*(n for n, kind in EFFECTS.items() if getattr(kind, "stage", None) is Stage.NOISE), "unknown", "clean")
 
 
 @dataclass(frozen=True)
@@ -232,6 +236,8 @@ class Simulator:
                 raise ParameterError(f"extra[{name!r}].null", effect.null, "a finite number, at which it is absent")
             if name in self.parameters:
                 raise ParameterError("extra", name, "names that no parameter has")
+            if name in _TAKEN:
+                raise ParameterError("extra", name, f"names that no effect on the noise has: {', '.join(_TAKEN)}")
 
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:

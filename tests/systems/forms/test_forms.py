@@ -7,6 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 from probewise.effects import is_out_of_vocabulary
+from probewise.errors import ParameterError
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.proposals import formula_forms
@@ -389,3 +390,22 @@ def test_a_dose_is_the_integral_over_time_in_a_table_of_one_row_too():
             ABOUT.theta, first
         )
         assert change[0, 0] == 0.0
+
+
+def test_an_extra_effect_has_no_name_of_an_effect_on_the_noise():
+    """It was replaced by that effect, which then counted as the user's own."""
+    for name in ("outliers", "unknown"):
+        with pytest.raises(ParameterError, match=name):
+            _simulator(extra={name: Extra((0, 1), 0.0, "{value}")})
+
+
+def test_the_rates_of_a_law_lack_nothing_where_no_time_passes():
+    law = Law(
+        {"s": "offset"}, lambda s, p, u: {"s": p["gain"] * u["drive"] - s["s"]}, lambda s, p, u: s["s"] + u["drive"]
+    )
+    simulator = Simulator("y", "V", {"offset": (-5, 5), "gain": (0, 4)}, law=law, time="t_s", run="run")
+    table = TABLE.with_columns({"t_s": np.zeros(N_ROWS)})
+    system = System.of(simulator, table)
+    names = bind_forms(ReferenceFit(system, table, np.zeros(system.n_params), SD))
+    assert {"sensitivity:room_c", "offset_per_run"} <= names.keys()
+    assert not any(name.endswith(":s") for name in names)

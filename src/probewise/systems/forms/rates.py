@@ -28,6 +28,8 @@ Of = Callable[[Any, Any], Any]
 
 def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each term that may be missing from the rate of a state, for friction and for bounds."""
+    if not about.table.has_varying_time:  # nothing moves
+        return
     for state, values in about.states.items():
         size = float(np.nanmax(np.abs(values))) or 1.0
         own = f"{state} per {about.time_unit}"

@@ -6,6 +6,7 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.residuals.bases import bank_of_unknown_effects
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places_of_effect, significant_places
@@ -109,3 +110,14 @@ def test_a_reading_that_depends_on_a_column_called_scan_is_found_in_it():
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"], time="t_s")
     found = diagnose_system(simulator, {"t_s": _T, "x": _X, "scan": scan, "y": y}, rng=np.random.default_rng(1))
     assert found.where[0].covariate == diagnosis_json(found)["where"][0]["covariate"] == "scan"
+
+
+def test_samples_of_an_effect_are_its_own_beside_a_column_whose_name_goes_on_with_a_point():
+    """As "x.1", which is how data frames name the second of two columns: their average ended in a traceback."""
+    prepared = _prepared({"x.1": _RNG.normal(size=_N)})
+    table, system = prepared.recording.plan, prepared.apparatus.system
+    effects = [prepared.effects[name] for name in ("sensitivity:x", "sensitivity:x.1")]
+    samples = ModelSamples(system.chain(table, effects), np.array([[1.0, 2.0, 3.0]]), np.ones(1), (), 0)
+    alone = ModelSamples(system.chain(table, effects[1:]), np.array([[1.0, 3.0]]), np.ones(1), (), 0)
+    assert [samples.effect_samples(effect.name).tolist() for effect in effects] == [[[2.0]], [[3.0]]]
+    assert alone.effect_samples("sensitivity:x").shape == (1, 0)

@@ -72,8 +72,9 @@ class ModelSamples:
 
     def effect_samples(self, effect: str) -> FloatArray:
         """Return the samples of one effect's parameters, (n_samples, n_params of the effect)."""
-        at = [i for i, name in enumerate(self.chain.names) if name.startswith(f"{effect}.")]
-        return self.theta[:, at]
+        effects = cast(Iterable[NamedEffect[Any]], self.chain.effects)
+        own = {f"{effect}.{name}" for each in effects if each.name == effect for name in each.prior.names}
+        return self.theta[:, [i for i, name in enumerate(self.chain.names) if name in own]]
 
     columns = effect_samples
     """The old name of `effect_samples`."""

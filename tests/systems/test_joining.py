@@ -11,8 +11,9 @@ from probewise.systems import RunTable, concatenate_tables
 
 
 def test_runs_of_one_name_in_two_tables_are_two_runs():
-    joined, _ = concatenate_tables([runs((20.0, 21.0)), runs((25.0,))], ["a.csv", "b.csv"])
+    joined, notes = concatenate_tables([runs((20.0, 21.0)), runs((25.0,))], ["a.csv", "b.csv"])
     assert joined.scan_names == ("1", "2", "1 (2)")
+    assert notes == ("runs of b.csv renamed, as another table has them too: 1 is 1 (2)",)
 
 
 def test_a_column_that_the_second_lacks_is_missing_there_and_noted():

@@ -32,7 +32,7 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
 
     Returns
     -------
-    The table, and notes on the missing and the omitted columns.
+    The table, and notes on missing and omitted columns and on renamed runs.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
             raise ParameterError("tables", f"{one} and {another}", "tables that differ; these hold the same rows")
     if len(tables) == 1:
         return tables[0], ()
-    first, notes = tables[0], []
+    first, notes = tables[0], list[str]()
     for source, table in zip(sources[1:], tables[1:], strict=True):
         notes += [
             f"{source} has no column {name}: missing there" for name in first.columns if name not in table.columns
@@ -54,7 +54,12 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
         beyond = [name for name in table.columns if name not in first.columns]
         notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
     run = first.run or unused_name(_FILE, first.columns)
-    names = np.array(list(_run_names_by_row(tables, sources, named=first.run is not None)))
+    by_table = _distinct_run_names(tables, sources, named=first.run is not None)
+    if first.run is not None:
+        for source, own in zip(sources, by_table, strict=True):
+            if renamed := [f"{name} is {new}" for name, new in own.items() if new != name]:
+                notes.append(f"runs of {source} renamed, as another table has them too: {', '.join(renamed)}")
+    names = np.concatenate([np.array([*own.values()])[t.scan] for t, own in zip(tables, by_table, strict=True)])
     columns = {
         name: names  # whether they were numbers or texts
         if name == run
@@ -92,9 +97,10 @@ def _text(value: object) -> str:
     return number_text(value) if isinstance(value, float) else str(value)
 
 
-def _run_names_by_row(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> Iterable[str]:
-    """Yield the name of each row's run, with a number appended if a run of an earlier table has that name."""
+def _distinct_run_names(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> list[dict[str, str]]:
+    """Return for each table the names of its runs, in order: a number is appended to one that an earlier table has."""
     taken: set[str] = set()
+    out: list[dict[str, str]] = []
     for table, source in zip(tables, sources, strict=True):
         names: tuple[str, ...] = table.scan_names if named else (source,)
         own: dict[str, str] = {}
@@ -102,7 +108,8 @@ def _run_names_by_row(tables: Sequence[RunTable], sources: Sequence[str], *, nam
             # A new name must not be one of this table's own either, which follows unchanged.
             own[name] = unused_name(name, taken | set(own.values()) | (set(names) - {name}))
         taken |= set(own.values())
-        yield from (own[names[k]] for k in table.scan.tolist())
+        out.append(own)
+    return out
 
 
 def unused_name(name: str, taken: Iterable[str]) -> str:

@@ -95,6 +95,15 @@ def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path
     assert "states temp_c" in said
 
 
+def test_a_mistake_in_observe_is_told_of_observe(capsys, tmp_path):
+    law = FILE.partition("def simulate")[0] + (
+        'states = {"warm": 0.0}\ndef rates(s, p, u):\n    return {"warm": -s["warm"] / p["tau_s"]}\n'
+        'def observe(s, p, u):\n    return s["hot"]\n'
+    )
+    said = refused(capsys, tmp_path, law)
+    assert "row 13: observe raises KeyError: 'hot'; allowed: columns" in said
+
+
 def test_a_sensor_beside_a_simulator_is_refused(capsys, tmp_path):
     assert "--sensor is 's.json'; allowed: none with --simulator" in refused(
         capsys, tmp_path, FILE, "--sensor", "s.json"

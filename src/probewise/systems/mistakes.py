@@ -30,6 +30,9 @@ def user_function_error(
         The simulator, and the columns passed to the function.
     """
     where = _files_of_user_functions(simulator)
+    if simulator.law is not None and simulator.law.observe is not None:
+        raised_in = {frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)}
+        what = "observe" if getattr(simulator.law.observe, "__code__", None) in raised_in else what
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename in where]
     said = " ".join(str(error).split())
     said = said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."

@@ -45,6 +45,8 @@ def test_two_columns_of_one_name_are_refused():
 
 def test_large_numbers_in_a_file_are_numbers(tmp_path):
     path = tmp_path / "diode.csv"
-    path.write_text("doping_per_m3,u_v\n1e22,0.1\n3e23,\n", encoding="utf-8")
-    table = read_run_table(path, time=None, run=None)
+    rows = "9007199254740992,1e22,0.1\n9007199254740993,3e23,\n"
+    path.write_text(f"run,doping_per_m3,u_v\n{rows}", encoding="utf-8")
+    table = read_run_table(path, time=None, run="run")
+    assert table.scan_names == ("9007199254740992", "9007199254740993")
     np.testing.assert_array_equal(table.covariates["doping_per_m3"], [1e22, 3e23])

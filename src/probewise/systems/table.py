@@ -17,7 +17,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
-from probewise.recordings.table import csv_text, number_text, read_table
+from probewise.recordings.table import LARGEST, csv_text, number_text, read_table
 
 _ONE_RUN = "all"
 _OF_COLUMN = "column:"
@@ -250,7 +250,9 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
             columns[name] = table.column_of_numbers(name)
             continue
         try:
-            columns[name] = table.column_of_numbers(name, missing=name != run, largest=None)
+            # Names of runs beyond 1e15 stay texts: as numbers some would be equal.
+            of_runs = name == run
+            columns[name] = table.column_of_numbers(name, missing=not of_runs, largest=LARGEST if of_runs else None)
         except FileError:
             columns[name] = np.array(table.cells(name))
     return RunTable(columns, time, run)

@@ -306,3 +306,10 @@ def test_a_column_with_a_colon_in_its_name_that_an_effect_reads_must_be_there():
     np.testing.assert_allclose(predicted(model, table).mean, x[0] + x[1] - x[1].mean())
     with pytest.raises(ParameterError, match="room:c"):
         predicted(model, {"x": x[0]})
+
+
+def test_a_row_that_no_sample_predicts_is_told():
+    simulator = Simulator("y", "V", {"a": (0, 1)}, simulate=lambda p, u: p["a"] + np.log(u["x"]))
+    model = FittedSystem(simulator, names=("a",), samples=np.full((500, 1), 0.5), noise_sd=np.ones(500))
+    with pytest.raises(ParameterError, match=r"simulate is 'no finite reading in 1 of 3 rows, first in row 4'"):
+        predicted(model, {"x": [1.0, 2.0, -1.0]})

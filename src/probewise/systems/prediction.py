@@ -158,22 +158,28 @@ def predict_system(
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
     given, lost = _filled_table_and_unpredictable_mask(chain, theta, own)
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
-    n_failed = 0
+    n_failed, never = 0, np.ones(len(own), dtype=np.bool_)
     between = _smoothing_width_by_row(chain, theta, given) if is_drawn else None
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
         mean = np.where(lost, 0.0, chain.predict(block, given))
         there = np.isfinite(mean).all(axis=1)
+        never &= ~np.isfinite(mean).any(axis=0)
         n_failed += int((~there).sum())
         if there.any():
             sd = fitted.noise_sd[first : first + per_block][there, None]
             mixture.add(mean[there], _noise_parameters(fitted, chain, block[there], mean[there], sd, own), between)
     if n_failed == n_samples:
+        rows = (
+            f" in {int(never.sum())} of {len(own)} rows, first in row {int(np.argmax(never)) + 2}"
+            if never.any()
+            else ""
+        )
         raise ParameterError(
             "simulate" if system.caller else "rates",
-            "no finite reading",
-            "finite readings of these rows for some of the samples",
+            f"no finite reading{rows}",
+            "finite readings of all rows for some of the samples",
         )
     if n_failed:
         warnings.warn(

@@ -309,7 +309,7 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
         if name in forms:
             out.append(forms[name])
         elif name == RandomWalk.name:
-            out.append(RandomWalk(n_before=0 if fitted.known is None else len(fitted.known.table)))
+            out.append(RandomWalk(n_before=table.first_row))
         elif name == NoisePerRun.name:
             seen = () if fitted.known is None else fitted.known.table.scan_names
             out.append(NoisePerRun(tuple(dict.fromkeys((*seen, *table.scan_names)))))

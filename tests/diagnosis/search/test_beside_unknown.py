@@ -18,6 +18,15 @@ def test_a_name_stands_beside_what_is_unknown_in_its_share_of_the_evidence():
     assert Searched.effect_probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
 
 
+def test_each_order_of_the_ssf_counts_with_its_own_evidence():
+    """A second order 20 nats behind, in which `lag` alone is likely, changes nothing."""
+    prior = PriorOdds()
+    more = math.log(3.0) + prior.log_prior_with_unknown(()) - prior.log_prior_with_unknown(("lag",))
+    unknown = {(1, (), ()): 10.0, (1, ("lag",), ()): 10.0 + more, (2, (), ()): -40.0, (2, ("lag",), ()): -10.0}
+    searched = SimpleNamespace(evidences=Evidences({}, unknown=unknown), prior=prior, certain=())
+    assert Searched.effect_probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
+
+
 def test_nothing_stands_beside_what_was_not_weighed():
     searched = SimpleNamespace(evidences=Evidences({}), prior=PriorOdds(), certain=())
     assert Searched.effect_probabilities_given_unknown(searched) == {}

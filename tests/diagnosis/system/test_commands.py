@@ -3,9 +3,15 @@
 from typing import cast
 
 import numpy as np
+import pytest
 from heater import runs
 
-from probewise.diagnosis.system.commands import plan_in_sequence, plan_of_alternatives, possible_run_commands
+from probewise.diagnosis.system.commands import (
+    _minutes_of_runs,
+    plan_in_sequence,
+    plan_of_alternatives,
+    possible_run_commands,
+)
 from probewise.systems import RunTable
 
 TABLE = runs()
@@ -69,3 +75,11 @@ def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
 def test_runs_that_differ_in_a_small_control_are_each_taken_again():
     table = TABLE.with_columns({"power_w": 1e-10 * TABLE.columns["power_w"]})
     assert offered(table=table).keys() == offered().keys()
+
+
+@pytest.mark.parametrize(("unit", "minutes"), [("s", 1 / 60), ("min.", 1.0), ("Month", 43_830.0), ("fortnight", None)])
+def test_the_time_that_runs_take_is_in_the_unit_of_the_table(unit, minutes):
+    """Half a minute before each run; of an unknown unit a second a reading."""
+    taken = _minutes_of_runs(TABLE, unit)
+    of_rows = len(TABLE) / 60 if minutes is None else np.ptp(TABLE.time_s) * minutes
+    assert taken == pytest.approx(0.5 + of_rows)

@@ -273,7 +273,7 @@ class Searched:
     def effect_probabilities_given_unknown(self) -> dict[str, float]:
         """Return, by effect, the probability that it acts too, given that an unknown effect acts."""
         scores = {
-            (names, noise): value
+            (order, names, noise): value
             + self.prior.log_prior_with_unknown(names)
             + self.prior.log_prior_on_noise(tuple(n for n in noise if n not in self.certain))
             for (order, names, noise), value in self.evidences.unknown.items()
@@ -282,7 +282,7 @@ class Searched:
         top = max(scores.values(), default=0.0)
         weights = {key: math.exp(score - top) for key, score in scores.items()}
         out: dict[str, float] = {}
-        for (names, _), weight in weights.items():
+        for (_, names, _), weight in weights.items():
             for name in names:
                 out[name] = out.get(name, 0.0) + weight / sum(weights.values())
         return out

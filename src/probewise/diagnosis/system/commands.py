@@ -17,7 +17,17 @@ from probewise.systems.joining import append_tables, unused_name
 
 _LEAST_ROWS = 4
 _MOST_RUNS = 4  # recorded runs to start from
-_MINUTES = {"ms": 1 / 60_000, "s": 1 / 60, "min": 1.0, "h": 60.0, "hour": 60.0, "day": 1440.0, "d": 1440.0}
+_SPELT = {
+    1 / 60_000: "ms millisecond milliseconds",
+    1 / 60: "s sec second seconds",
+    1.0: "min minute minutes",
+    60.0: "h hr hour hours",
+    1440.0: "d day days",
+    10_080.0: "week weeks",
+    43_830.0: "month months",
+    525_960.0: "a yr year years",
+}
+_MINUTES = {unit: minutes for minutes, units in _SPELT.items() for unit in units.split()}
 _A_READING = 1 / 60  # minutes, where no time tells how long one takes
 _BREAK = 0.5  # minutes, before a run
 _RUN = "run"
@@ -184,9 +194,10 @@ def _least_and_greatest(values: FloatArray) -> tuple[float, float]:
 
 
 def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
-    if table.time is None or time_unit not in _MINUTES:
+    minutes = _MINUTES.get(time_unit.strip().rstrip(".").lower())
+    if table.time is None or minutes is None:
         return _BREAK + len(table) * _A_READING
-    return _BREAK + float(np.ptp(table.time_s)) * _MINUTES[time_unit]
+    return _BREAK + float(np.ptp(table.time_s)) * minutes
 
 
 def _list_in_words(names: Mapping[str, object]) -> str:

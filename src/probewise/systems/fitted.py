@@ -22,7 +22,7 @@ from probewise._posterior_samples import (
     require_masks_of_absent_effects,
 )
 from probewise._version import __version__
-from probewise.effects import EFFECTS
+from probewise.effects import EFFECTS, name_without_copy_suffix
 from probewise.errors import FileError, ParameterError, ProbewiseError
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
@@ -33,6 +33,7 @@ from probewise.systems.table import RunTable
 
 FORMAT = "system/1"
 _ORIGINS = 1  # rule by which effects on a recording far from 0 count: files of earlier versions, from 0, have none
+_BEND = 1  # rule by which a bend has its ends: files of earlier versions, at those of the law's predictions, have none
 _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` writes"
 
 
@@ -119,6 +120,10 @@ class FittedSystem(NamedSamples):
     def _counts_from_far_origin(self) -> bool:
         return self.known is not None and counts_from_far_origin(self.effects, self.simulator, self.known)
 
+    @property
+    def _has_bend(self) -> bool:
+        return any(name_without_copy_suffix(name) == "nonlinearity" for name in self.effects)
+
     def to_json(self) -> str:
         """Serialise as strict JSON, format "system/1"."""
         mean, sd, median, interval = self.mean(), self.sd(), self.median(), self.interval()
@@ -143,6 +148,7 @@ class FittedSystem(NamedSamples):
             "level": list(self.level),
             "bound_about": None if self.known is None else _stored_fit_to_json(self.known),
             **({"origins": _ORIGINS} if self._counts_from_far_origin else {}),
+            **({"bend": _BEND} if self._has_bend else {}),
             "notes": list(self.notes),
             "samples": self.samples.tolist(),
         }
@@ -198,6 +204,11 @@ class FittedSystem(NamedSamples):
                 raise FileError(
                     path, f"origins {found!r}: a recording far from 0, of which its effects counted from elsewhere",
                     f"{_ORIGINS}, as a model of this version has; diagnose again",
+                )  # fmt: skip
+            if document.get("bend") != _BEND and fitted._has_bend:
+                raise FileError(
+                    path, f"bend {document.get('bend')!r}: its bend ends elsewhere",
+                    f"{_BEND}, as a model of this version has; diagnose again",
                 )  # fmt: skip
             return fitted
         except FileError:

@@ -22,6 +22,7 @@ from probewise.sensor.stages import effects_with_columns
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 _AS_EXPECTED = 0.5  # of the gain to second order, from which a step without damping is taken without trying others
+_VALLEY_DAMPINGS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # times the curvature along the valley
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
@@ -237,13 +238,21 @@ def _fit_coroutine(
         all_predicted = batch.reshape(len(tries), -1, batch.shape[1])[:, :, usable]
         values = objective(all_predicted[:, 0], tries)
         values = np.where(np.isfinite(values), values, np.inf)
+        if expected > tolerance and not best - values.min() > _AS_EXPECTED * expected:
+            # In a curved valley that is oblique to the coordinates, damping by their scales stops every step.
+            more = np.clip(z + np.clip(_steps_along_valley(curvature, downhill), -2.0, 2.0), -FARTHEST, FARTHEST)
+            found = objective((yield more)[:, usable], more)
+            tries, values = (
+                np.concatenate([tries, more]),
+                np.append(values, np.where(np.isfinite(found), found, np.inf)),
+            )
         at = int(np.argmin(values))
         gained = best - float(values[at])
         settled = gained < tolerance
         if gained <= 0:
             break
         z, best = tries[at], float(values[at])
-        if about:
+        if at < len(about):
             predicted, slopes = _prediction_and_slopes(all_predicted[at], about[at][1])
         else:
             predicted, slopes = yield from request_slopes(z)
@@ -263,6 +272,17 @@ def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
         with contextlib.suppress(np.linalg.LinAlgError):
             solved.append(np.linalg.solve(curvature + np.diag(damping * scale), downhill))
     return np.array(solved).reshape(-1, len(downhill))
+
+
+def _steps_along_valley(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+    """Return steps damped equally in all directions (Levenberg), (n_dampings, n_params).
+
+    The dampings are in terms of the curvature along the principal axis that promises most.
+    """
+    along, axes = np.linalg.eigh(curvature)
+    slope = axes.T @ downhill
+    valley = along[np.argmax(slope**2 / along)]
+    return np.asarray((slope / (along + valley * _VALLEY_DAMPINGS[:, None])) @ axes.T)
 
 
 def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebfit, chebval
 
 from probewise._arrays import FloatArray
 from probewise.priors import LogUniform, Uniform
@@ -16,6 +17,8 @@ from probewise.systems.forms.modulations import Modulation
 from probewise.systems.table import RunTable
 
 _N_SIZES = 9
+_BEND_DEGREE = 4
+_OUTLYING = 5.0  # medians of the residual's size
 
 
 def modulated_form(
@@ -267,8 +270,30 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     )
 
 
+def _expected_range_of_readings(about: ReferenceFit) -> tuple[float, float]:
+    """Return the least and the largest reading to be expected in the table, without noise.
+
+    It is the range of the predicted readings, bent as the recorded ones are: by a polynomial in the predicted reading,
+    fitted to the residuals. Without it a law that lacks a bend misses the ends of the range by many noise sds.
+    """
+    predicted, readings = about.predicted, about.table.columns[about.system.simulator.reading]
+    low, high = float(predicted.min()), float(predicted.max())
+    there = np.isfinite(readings)
+    degree = min(_BEND_DEGREE, np.unique(predicted[there]).size - 1)
+    if not low < high or degree < 1:
+        return low, high
+    level, residual = 2 * (predicted - low) / (high - low) - 1, readings - predicted
+    bend = np.zeros(1)
+    for _ in range(3):  # the last two without outlying residuals
+        bend = chebfit(level[there], residual[there], degree)
+        off = np.abs(residual - chebval(level, bend))
+        there = np.isfinite(readings) & (off <= _OUTLYING * max(np.nanmedian(off), about.sd))
+    bent = predicted + chebval(level, bend)
+    return float(bent.min()), float(bent.max())
+
+
 def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
-    low, high = float(about.predicted.min()), float(about.predicted.max())
+    low, high = _expected_range_of_readings(about)
     if not low < high:
         return
 

@@ -37,16 +37,23 @@ def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
     return kind, rows, {"k": np.array([[k]])}
 
 
+def with_forms(names, numbers, **options):
+    """Simulate the small system with forms of the vocabulary, (n_samples, n_points); also its rows and bare readings."""
+    kind, rows, parameters = small(**options)
+    bare = simulate_noise_free(kind, rows, parameters)
+    true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
+    forms = {form.name: form for form in forms_of(true)}
+    placed = [(forms[name], own) for name, own in zip(names, numbers, strict=True)]
+    return simulate_noise_free(kind, rows, parameters, placed).readings, rows, bare.readings[0]
+
+
 @pytest.fixture
 def solve():
     """Readings of the small system with one form of the vocabulary and its numbers."""
 
     def run(name, numbers, **options):
-        kind, rows, parameters = small(**options)
-        bare = simulate_noise_free(kind, rows, parameters)
-        true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
-        form = next(f for f in forms_of(true) if f.name == name)
-        return simulate_noise_free(kind, rows, parameters, [(form, numbers)]).readings[0], rows, bare.readings[0]
+        found, rows, bare = with_forms([name], [numbers], **options)
+        return found[0], rows, bare
 
     return run
 
@@ -54,14 +61,4 @@ def solve():
 @pytest.fixture
 def simulate_pair():
     """Readings of the small system with two forms of the vocabulary and their numbers, (n_samples, n_points)."""
-
-    def run(names, numbers, **options):
-        kind, rows, parameters = small(**options)
-        bare = simulate_noise_free(kind, rows, parameters)
-        true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
-        forms = {form.name: form for form in forms_of(true)}
-        return simulate_noise_free(
-            kind, rows, parameters, [(forms[n], v) for n, v in zip(names, numbers, strict=True)]
-        ).readings
-
-    return run
+    return lambda names, numbers, **options: with_forms(names, numbers, **options)[0]

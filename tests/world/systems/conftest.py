@@ -38,7 +38,7 @@ def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
 
 
 def with_forms(names, numbers, **options):
-    """Simulate the small system with forms of the vocabulary, (n_samples, n_points); also its rows and bare readings."""
+    """Simulate the small system with forms, (n_samples, n_points); also return its rows and the readings without."""
     kind, rows, parameters = small(**options)
     bare = simulate_noise_free(kind, rows, parameters)
     true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})

@@ -103,10 +103,10 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
     weight[alive] = np.exp(-seeded.log_density_over_prior(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
     # The lighter of two uniform numbers is below a tenth of the other.
     assert abs(weight.mean() - FAINT) < 4 * weight.std() / np.sqrt(len(weight)) < 0.04
-    there, log_drawn = seeded.propose(drawn[alive], rng=rng)
+    there, log_drawn = seeded.propose_moves(drawn[alive], rng=rng)
     assert there.shape == (len(alive), 14)
     assert np.isfinite(log_drawn).mean() > 0.1
-    assert seeded.propose(drawn[:0], rng=rng)[0].shape == (0, 14)
+    assert seeded.propose_moves(drawn[:0], rng=rng)[0].shape == (0, 14)
 
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
@@ -209,7 +209,7 @@ def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
     here, _ = _sorted_draws(prior, 3000, m, rng)
     start = here
     for _ in range(12):
-        there, log_drawn = reference.propose(here, rng=rng)
+        there, log_drawn = reference.propose_moves(here, rng=rng)
         moved = np.isfinite(there).all(axis=1)
         moved[moved] = np.isfinite(prior.log_prob(there[moved])) & (count_bright_gaussians(there[moved]) == m)
         moved &= np.log(rng.random(len(here))) < log_drawn

@@ -108,6 +108,6 @@ def test_a_sharing_density_keeps_the_whole_of_the_gaussians_below() -> None:
         sd = below[:, other].std()
         assert abs(x[:, own].mean() - below[:, other].mean()) < sd
         assert 1.5 < x[:, own].std() / sd < 3.0
-    there, log_drawn = density.propose(possible[:100], rng=rng)
+    there, log_drawn = density.propose_moves(possible[:100], rng=rng)
     assert there.shape == (100, 14)
     assert np.isfinite(log_drawn).any()

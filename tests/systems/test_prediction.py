@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from heater import ABOUT, SIMULATOR, fitted, runs
 
-from probewise.diagnosis.system.commands import plan_in_sequence, possible_run_commands
+from probewise.diagnosis.system.commands import plan_of_sequence, possible_run_commands
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system, write_system_prediction
 from probewise.systems.forms import ReferenceFit, bind_forms
@@ -214,7 +214,7 @@ def test_a_run_that_could_be_recorded_next_comes_after_the_step_at_a_row():
     _, table = _model_with_a_step_at_a_row()
     commands = possible_run_commands(table, "y", ("x",), "s")
     assert {command.table.first_row for command in commands} == {40}
-    assert plan_in_sequence(commands[:2], table).row_number[0] == 40
+    assert plan_of_sequence(commands[:2], table).row_number[0] == 40
 
 
 def _with_missing_power(table, *rows):

@@ -63,7 +63,7 @@ class AllGaussiansBrightDensity:
         theta[~np.isfinite(log_prior)] = np.nan
         return theta
 
-    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def propose_moves(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Propose a draw of this density to each particle, both (n, 6 N + 2), nan where outside the prior.
 
         Also return log density over prior at the particles minus that at the draws, (n,); -inf where there is no draw.

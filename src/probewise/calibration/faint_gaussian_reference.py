@@ -154,7 +154,7 @@ class FaintGaussianReferenceDensity:
             out[which == k] = proposal.draw(rest[which == k], rng=rng)
         return out
 
-    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def propose_moves(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Replace one faint Gaussian: the others shift to compensate, or the new one is split off a bright one.
 
         Return the new parameters, (n, 6 N + 2), nan where there are none; and the log of the density over the prior's
@@ -175,7 +175,7 @@ class FaintGaussianReferenceDensity:
         """Take away any one faint Gaussian, undo the shift of the others, add another one and shift them for it.
 
         The new one may be heavier than other faint ones, so that each of these is moved, not the lightest alone. `here`
-        is sorted; the new one comes last. Return as `propose` does.
+        is sorted; the new one comes last. Return as `propose_moves` does.
         """
         m, n = len(here), self.prior.n_gaussians
         g = here[:, :-2].reshape(m, n, 6)
@@ -316,7 +316,7 @@ class FaintGaussianReferenceDensity:
         return rest, self._log_density_of_split(rest, self.without_last_gaussian(theta), label, theta[:, -8:-2], most)
 
     def _propose_merge_and_split(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Merge a faint Gaussian into a bright one, and split another off a bright one; return as `propose` does."""
+        """Merge a faint Gaussian into a bright one, split another off a bright one; return as `propose_moves` does."""
         m, n = len(here), self.prior.n_gaussians
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         label = rng.integers(self.n_bright, n, size=m)

@@ -53,14 +53,14 @@ class MixedReferenceDensity:
             out[rows] = density.draw(rest[rows], rng=rng)
         return out
 
-    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def propose_moves(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Propose new parameters, (n, 6 N + 2), by one of the densities, drawn for each particle.
 
         Also return that density's log over the prior's at the particles minus that at the new parameters, (n,).
         """
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
         for density, rows in self._assign_rows_to_densities(len(here), rng):
-            there[rows], log_drawn[rows] = density.propose(here[rows], rng=rng)
+            there[rows], log_drawn[rows] = density.propose_moves(here[rows], rng=rng)
         return there, log_drawn
 
     def _assign_rows_to_densities(self, n: int, rng: np.random.Generator) -> list[tuple[ReferenceDensity, IntArray]]:

@@ -119,7 +119,7 @@ class PeakDensity:
         y = self.space.enter(theta)
         return self._log_density_in_coordinates(y) - self.space.leave(y)[1]
 
-    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def propose_moves(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Propose a draw of this density to each particle, both (n, 6 N + 2), nan where outside the prior.
 
         Also return log density over prior at the particles minus that at the draws, (n,); -inf where there is no draw.

@@ -32,7 +32,7 @@ class ReferenceDensity(Protocol):
         """
         ...
 
-    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def propose_moves(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Propose new parameters for particles `here`, both (n, 6 N + 2); nan where there are none.
 
         Also return the log of the density over the prior's at `here`, minus that at the new parameters, (n,).

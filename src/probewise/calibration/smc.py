@@ -413,7 +413,7 @@ def _moved_by_independent_proposals(
     rng: np.random.Generator,
 ) -> _Particles:
     """Propose a draw from the reference to each particle, accepted by the ratio of target over reference density."""
-    there, log_drawn = reference.propose(space.leave(now.x)[0], rng=rng)
+    there, log_drawn = reference.propose_moves(space.leave(now.x)[0], rng=rng)
     with np.errstate(invalid="ignore"):
         new = evaluate_particles(space.enter(there))
         log_accept = (

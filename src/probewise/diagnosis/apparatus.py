@@ -128,6 +128,6 @@ class Apparatus(Protocol):
         """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
         ...
 
-    def plan_in_sequence(self, commands: Sequence[Any], after: Plan) -> Plan:
+    def plan_of_sequence(self, commands: Sequence[Any], after: Plan) -> Plan:
         """Concatenate commands into one plan, timed to be carried out in sequence after a plan."""
         ...

@@ -269,7 +269,7 @@ def sensor_chain_at_means(sensor: FittedSensor, scene: HypothesisScene, *, estim
 
 
 def _marginal_prior_from_samples(samples: FloatArray) -> Marginal:
-    """Return a prior with mean and sd of samples, (n_samples,): log-normal if all are positive, else normal."""
+    """Return a prior fitted to samples, (n_samples,): by mean and sd of their logs if all are positive, else normal."""
     if (samples > 0).all():
         log = np.log(samples)
         return LogNormal(float(np.exp(log.mean())), float(log.std()))

@@ -111,9 +111,9 @@ class CrossedEllipses:
         return np.where((room > 0) & (scale > 0), middle - half, np.inf), middle + half
 
     def footprint_share(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
-        """Return the share of the footprint over the ellipse at `x_mm` of the crossings `crossing`, (n_pairs,) each.
+        """Return the share of the footprint over the ellipse, for a sensor at `x_mm` on the row, (n_pairs,).
 
-        The nearest point is found by one step along the circle of curvature from the point on the same ray.
+        `crossing` are the indices of these pairs of ellipse and row, (n_pairs,).
         """
         out = to_single_precision(np.zeros(x_mm.shape))
         for share, slope, base, axes in zip(self.share, self.slope, self.base, self.axes, strict=True):

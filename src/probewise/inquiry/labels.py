@@ -36,7 +36,7 @@ class ParameterValue:
         """Return the bin of each hypothesis's parameter: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
         if self.name not in names:
             raise ParameterError("parameter", self.name, f"one of {', '.join(names)}")
-        return _bins_of_equal_weight(theta[:, names.index(self.name)], weight, self.n_bins)
+        return _equal_weight_bin_of_each_value(theta[:, names.index(self.name)], weight, self.n_bins)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def _require_enough_bins(n_bins: int) -> None:
         raise ParameterError("n_bins", n_bins, "2 or more")
 
 
-def _bins_of_equal_weight(values: FloatArray, weight: FloatArray, n_bins: int) -> IntArray:
+def _equal_weight_bin_of_each_value(values: FloatArray, weight: FloatArray, n_bins: int) -> IntArray:
     """Return the bin of each value, for bins of equal weight numbered from the lowest."""
     order = np.argsort(values, kind="stable")
     before = np.cumsum(weight[order]) - 0.5 * weight[order]

@@ -20,7 +20,7 @@ from probewise.diagnosis.advice.next_scans import (
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, excerpts_of_scan
-from probewise.diagnosis.light_sensor.scheduling import plan_in_sequence, plan_of_alternatives, scan_started_after
+from probewise.diagnosis.light_sensor.scheduling import plan_of_alternatives, plan_of_sequence, scan_started_after
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
@@ -214,7 +214,7 @@ def test_a_scan_over_a_new_sheet_takes_longer():
     end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))
     later = scan_started_after(new, plan).plan
     assert later.time_s[-1] - end_s == pytest.approx(60.0 * new.minutes)
-    both = plan_in_sequence([again, new], plan)
+    both = plan_of_sequence([again, new], plan)
     assert both.time_s[-1] - end_s == pytest.approx(60.0 * (again.minutes + new.minutes))
     assert both.time_s[-1] - both.time_s[len(again.plan)] == pytest.approx(lasts_s)
 

@@ -8,8 +8,8 @@ from heater import runs
 
 from probewise.diagnosis.system.commands import (
     _minutes_of_runs,
-    plan_in_sequence,
     plan_of_alternatives,
+    plan_of_sequence,
     possible_run_commands,
 )
 from probewise.systems import RunTable
@@ -51,7 +51,7 @@ def test_time_that_goes_on_is_later_than_all_that_was_recorded():
     time = np.arange(float(len(TABLE)))
     table = TABLE.with_columns({"t_s": time})
     commands = list(offered((), table).values())
-    asked = cast(RunTable, plan_in_sequence(commands[:2], table))
+    asked = cast(RunTable, plan_of_sequence(commands[:2], table))
     assert (np.diff(asked.time_s) > 0).all()
     assert asked.time_s[0] > time[-1]
 

@@ -132,7 +132,7 @@ def measurement_separating_rivals(
         return None
     scans = [offered[k] for k in chosen]
     return NextMeasurement(
-        apparatus.plan_in_sequence(scans, plan),
+        apparatus.plan_of_sequence(scans, plan),
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
         _expected_log_bayes_factor_over_closest(

@@ -56,7 +56,7 @@ def plan_of_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
     return _with_last_known_covariates(_joined_plan(scans), after)
 
 
-def plan_in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
+def plan_of_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
 
     Covariates that the scans lack are filled as in `plan_of_alternatives`, to be replaced by measured values.

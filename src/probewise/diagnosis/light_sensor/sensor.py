@@ -17,7 +17,7 @@ from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, ro
 from probewise.diagnosis.light_sensor.covariates import covariate_of_effect, slope_along_motion, varying_covariates
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure_slopes
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
-from probewise.diagnosis.light_sensor.scheduling import Scan, plan_in_sequence, plan_of_alternatives
+from probewise.diagnosis.light_sensor.scheduling import Scan, plan_of_alternatives, plan_of_sequence
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -85,7 +85,7 @@ class LightSensorApparatus:
     covariate_of_effect = staticmethod(covariate_of_effect)
     held_out_parts = staticmethod(held_out_parts)
     plan_of_alternatives = staticmethod(plan_of_alternatives)
-    plan_in_sequence = staticmethod(plan_in_sequence)
+    plan_of_sequence = staticmethod(plan_of_sequence)
 
     def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
         """Return the slopes of the readings by fine structure of the SSF, (n_usable, n_columns)."""

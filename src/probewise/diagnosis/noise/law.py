@@ -212,10 +212,10 @@ class NoiseLaw:
     @cached_property
     def sigma_floor(self) -> float:
         """Least sigma for which every reading's sd, given those before it, is at least `least`."""
-        return self.least / self._smallest_conditional_sd if self.least else 0.0
+        return self.least / self._smallest_innovation_sd if self.least else 0.0
 
     @cached_property
-    def _smallest_conditional_sd(self) -> float:
+    def _smallest_innovation_sd(self) -> float:
         """Smallest sd of a reading given those before it, in units of sigma; 1 if all are lost."""
         if not self.n_kept:
             return 1.0
@@ -225,7 +225,7 @@ class NoiseLaw:
 
     def with_least_sigma(self, sigma: float) -> NoiseLaw:
         """Return the distribution with this lower bound on sigma."""
-        return replace(self, least=sigma * self._smallest_conditional_sd)
+        return replace(self, least=sigma * self._smallest_innovation_sd)
 
     @property
     def sd_factor_of_rounding(self) -> float:

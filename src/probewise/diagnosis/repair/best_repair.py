@@ -64,7 +64,7 @@ def judged_and_best_repair(
     """
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
-        leading = searched.leading_out_of_vocabulary()
+        leading = searched.leading_combination_out_of_vocabulary()
         fit = (
             searched.best_refit_of(leading, noise) if leading else searched.likeliest_fit_beside_unknown(noise)
         ) or null

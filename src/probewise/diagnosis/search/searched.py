@@ -314,7 +314,7 @@ class Searched:
         """The fit of the null with the likeliest number of Gaussians."""
         return self.evidences.fits[self.likeliest_order, ()]
 
-    def leading_out_of_vocabulary(self) -> Names:
+    def leading_combination_out_of_vocabulary(self) -> Names:
         """Return the most probable combination with a formula out of vocabulary, if it beats one without; else ()."""
         by_mean = self.posterior.marginal_over_noise
         own = {names: p for names, p in by_mean.items() if effects_out_of_vocabulary(names)}

@@ -17,8 +17,8 @@ from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.system.commands import (
     RunCommand,
-    plan_in_sequence,
     plan_of_alternatives,
+    plan_of_sequence,
     possible_run_commands,
 )
 from probewise.effects import (
@@ -218,7 +218,7 @@ class SimulatorApparatus:
         return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
     plan_of_alternatives = staticmethod(plan_of_alternatives)
-    plan_in_sequence = staticmethod(plan_in_sequence)
+    plan_of_sequence = staticmethod(plan_of_sequence)
 
 
 def _differences_within_runs(values: FloatArray, table: RunTable) -> FloatArray:

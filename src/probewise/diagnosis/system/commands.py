@@ -165,7 +165,7 @@ def plan_of_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
     return cast(Plan, append_tables(first, more))
 
 
-def plan_in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
+def plan_of_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
     """Concatenate runs to be recorded in sequence: each begins after the one before, unless time restarts with each."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []

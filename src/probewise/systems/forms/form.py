@@ -181,7 +181,11 @@ class Form:
         return self if self.change_points is None else replace(self, change_points=self.change_points.thinned())
 
     def variant_masks(self, plan: Any) -> VariantMasks | None:
-        """Return the mask of the rows after each variant's change point, (n_variants, n_points); None if not gated."""
+        """Return the masks of the rows after each candidate change point, (n_variants, n_points); None for other forms.
+
+        With them is the bank entry that acts on all rows. Only a form without effect before the change point, and with
+        the same effect everywhere after it, has them.
+        """
         if self.change_points is None or not self.change_points.gated:
             return None
         always = self.entries[0].copy()

@@ -56,7 +56,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
         values, covariate = table.covariates[name], covariate_of_column(name)
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
         says = partial(_fill_sentence, f"the true {name} is the recorded {name} plus {{}}")
-        yield from _linear_form(
+        yield from _amplitude_form(
             about,
             f"input_offset:{name}",
             _column_changer(name, _column_with_offset),
@@ -66,7 +66,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
             covariate,
         )
         says = partial(_fill_sentence, f"the true {name} is the recorded {name} times (1 + a), a = {{}}")
-        yield from _linear_form(
+        yield from _amplitude_form(
             about, f"input_gain:{name}", _column_changer(name, _scaled_column), 1e-4, "1", says, covariate
         )
         yield from _clipped_column_form(about, name, low, high)
@@ -116,7 +116,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
         says = partial(_fill_sentence, "the true time is the recorded time times (1 + a), a = {}")
         origin = time_origin(table)
         clock = _column_changer(time, _clock_scaler(origin))
-        for form in _linear_form(about, "clock_drift", clock, 1e-5, "1", says, "time"):
+        for form in _amplitude_form(about, "clock_drift", clock, 1e-5, "1", says, "time"):
             yield replace(form, counted_from=origin_in_words(time, origin, about.time_unit))
 
 
@@ -142,7 +142,7 @@ def _column_changer(name: str, change: Change) -> Act:
     return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
 
 
-def _linear_form(
+def _amplitude_form(
     about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: Say, *covariates: str
 ) -> Iterator[Form]:
     typical = about.typical_amplitude(Stage.INPUT, act, np.full((1, 1, 1), guess), guess)

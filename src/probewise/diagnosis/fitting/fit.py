@@ -238,7 +238,8 @@ def _fit_coroutine(
         all_predicted = batch.reshape(len(tries), -1, batch.shape[1])[:, :, usable]
         values = objective(all_predicted[:, 0], tries)
         values = np.where(np.isfinite(values), values, np.inf)
-        if expected > tolerance and not best - values.min() > _AS_EXPECTED * expected:
+        short = expected > tolerance and not best - values.min() > _AS_EXPECTED * expected
+        if short and model.sensor.predicts_in_bulk:
             # In a curved valley that is oblique to the coordinates, damping by their scales stops every step.
             more = np.clip(z + np.clip(_steps_along_valley(curvature, downhill), -2.0, 2.0), -FARTHEST, FARTHEST)
             found = objective((yield more)[:, usable], more)
@@ -280,6 +281,7 @@ def _steps_along_valley(curvature: FloatArray, downhill: FloatArray) -> FloatArr
     The dampings are in terms of the curvature along the principal axis that promises most.
     """
     along, axes = np.linalg.eigh(curvature)
+    along = np.maximum(along, 1.0)  # the prior's, which may be lost in rounding
     slope = axes.T @ downhill
     valley = along[np.argmax(slope**2 / along)]
     return np.asarray((slope / (along + valley * _VALLEY_DAMPINGS[:, None])) @ axes.T)

@@ -3,8 +3,9 @@
 Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweights the samples. If the effective share of the
 samples falls below a limit, the reading's likelihood is tempered. At each temperature the samples are resampled and
 moved by Metropolis-Hastings steps on all readings so far. The evidence is the product of the mean weights. Thousands of
-samples represent what a long search has excluded. The error of the evidence is estimated from the genealogy: if few
-initial samples are ancestors of the current ones, another start would give another evidence (Lee & Whiteley 2018).
+samples still represent the small parts of the prior that a long search has left. The error of the evidence is estimated
+from the genealogy: if few initial samples are ancestors of the current ones, another start would give another evidence
+(Lee & Whiteley 2018).
 """
 
 from __future__ import annotations

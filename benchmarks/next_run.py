@@ -1,9 +1,9 @@
 """The run after a run that found out what its sensor leaves out: does it start from a sensor that can be relied on?
 
 For seven of the effects that a sensor file can hold, a robot with doubt looks for a circle in a world in which the
-effect is concealed (as `probewise study --concealed` does, clear size). A second one starts from the sensor that the first one
-wrote, looks for another circle in the same world, and is compared with a robot whose sensor is right: the same circle
-with nothing concealed.
+effect is concealed (as `probewise study --concealed` does, clear size). A second one starts from the sensor that the
+first one wrote, looks for another circle in the same world, and is compared with a robot whose sensor is right: the
+same circle with nothing concealed.
 
     python benchmarks/next_run.py --circles 8 --seed 733 --out docs/results/next_run.json
 """

@@ -85,7 +85,7 @@ def read_geometry(path: Path) -> Geometry:
         if stop is not None and low < stop < high:
             allowed = f"at or beyond a limit, {low:g} or {high:g}"
             raise FileError(path, f"joints.{name}.stop_deg is {stop:g}", allowed)
-        return JointParameters(port, ratio, home, low, high, play, stop)
+        return JointParameters(port, ratio, home_deg=home, low_deg=low, high_deg=high, play_deg=play, stop_deg=stop)
 
     elbow = _value_in_file(path, table, ("links", "elbow"))
     if elbow not in ("absolute", "relative"):

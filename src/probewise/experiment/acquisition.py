@@ -98,14 +98,14 @@ def predict_readings_and_utilities(
     utility_input = UtilityInput(
         experiment.forecast,
         experiment.readout,
-        theta,
-        weight,
-        drawn,
-        designs,
-        plan,
-        rows,
-        cost_s[rows],
-        experiment.goal if goal is None else goal,
+        theta=theta,
+        weight=weight,
+        drawn=drawn,
+        designs=designs,
+        plan=plan,
+        rows=rows,
+        cost_s=cost_s[rows],
+        goal=experiment.goal if goal is None else goal,
     )
     return utility_input, utility_map(utility_input, experiment.utility)
 

@@ -128,7 +128,17 @@ def importance_weighted_draws(
     n_eff = n_effective(log_weight)
     error = math.sqrt(max(1.0 / n_eff - 1.0 / n, 0.0))
     names = problem.prior.names
-    return Weighted(names, theta, log_likelihood, log_weight, log_z, error, n_eff, n, pareto_k(log_ratio))
+    return Weighted(
+        names,
+        theta,
+        log_likelihood=log_likelihood,
+        log_weight=log_weight,
+        log_z=log_z,
+        log_z_error=error,
+        n_eff=n_eff,
+        n_calls=n,
+        pareto_k=pareto_k(log_ratio),
+    )
 
 
 @dataclass(frozen=True, eq=False)

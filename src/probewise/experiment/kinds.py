@@ -104,7 +104,14 @@ def kinds_of(
         whole, model = _prior_and_model_with_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
         kinds.append(
             HypothesisKind(
-                part.label, "", plain, whole, part.restrict_model(model), likelihood, part.to_whole_theta, prior.names
+                part.label,
+                "",
+                log_prior=plain,
+                prior=whole,
+                model=part.restrict_model(model),
+                likelihood=likelihood,
+                to_whole_theta=part.to_whole_theta,
+                whole_names=prior.names,
             )
         )
         for rival in rivals:
@@ -112,7 +119,16 @@ def kinds_of(
             if rival.effect is None:
                 model, law = part.restrict_model(quick), rival.likelihood or likelihood
                 kinds.append(
-                    HypothesisKind(part.label, rival.name, log_p, own, model, law, part.to_whole_theta, prior.names)
+                    HypothesisKind(
+                        part.label,
+                        rival.name,
+                        log_prior=log_p,
+                        prior=own,
+                        model=model,
+                        likelihood=law,
+                        to_whole_theta=part.to_whole_theta,
+                        whole_names=prior.names,
+                    )
                 )
                 continue
             if not isinstance(chain, Chain):
@@ -124,13 +140,13 @@ def kinds_of(
                 HypothesisKind(
                     part.label,
                     rival.name,
-                    log_p,
-                    both,
-                    model,
-                    likelihood,
-                    part.to_whole_theta,
-                    prior.names,
-                    rival.effect,
+                    log_prior=log_p,
+                    prior=both,
+                    model=model,
+                    likelihood=likelihood,
+                    to_whole_theta=part.to_whole_theta,
+                    whole_names=prior.names,
+                    effect=rival.effect,
                 )
             )
     return tuple(kinds)
@@ -191,13 +207,19 @@ class _MemberShape:
 def _member_shapes(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_MemberShape]:
     """Return the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
     if not isinstance(shape, AnyOf):
-        return [_MemberShape("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
+        return [
+            _MemberShape(
+                "", 1.0, prior=prior, whole=prior, columns=np.arange(len(prior.names)), number=None, n_sensor=0
+            )
+        ]
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
     parts = []
     for k, (name, member) in enumerate(shape.shapes.items()):
         columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns_by_shape[k]])
         own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
-        parts.append(_MemberShape(name, shape.weights[k], own, prior, columns, k, n_sensor))
+        parts.append(
+            _MemberShape(name, shape.weights[k], prior=own, whole=prior, columns=columns, number=k, n_sensor=n_sensor)
+        )
     return parts
 
 

@@ -167,7 +167,16 @@ def step(
         arm = error_of_arm()
         known, off = _may_stop_and_chance_off(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
-    reason = stop_reason(experiment, sd, known and not asks, p_value, utilities, len(readings), max_readings, arm_sd)
+    reason = stop_reason(
+        experiment,
+        sd,
+        known=known and not asks,
+        p_value=p_value,
+        utilities=utilities,
+        n_readings=len(readings),
+        max_readings=max_readings,
+        arm_sd=arm_sd,
+    )
     pose, *planned = state.planned or next_poses(experiment, utility_input, utilities, rng=rng)
     info = Step(
         number=len(readings),
@@ -296,7 +305,9 @@ def explore(
             )
     start_s = before.readings[-1].time_s if before is not None and before.entries else 0.0
     instrument = as_instrument(instrument, start_s=start_s)
-    return _yield_steps(instrument, experiment, seed, max_readings, path, before, settings)
+    return _yield_steps(
+        instrument, experiment, seed=seed, max_readings=max_readings, path=path, before=before, settings=settings
+    )
 
 
 def run(

@@ -141,14 +141,14 @@ def _weighted_samples_of(result: NestedResult, n_calls: int) -> Weighted:
     return Weighted(
         result.names,
         result.theta,
-        result.log_likelihood,
-        result.log_weight,
-        result.log_z,
-        result.log_z_error,
-        result.n_eff,
-        n_calls,
-        -math.inf,
-        result,
+        log_likelihood=result.log_likelihood,
+        log_weight=result.log_weight,
+        log_z=result.log_z,
+        log_z_error=result.log_z_error,
+        n_eff=result.n_eff,
+        n_calls=n_calls,
+        pareto_k=-math.inf,
+        run=result,
     )
 
 

@@ -140,7 +140,17 @@ def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator)
             "one with mass: its draws must have a density above zero. Do its bounds leave room for anything?",
         )
     even = np.full(n_particles, -math.log(n_particles))
-    drawn = Weighted(prior.names, theta, np.zeros(n_particles), even, 0.0, 0.0, float(n_particles), 0, -math.inf)
+    drawn = Weighted(
+        prior.names,
+        theta,
+        log_likelihood=np.zeros(n_particles),
+        log_weight=even,
+        log_z=0.0,
+        log_z_error=0.0,
+        n_eff=float(n_particles),
+        n_calls=0,
+        pareto_k=-math.inf,
+    )
     return Particles(drawn, np.arange(n_particles))
 
 
@@ -225,13 +235,13 @@ def update(
     found = Weighted(
         before.names,
         now.theta,
-        now.after,
-        log_weight,
-        log_z,
-        math.sqrt(variance),
-        n_effective(log_weight),
-        before.n_calls + n_calls,
-        tail,
+        log_likelihood=now.after,
+        log_weight=log_weight,
+        log_z=log_z,
+        log_z_error=math.sqrt(variance),
+        n_eff=n_effective(log_weight),
+        n_calls=before.n_calls + n_calls,
+        pareto_k=tail,
     )
     degrees = n_resampled - previous.n_resampled
     hurried, with_ease = previous.hurried or degrees >= _MANY_DEGREES, degrees <= 1 and not strained
@@ -481,6 +491,15 @@ def _particles_from_run(
     even = np.full(n, -math.log(n))
     calls = n_calls + run.n_calls + n + moves.n_calls
     drawn = Weighted(
-        run.names, moved.theta, moved.after, even, run.log_z, run.log_z_error, float(n), calls, -math.inf, run
+        run.names,
+        moved.theta,
+        log_likelihood=moved.after,
+        log_weight=even,
+        log_z=run.log_z,
+        log_z_error=run.log_z_error,
+        n_eff=float(n),
+        n_calls=calls,
+        pareto_k=-math.inf,
+        run=run,
     )
     return Particles(drawn, np.arange(n), run.log_z_error**2)

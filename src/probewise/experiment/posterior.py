@@ -90,14 +90,14 @@ class Posterior:
         return Weighted(
             self.kinds[0].whole_names,
             theta,
-            np.concatenate([w.log_likelihood for w in own]),
-            log_weight,
-            self.log_z,
-            float(np.sqrt(probability[some] ** 2 @ errors**2)),
-            float(weight.sum() ** 2 / (weight @ weight)),
-            sum(p.weighted.n_calls for p in self.particles),
-            max(w.pareto_k for w in own),
-            leader.run,
+            log_likelihood=np.concatenate([w.log_likelihood for w in own]),
+            log_weight=log_weight,
+            log_z=self.log_z,
+            log_z_error=float(np.sqrt(probability[some] ** 2 @ errors**2)),
+            n_eff=float(weight.sum() ** 2 / (weight @ weight)),
+            n_calls=sum(p.weighted.n_calls for p in self.particles),
+            pareto_k=max(w.pareto_k for w in own),
+            run=leader.run,
         )
 
 

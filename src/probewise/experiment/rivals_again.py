@@ -67,7 +67,7 @@ def sample_rivals_again(
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
         donors += [own.weighted] if own.log_z > hopeless else []
         n = max(len(own.ancestor), n_samples_of_kind(kind, 0.0, n_particles))
-        anew = sample_near_other_kinds(kind, problem, own.weighted, donors, n, hopeless, rng)
+        anew = sample_near_other_kinds(kind, problem, own=own.weighted, donors=donors, n=n, hopeless=hopeless, rng=rng)
         few = _LEAST_FOUND if kind.effect is not None else WELL_FOUND
         if may_search and (matters or not anew.is_reproduced or (each and anew.n_eff < few)):
             n_searches -= 1

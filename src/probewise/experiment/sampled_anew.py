@@ -128,7 +128,15 @@ def samples_from_run(
         even = np.full(n, -math.log(n))
         likelihood = problem.log_likelihood(points)
         drawn = Weighted(
-            problem.prior.names, points, likelihood, even, run.log_z, run.log_z_error, float(n), n, -math.inf
+            problem.prior.names,
+            points,
+            log_likelihood=likelihood,
+            log_weight=even,
+            log_z=run.log_z,
+            log_z_error=run.log_z_error,
+            n_eff=float(n),
+            n_calls=n,
+            pareto_k=-math.inf,
         )
     return replace(drawn, n_calls=own.n_calls + run.n_calls + drawn.n_calls)
 

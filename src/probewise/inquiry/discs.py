@@ -297,7 +297,16 @@ def _readings_around_disc(
     places = away.reshape(-1, 2)
     n = len(places)
     zero = np.zeros(n, dtype=np.int64)
-    plan = Plan(places[:, 0], places[:, 1], np.zeros(n), np.zeros(n), zero, ("table",), zero, ("table",))
+    plan = Plan(
+        places[:, 0],
+        places[:, 1],
+        orientation_rad=np.zeros(n),
+        time_s=np.zeros(n),
+        scan=zero,
+        scan_names=("table",),
+        pattern=zero,
+        pattern_names=("table",),
+    )
     predicted = model.predict(np.array([[0.0, 0.0, radius_mm]]), plan)
     return predicted.reshape(len(directions), len(distance_mm))
 

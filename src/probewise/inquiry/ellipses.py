@@ -54,13 +54,15 @@ class Ellipses:
         return cls(
             to_single_precision(region.center_mm[:, 1] + np.stack([-half_mm, half_mm])),
             to_single_precision(footprint.weights),
-            to_single_precision(
+            lab=to_single_precision(
                 np.stack([*(region.center_mm - middle).T, form[:, 0, 0], form[:, 0, 1], form[:, 1, 1]])
             ),
-            to_single_precision((1.0 / axes[:, 1]).max(axis=0)),
-            to_single_precision(away / region.semi_axes_mm.min(axis=1)),
-            to_single_precision(np.concatenate([to_axes_frame, constant[..., None]], axis=-1).transpose(0, 2, 3, 1)),
-            to_single_precision(axes),
+            growth_per_sd=to_single_precision((1.0 / axes[:, 1]).max(axis=0)),
+            growth_by_offsets=to_single_precision(away / region.semi_axes_mm.min(axis=1)),
+            to_axes_frame=to_single_precision(
+                np.concatenate([to_axes_frame, constant[..., None]], axis=-1).transpose(0, 2, 3, 1)
+            ),
+            axes=to_single_precision(axes),
         )
 
     def crossed_by_rows(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
@@ -73,11 +75,11 @@ class Ellipses:
         return CrossedEllipses(
             self.share,
             lab,
-            growth_per_sd,
-            growth_by_offsets,
-            to_axes_frame[:, :, 0],
-            to_axes_frame[:, :, 1] * y_mm + to_axes_frame[:, :, 2],
-            axes,
+            growth_per_sd=growth_per_sd,
+            growth_by_offsets=growth_by_offsets,
+            slope=to_axes_frame[:, :, 0],
+            base=to_axes_frame[:, :, 1] * y_mm + to_axes_frame[:, :, 2],
+            axes=axes,
         )
 
 

@@ -64,7 +64,16 @@ class ScanlineIntervals:
         inner_first, inner_last = columns_in(inner)
         none = np.flatnonzero(inner_first > inner_last)
         inner_first[none], inner_last[none] = last[none] + 1, last[none]
-        return cls(grid, n_rows, row, hypothesis, first, last, inner_first, inner_last)
+        return cls(
+            grid,
+            n_rows,
+            row=row,
+            hypothesis=hypothesis,
+            first=first,
+            last=last,
+            inner_first=inner_first,
+            inner_last=inner_last,
+        )
 
     def places_near_edges(self) -> PlacesNearEdges:
         """Pair intervals with their places in the ring about the edge: left of the interior, then right of it."""

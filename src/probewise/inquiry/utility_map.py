@@ -142,7 +142,15 @@ def entropy_map(
     rows = reachable_rows(reachable, grid.n_places)
     even = np.full(len(theta), 1.0 / len(theta))
     utility_input = UtilityInput(
-        DirectForecast(model), Readout(noise_sd), theta, even, theta, Designs(grid), plan, rows, np.ones(rows.size)
+        DirectForecast(model),
+        Readout(noise_sd),
+        theta=theta,
+        weight=even,
+        drawn=theta,
+        designs=Designs(grid),
+        plan=plan,
+        rows=rows,
+        cost_s=np.ones(rows.size),
     )
     return utility_map(utility_input, ReadingEntropy() if utility is None else utility)
 

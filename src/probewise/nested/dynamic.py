@@ -100,7 +100,16 @@ def intensified(
     _require_complete_run_of(result, evaluate)
     seed_state = generator_state_as_json(rng.bit_generator.state)
     first, last = _first_and_last_row_to_intensify(result, goal)
-    thread = _draw_thread(result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng)
+    thread = _draw_thread(
+        result,
+        evaluate,
+        move=SliceMove() if move is None else move,
+        first=first,
+        last=last,
+        n_live=n_live,
+        max_calls=max_calls,
+        rng=rng,
+    )
     return _join_thread_to_run(result, thread, seed_state, evaluate.n_calls, rng)
 
 

@@ -225,14 +225,14 @@ def update(
     return Weighted(
         fallen.names,
         fallen.theta,
-        fallen.log_likelihood,
-        fallen.log_weight,
-        fallen.log_z,
-        fallen.log_z_error,
-        fallen.n_eff,
-        evaluate.n_calls + fallen.n_calls,
-        k,
-        fallen,
+        log_likelihood=fallen.log_likelihood,
+        log_weight=fallen.log_weight,
+        log_z=fallen.log_z,
+        log_z_error=fallen.log_z_error,
+        n_eff=fallen.n_eff,
+        n_calls=evaluate.n_calls + fallen.n_calls,
+        pareto_k=k,
+        run=fallen,
     )
 
 
@@ -346,7 +346,15 @@ def draw_and_weigh(
     if not alive.any():
         nothing = np.empty(0)
         return Weighted(
-            evaluate.names, theta[:0], nothing, nothing, -math.inf, math.inf, 0.0, evaluate.n_calls, math.inf
+            evaluate.names,
+            theta[:0],
+            log_likelihood=nothing,
+            log_weight=nothing,
+            log_z=-math.inf,
+            log_z_error=math.inf,
+            n_eff=0.0,
+            n_calls=evaluate.n_calls,
+            pareto_k=math.inf,
         )
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
     k = pareto_k(log_ratio, tail)
@@ -358,7 +366,16 @@ def draw_and_weigh(
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
     n_eff = n_effective(log_weight)
     return Weighted(
-        evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, evaluate.n_calls, k, missed=missed
+        evaluate.names,
+        theta,
+        log_likelihood=log_likelihood,
+        log_weight=log_weight,
+        log_z=log_z,
+        log_z_error=error,
+        n_eff=n_eff,
+        n_calls=evaluate.n_calls,
+        pareto_k=k,
+        missed=missed,
     )
 
 

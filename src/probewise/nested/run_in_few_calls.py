@@ -185,14 +185,14 @@ def _weighted_from_run(run: NestedResult, log_likelihood: FloatArray, n_calls: i
     return Weighted(
         run.names,
         run.theta,
-        log_likelihood,
-        run.log_weight,
-        run.log_z,
-        run.log_z_error,
-        run.n_eff,
-        n_calls,
-        k,
-        run,
+        log_likelihood=log_likelihood,
+        log_weight=run.log_weight,
+        log_z=run.log_z,
+        log_z_error=run.log_z_error,
+        n_eff=run.n_eff,
+        n_calls=n_calls,
+        pareto_k=k,
+        run=run,
     )
 
 

@@ -158,7 +158,9 @@ def run_once(
     now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)
-    under_way = _RunUnderWay(evaluate, rng, n_live, n_replaced, rule, seed_state, keeper, now)
+    under_way = _RunUnderWay(
+        evaluate, rng, n_live=n_live, n_replaced=n_replaced, rule=rule, seed_state=seed_state, keeper=keeper, now=now
+    )
     try:
         return under_way.run_to_end(max_calls, progress)
     except NotConvergedError as error:

@@ -196,7 +196,9 @@ def predict_system(
             DoubtfulResultWarning,
             stacklevel=2,
         )
-    return SystemPrediction(own, recording.readings, mean, sd, scores, n_samples, n_failed)
+    return SystemPrediction(
+        own, recording.readings, mean=mean, sd=sd, log_density=scores, n_samples=n_samples, n_failed=n_failed
+    )
 
 
 def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:

@@ -93,7 +93,16 @@ def search(
         """Return whether this share is spent of the budget of refits that an earlier search left."""
         return prepared.apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
-    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, share_is_spent)
+    state = SearchState(
+        on_mean,
+        prior,
+        noises=noises,
+        templates=templates,
+        refits=refits,
+        tried_always=own,
+        progress=progress,
+        share_is_spent=share_is_spent,
+    )
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
     else:

@@ -75,7 +75,16 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     effects = tuple(_with_rows_needed(effect, reasons) for effect in found)
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words
-    return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _alias_classes(effects))
+    return PlanAudit(
+        cast(Plan, own),
+        assumed,
+        effects=effects,
+        cosines=cosines,
+        cures=(),
+        after=effects,
+        words=words,
+        classes=_alias_classes(effects),
+    )
 
 
 def _without_reading_column(simulator: Simulator, table: RunTable) -> RunTable:

@@ -73,7 +73,7 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
         of = f"run {name}" if table.run is not None else "the rows"
         for kind, words, columns, slower in _variations_of_run(table, kept, ends, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
-            made = _planned_run(table, kept, columns, reading, called, name, slower)
+            made = _planned_run(table, kept, columns=columns, reading=reading, name=called, like=name, slower=slower)
             out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
     return out
 

@@ -153,7 +153,17 @@ class ReadingsProblem:
 def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:
     """Draw `n` equally weighted samples of the prior, as the posterior without readings: its evidence is one."""
     theta = prior.from_unit_cube(rng.random((n, len(prior.names))))
-    return Weighted(prior.names, theta, np.zeros(n), np.full(n, -math.log(n)), 0.0, 0.0, float(n), 0, -math.inf)
+    return Weighted(
+        prior.names,
+        theta,
+        log_likelihood=np.zeros(n),
+        log_weight=np.full(n, -math.log(n)),
+        log_z=0.0,
+        log_z_error=0.0,
+        n_eff=float(n),
+        n_calls=0,
+        pareto_k=-math.inf,
+    )
 
 
 def updated_posterior(

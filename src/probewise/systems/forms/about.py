@@ -128,13 +128,13 @@ class ReferenceFit:
         trial = Form(
             "trial",
             stage,
-            dict.fromkeys(map(str, range(settings.shape[1])), _ANY),
-            (),
-            (),
-            act,
-            settings,
-            (),
-            lambda mean, sd: "",
+            marginals=dict.fromkeys(map(str, range(settings.shape[1])), _ANY),
+            units=(),
+            covariates=(),
+            act=act,
+            entries=settings,
+            amplitudes=(),
+            says=lambda mean, sd: "",
         )
         chain = replace(self.system.chain(self.table, ()), effects=(trial,))
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)

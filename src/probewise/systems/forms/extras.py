@@ -27,13 +27,13 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
             yield Form(
                 name,
                 Stage.PARAMETER,
-                {"value": extra.prior},
-                ("",),
-                ("level", "time", "row"),
-                act,
-                values[seen][:, None, None],
-                (),
-                _sentence_writer(extra.says),
+                marginals={"value": extra.prior},
+                units=("",),
+                covariates=("level", "time", "row"),
+                act=act,
+                entries=values[seen][:, None, None],
+                amplitudes=(),
+                says=_sentence_writer(extra.says),
                 absent={0: extra.null},
             )
 

@@ -150,13 +150,13 @@ def _amplitude_form(
         yield Form(
             name,
             Stage.INPUT,
-            {"a": about.amplitude_prior(typical)},
-            (unit,),
-            covariates,
-            act,
-            np.full((1, 1, 1), typical),
-            (0,),
-            says,
+            marginals={"a": about.amplitude_prior(typical)},
+            units=(unit,),
+            covariates=covariates,
+            act=act,
+            entries=np.full((1, 1, 1), typical),
+            amplitudes=(0,),
+            says=says,
         )
 
 
@@ -166,7 +166,18 @@ def _log_uniform_form(
     prior = about.log_uniform_size_prior(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
     if prior is not None:
         entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
-        yield Form(name, Stage.INPUT, {parameter: prior}, (unit,), covariates, act, entries, (), says, absent={0: 0.0})
+        yield Form(
+            name,
+            Stage.INPUT,
+            marginals={parameter: prior},
+            units=(unit,),
+            covariates=covariates,
+            act=act,
+            entries=entries,
+            amplitudes=(),
+            says=says,
+            absent={0: 0.0},
+        )
 
 
 def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float) -> Iterator[Form]:
@@ -183,13 +194,13 @@ def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float
         yield Form(
             f"input_saturation:{name}",
             Stage.INPUT,
-            {"level": ends.prior},
-            (name,),
-            (covariate_of_column(name),),
-            act,
-            ends.trial_levels[:, None, None],
-            (),
-            lambda m, s: (
+            marginals={"level": ends.prior},
+            units=(name,),
+            covariates=(covariate_of_column(name),),
+            act=act,
+            entries=ends.trial_levels[:, None, None],
+            amplitudes=(),
+            says=lambda m, s: (
                 f"{name} {'rises' if m[0] > ends.least_ceiling else 'falls'} no further than "
                 f"{mean_with_sd(m[0], s[0], '')}"
             ),
@@ -229,13 +240,13 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     yield Form(
         f"periodic_error:{name}",
         Stage.INPUT,
-        marginals,
-        (name, name, "rad"),
-        (covariate_of_column(name),),
-        act,
-        sine_and_cosine_entries(typical, 1 / frequencies),
-        (0,),
-        lambda m, s: (
+        marginals=marginals,
+        units=(name, name, "rad"),
+        covariates=(covariate_of_column(name),),
+        act=act,
+        entries=sine_and_cosine_entries(typical, 1 / frequencies),
+        amplitudes=(0,),
+        says=lambda m, s: (
             f"{name} has a periodic error with an amplitude of {mean_with_sd(m[0], s[0], '')} "
             f"and a period of {mean_with_sd(m[1], s[1], '')}, both in units of {name}"
         ),

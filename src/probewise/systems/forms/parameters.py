@@ -32,13 +32,27 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)
             yield from modulated_form(
-                about, f"{kind}:{name}", Stage.PARAMETER, how, _parameter_shifter(name, how), size, name, ""
+                about,
+                f"{kind}:{name}",
+                stage=Stage.PARAMETER,
+                how=how,
+                act=_parameter_shifter(name, how),
+                guess=size,
+                what=name,
+                unit="",
             )
         for column in columns:
             how = modulations.column_proportional_modulation(column, table)
             size = guess / float(np.nanstd(table.covariates[column]))
             yield from modulated_form(
-                about, f"depends:{name}:{column}", Stage.PARAMETER, how, _parameter_shifter(name, how), size, name, ""
+                about,
+                f"depends:{name}:{column}",
+                stage=Stage.PARAMETER,
+                how=how,
+                act=_parameter_shifter(name, how),
+                guess=size,
+                what=name,
+                unit="",
             )
 
 

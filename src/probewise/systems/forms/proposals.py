@@ -148,13 +148,13 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {"a": about.amplitude_prior(typical), "at": Uniform(at[0], at[-1])},
-        (own.unit, name),
-        (covariate_of_column(name),),
-        act,
-        entry,
-        (0,),
-        lambda mean, sd: (
+        marginals={"a": about.amplitude_prior(typical), "at": Uniform(at[0], at[-1])},
+        units=(own.unit, name),
+        covariates=(covariate_of_column(name),),
+        act=act,
+        entries=entry,
+        amplitudes=(0,),
+        says=lambda mean, sd: (
             f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} where {name} is above "
             f"{mean_with_sd(mean[1], sd[1], '')}: a proposal, not a known effect"
         ),
@@ -187,13 +187,13 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
         yield Form(
             f"formula:rate:{state}:{text}",
             Stage.RATE,
-            {"a": about.amplitude_prior(typical), "at": Uniform(low, high)},
-            ("", state),
-            (f"state:{state}", "time"),
-            act,
-            entries,
-            (0,),
-            says,
+            marginals={"a": about.amplitude_prior(typical), "at": Uniform(low, high)},
+            units=("", state),
+            covariates=(f"state:{state}", "time"),
+            act=act,
+            entries=entries,
+            amplitudes=(0,),
+            says=says,
             expression=f"a {text}",
         )
 
@@ -255,12 +255,14 @@ def _single_term_form(
     yield Form(
         f"formula:{side}:{target}:{term.text}",
         stage,
-        {"a": about.amplitude_prior(typical)},
-        ("",),
-        where,
-        act,
-        np.full((1, 1, 1), typical),
-        (0,),
-        lambda mean, sd: f"{what} lacks {text}, a = {mean_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect",
+        marginals={"a": about.amplitude_prior(typical)},
+        units=("",),
+        covariates=where,
+        act=act,
+        entries=np.full((1, 1, 1), typical),
+        amplitudes=(0,),
+        says=lambda mean, sd: (
+            f"{what} lacks {text}, a = {mean_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect"
+        ),
         expression=text,
     )

@@ -54,19 +54,19 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {
+        marginals={
             "a": about.amplitude_prior(typical),
             "hz": frequency_prior(frequencies),
             "phase": Uniform(-1.0, 1.0),
             "share": Uniform(0.03, 0.97),
             "edge": LogUniform(0.03, 1.0),
         },
-        (own.unit, f"1/{about.time_unit}", "1", "1", "1"),
-        ("time",),
-        act,
-        entries,
-        (0,),
-        lambda mean, sd: (
+        units=(own.unit, f"1/{about.time_unit}", "1", "1", "1"),
+        covariates=("time",),
+        act=act,
+        entries=entries,
+        amplitudes=(0,),
+        says=lambda mean, sd: (
             f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} during "
             f"{mean_with_sd(mean[3], sd[3], '')} of every {1 / mean[1]:.4g} {about.time_unit}: "
             "a proposal, not a known effect"
@@ -102,18 +102,18 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {
+        marginals={
             "a": about.amplitude_prior(typical, positive=True),
             "hz": frequency_prior(frequencies),
             "sweep": Uniform(-1.2, 1.2),
             "phase": PHASE,
         },
-        (own.unit, f"1/{about.time_unit}", "1", "rad"),
-        ("time",),
-        act,
-        entries,
-        (0,),
-        lambda mean, sd: (
+        units=(own.unit, f"1/{about.time_unit}", "1", "rad"),
+        covariates=("time",),
+        act=act,
+        entries=entries,
+        amplitudes=(0,),
+        says=lambda mean, sd: (
             f"{own.reading} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], own.unit)} and a frequency "
             f"that goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
             "proposal, not a known effect"
@@ -149,13 +149,18 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {"a": about.amplitude_prior(typical), "b": about.amplitude_prior(typical), "tau1": between, "tau2": between},
-        (own.unit, own.unit, about.time_unit, about.time_unit),
-        ("time", "run"),
-        act,
-        entries,
-        (0, 1),
-        lambda mean, sd: (
+        marginals={
+            "a": about.amplitude_prior(typical),
+            "b": about.amplitude_prior(typical),
+            "tau1": between,
+            "tau2": between,
+        },
+        units=(own.unit, own.unit, about.time_unit, about.time_unit),
+        covariates=("time", "run"),
+        act=act,
+        entries=entries,
+        amplitudes=(0, 1),
+        says=lambda mean, sd: (
             f"{own.reading} is off by {mean_with_sd(mean[0], sd[0], own.unit)} and "
             f"{mean_with_sd(mean[1], sd[1], own.unit)} at the start of each run, which settle with time constants of "
             f"{mean_with_sd(mean[2], sd[2], about.time_unit)} and {mean_with_sd(mean[3], sd[3], about.time_unit)}: a "

@@ -52,13 +52,13 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        dict.fromkeys("abc", about.amplitude_prior(typical)),
-        (own.unit,) * 3,
-        (covariate_of_column(name), "level"),
-        act,
-        typical * entries,
-        (0, 1, 2),
-        lambda mean, sd: (
+        marginals=dict.fromkeys("abc", about.amplitude_prior(typical)),
+        units=(own.unit,) * 3,
+        covariates=(covariate_of_column(name), "level"),
+        act=act,
+        entries=typical * entries,
+        amplitudes=(0, 1, 2),
+        says=lambda mean, sd: (
             f"{own.reading} rises with {name} by {mean_with_sd(mean[0], sd[0], own.unit)} per sd in the middle of its "
             f"range, {mean_with_sd(float(mean @ (1, -1, 1)), float(np.hypot(*sd[1:])), own.unit)} at its low end and "
             f"{mean_with_sd(float(mean.sum()), float(np.hypot(*sd[1:])), own.unit)} at its high end: a proposal, not a "
@@ -102,13 +102,13 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
         yield Form(
             f"formula:reading:{own.reading}:{text}",
             Stage.OFFSET,
-            {"a": about.amplitude_prior(typical), "d": saturating},
-            (own.unit, ""),
-            (covariate_of_column(name), "time", "run"),
-            act,
-            single_column_bank(typical, tried),
-            (0,),
-            lambda mean, sd, what=what: (  # type: ignore[misc]  # the second name of a value, not a parameter
+            marginals={"a": about.amplitude_prior(typical), "d": saturating},
+            units=(own.unit, ""),
+            covariates=(covariate_of_column(name), "time", "run"),
+            act=act,
+            entries=single_column_bank(typical, tried),
+            amplitudes=(0,),
+            says=lambda mean, sd, what=what: (  # type: ignore[misc]  # the second name of a value, not a parameter
                 f"{own.reading} shifts in the end by {mean_with_sd(mean[0], sd[0], own.unit)} as the {summed} of "
                 f"{what} grows in a run, by 63 % of it when that is {mean_with_sd(mean[1], sd[1], '')}: a proposal, "
                 "not a known effect"

@@ -34,13 +34,32 @@ def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
         size = float(np.nanmax(np.abs(values))) or 1.0
         own = f"{state} per {about.time_unit}"
         yield from _rate_term_form(
-            about, f"damping:{state}", state, state, lambda r: -r, size, f"a damping term -a {state}"
+            about,
+            f"damping:{state}",
+            state=state,
+            other=state,
+            term=lambda r: -r,
+            scale=size,
+            what=f"a damping term -a {state}",
         )
         yield from _rate_term_form(
-            about, f"drag:{state}", state, state, lambda r: -np.abs(r) * r, size**2, f"a drag term -a |{state}| {state}"
+            about,
+            f"drag:{state}",
+            state=state,
+            other=state,
+            term=lambda r: -np.abs(r) * r,
+            scale=size**2,
+            what=f"a drag term -a |{state}| {state}",
         )
         yield from _rate_term_form(
-            about, f"forcing:{state}", state, state, lambda r: 1.0 + 0.0 * r, 1.0, "a constant term a", unit=own
+            about,
+            f"forcing:{state}",
+            state=state,
+            other=state,
+            term=lambda r: 1.0 + 0.0 * r,
+            scale=1.0,
+            what="a constant term a",
+            unit=own,
         )
         yield from _friction_form(about, state, own)
         yield from _periodic_forcing_form(about, state, own)
@@ -48,14 +67,32 @@ def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
         for other, there in about.states.items():
             scale = float(np.nanmax(np.abs(there))) or 1.0
             yield from _rate_term_form(
-                about, f"cubic:{state}:{other}", state, other, lambda r: -(r**3), scale**3, f"a term -a {other}^3"
+                about,
+                f"cubic:{state}:{other}",
+                state=state,
+                other=other,
+                term=lambda r: -(r**3),
+                scale=scale**3,
+                what=f"a term -a {other}^3",
             )
             yield from _rate_term_form(
-                about, f"quadratic:{state}:{other}", state, other, lambda r: -(r**2), scale**2, f"a term -a {other}^2"
+                about,
+                f"quadratic:{state}:{other}",
+                state=state,
+                other=other,
+                term=lambda r: -(r**2),
+                scale=scale**2,
+                what=f"a term -a {other}^2",
             )
             if other != state:
                 yield from _rate_term_form(
-                    about, f"coupling:{state}:{other}", state, other, lambda r: -r, scale, f"a term -a {other}"
+                    about,
+                    f"coupling:{state}:{other}",
+                    state=state,
+                    other=other,
+                    term=lambda r: -r,
+                    scale=scale,
+                    what=f"a term -a {other}",
                 )
 
 
@@ -81,13 +118,13 @@ def _rate_term_form(
     yield Form(
         name,
         Stage.RATE,
-        {"a": about.amplitude_prior(typical)},
-        (unit,),
-        (f"state:{other}", "time"),
-        act,
-        np.full((1, 1, 1), typical),
-        (0,),
-        lambda mean, sd: f"the rate of {state} lacks {what}, a = {mean_with_sd(mean[0], sd[0], '')}",
+        marginals={"a": about.amplitude_prior(typical)},
+        units=(unit,),
+        covariates=(f"state:{other}", "time"),
+        act=act,
+        entries=np.full((1, 1, 1), typical),
+        amplitudes=(0,),
+        says=lambda mean, sd: f"the rate of {state} lacks {what}, a = {mean_with_sd(mean[0], sd[0], '')}",
     )
 
 
@@ -102,13 +139,13 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
         yield Form(
             f"friction:{state}",
             Stage.RATE,
-            {"a": prior},
-            (unit,),
-            (f"state:{state}", "level"),
-            act,
-            entries,
-            (),
-            lambda mean, sd: (
+            marginals={"a": prior},
+            units=(unit,),
+            covariates=(f"state:{state}", "level"),
+            act=act,
+            entries=entries,
+            amplitudes=(),
+            says=lambda mean, sd: (
                 f"dry friction slows {state} by {mean_with_sd(mean[0], sd[0], '')} per {about.time_unit}, "
                 "and holds it at rest"
             ),
@@ -137,13 +174,13 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
     yield Form(
         f"periodic_forcing:{state}",
         Stage.RATE,
-        marginals,
-        (unit, f"1/{about.time_unit}", "rad"),
-        ("time",),
-        act,
-        sine_and_cosine_entries(typical, frequencies),
-        (0,),
-        lambda mean, sd: (
+        marginals=marginals,
+        units=(unit, f"1/{about.time_unit}", "rad"),
+        covariates=("time",),
+        act=act,
+        entries=sine_and_cosine_entries(typical, frequencies),
+        amplitudes=(0,),
+        says=lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
         ),
@@ -189,13 +226,13 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
     alone = Form(
         f"limit:{state}",
         Stage.RATE,
-        marginals(None),
-        (state, *("1" for _ in others)),
-        (f"state:{state}", "level"),
-        act,
-        entries(None),
-        (),
-        says,
+        marginals=marginals(None),
+        units=(state, *("1" for _ in others)),
+        covariates=(f"state:{state}", "level"),
+        act=act,
+        entries=entries(None),
+        amplitudes=(),
+        says=says,
         absent={0: ends.level_out_of_reach},
         fixed=names_of_fixed_shares(None),
     )

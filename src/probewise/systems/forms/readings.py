@@ -39,13 +39,13 @@ def modulated_form(
         yield Form(
             name,
             stage,
-            how.marginals(about.amplitude_prior(typical)),
-            how.units(unit),
-            (*how.covariates, *covariates),
-            act,
-            how.entries(typical),
-            how.amplitudes,
-            lambda mean, sd: how.says(what, unit, mean, sd),
+            marginals=how.marginals(about.amplitude_prior(typical)),
+            units=how.units(unit),
+            covariates=(*how.covariates, *covariates),
+            act=act,
+            entries=how.entries(typical),
+            amplitudes=how.amplitudes,
+            says=lambda mean, sd: how.says(what, unit, mean, sd),
             change_points=how.change_points,
             joined=how.joined,
             counted_from=how.counted_from,
@@ -65,23 +65,37 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         over["per_run"] = modulations.value_per_run_modulation(table)
     for kind, how in over.items():
         yield from modulated_form(
-            about, f"offset_{kind}", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
+            about,
+            f"offset_{kind}",
+            stage=Stage.OFFSET,
+            how=how,
+            act=_reading_adder(how),
+            guess=about.sd,
+            what=reading,
+            unit=unit,
         )
         yield from modulated_form(
             about,
             f"gain_{kind}",
-            Stage.GAIN,
-            how,
-            _reading_scaler(how, zero),
-            about.sd / span,
-            f"the gain of {reading}",
-            "1",
-            ("level",),
+            stage=Stage.GAIN,
+            how=how,
+            act=_reading_scaler(how, zero),
+            guess=about.sd / span,
+            what=f"the gain of {reading}",
+            unit="1",
+            covariates=("level",),
         )
     if table.has_varying_time:
         how = modulations.sinusoid_modulation(table, about.time_unit)
         yield from modulated_form(
-            about, "interference", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
+            about,
+            "interference",
+            stage=Stage.OFFSET,
+            how=how,
+            act=_reading_adder(how),
+            guess=about.sd,
+            what=reading,
+            unit=unit,
         )
         yield from _settling_form(about)
         yield from _lag_form(about)
@@ -90,7 +104,14 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         if name not in (reading, about.system.simulator.noise.sd) and np.nanstd(values) > 0:
             how = modulations.column_proportional_modulation(name, table)
             yield from modulated_form(
-                about, f"sensitivity:{name}", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
+                about,
+                f"sensitivity:{name}",
+                stage=Stage.OFFSET,
+                how=how,
+                act=_reading_adder(how),
+                guess=about.sd,
+                what=reading,
+                unit=unit,
             )
     yield from _hysteresis_form(about)
     yield from _nonlinearity_form(about)
@@ -135,13 +156,13 @@ def _settling_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         "settling",
         Stage.OFFSET,
-        {"a": about.amplitude_prior(typical), "tau_s": prior},
-        (unit, time_unit),
-        ("time", "run"),
-        act,
-        entries,
-        (0,),
-        lambda mean, sd: (
+        marginals={"a": about.amplitude_prior(typical), "tau_s": prior},
+        units=(unit, time_unit),
+        covariates=("time", "run"),
+        act=act,
+        entries=entries,
+        amplitudes=(0,),
+        says=lambda mean, sd: (
             f"{reading} is off by {mean_with_sd(mean[0], sd[0], unit)} at the start of each run, and settles "
             f"with a time constant of {mean_with_sd(mean[1], sd[1], time_unit)}"
         ),
@@ -166,13 +187,13 @@ def _lag_form(about: ReferenceFit) -> Iterator[Form]:
         yield Form(
             "lag",
             Stage.LAG,
-            {"tau_s": prior},
-            (time_unit,),
-            ("previous",),
-            act,
-            _log_spaced_entries(prior),
-            (),
-            lambda mean, sd: (
+            marginals={"tau_s": prior},
+            units=(time_unit,),
+            covariates=("previous",),
+            act=act,
+            entries=_log_spaced_entries(prior),
+            amplitudes=(),
+            says=lambda mean, sd: (
                 f"{about.system.simulator.reading} lags with a time constant of "
                 f"{mean_with_sd(mean[0], sd[0], time_unit)}"
             ),
@@ -188,13 +209,13 @@ def _delay_form(about: ReferenceFit) -> Iterator[Form]:
         yield Form(
             "delay",
             Stage.LAG,
-            {"tau_s": prior},
-            (time_unit,),
-            ("previous",),
-            delayed_values,
-            _log_spaced_entries(prior),
-            (),
-            lambda mean, sd: (
+            marginals={"tau_s": prior},
+            units=(time_unit,),
+            covariates=("previous",),
+            act=delayed_values,
+            entries=_log_spaced_entries(prior),
+            amplitudes=(),
+            says=lambda mean, sd: (
                 f"{about.system.simulator.reading} is delayed by {mean_with_sd(mean[0], sd[0], time_unit)}"
             ),
             absent={0: 0.0},
@@ -257,13 +278,13 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         "hysteresis",
         Stage.OFFSET,
-        {"a": about.amplitude_prior(about.sd)},
-        (unit,),
-        ("previous",),
-        act,
-        np.full((1, 1, 1), about.sd),
-        (0,),
-        lambda mean, sd: (
+        marginals={"a": about.amplitude_prior(about.sd)},
+        units=(unit,),
+        covariates=("previous",),
+        act=act,
+        entries=np.full((1, 1, 1), about.sd),
+        amplitudes=(0,),
+        says=lambda mean, sd: (
             f"{reading} reads {mean_with_sd(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} "
             "while it rises than while it falls"
         ),
@@ -314,13 +335,13 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         "nonlinearity",
         Stage.BEND,
-        {"a": about.amplitude_prior(typical), "power": LogUniform(0.4, 5.0)},
-        ("1", "1"),
-        ("level",),
-        act,
-        entries,
-        (0,),
-        lambda mean, sd: (
+        marginals={"a": about.amplitude_prior(typical), "power": LogUniform(0.4, 5.0)},
+        units=("1", "1"),
+        covariates=("level",),
+        act=act,
+        entries=entries,
+        amplitudes=(0,),
+        says=lambda mean, sd: (
             f"{reading} has a bent response, y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at "
             f"{high:.4g} {unit}, a = {mean_with_sd(mean[0], sd[0], '')}, power = {mean_with_sd(mean[1], sd[1], '')}"
         ),
@@ -358,13 +379,13 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         "saturation",
         Stage.SATURATION,
-        {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)},
-        (unit,),
-        ("level",),
-        clip,
-        levels[:, None, None],
-        (),
-        lambda mean, sd: (
+        marginals={"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)},
+        units=(unit,),
+        covariates=("level",),
+        act=clip,
+        entries=levels[:, None, None],
+        amplitudes=(),
+        says=lambda mean, sd: (
             f"{reading} {'rises' if mean[0] > middle else 'falls'} no further than {mean_with_sd(mean[0], sd[0], unit)}"
         ),
         absent={0: float(top + 1e3 * span)},

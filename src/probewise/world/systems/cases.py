@@ -240,7 +240,17 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         except NotConvergedError as error:
             failure = error
             continue
-        return _recorded_case(seed, number, stratum, n_earlier, drawn, effects, cosine, everywhere, noise)
+        return _recorded_case(
+            seed,
+            number,
+            stratum=stratum,
+            n_earlier=n_earlier,
+            drawn=drawn,
+            effects=effects,
+            cosine=cosine,
+            noise_free=everywhere,
+            rng=noise,
+        )
     raise failure
 
 
@@ -279,15 +289,15 @@ def _recorded_case(
     return SystemCase(
         seed,
         number,
-        stratum,
-        drawn,
-        effects,
-        noise,
-        text,
-        labels,
-        noise_free,
-        np.round(readings, kind.reading_decimals),
-        cosine,
+        stratum=stratum,
+        drawn=drawn,
+        effects=effects,
+        noise=noise,
+        noise_text=text,
+        labels=labels,
+        noise_free=noise_free,
+        readings=np.round(readings, kind.reading_decimals),
+        cosine=cosine,
     )
 
 

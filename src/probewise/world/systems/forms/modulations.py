@@ -44,13 +44,13 @@ def _amplitude_only_modulation(
     return Modulation(
         value_at,
         lambda a, drawn: {"a": a},
-        lambda rng: {},
-        lambda a: [[{"a": a}]],
-        start_values_of_single_member,
-        lambda a: {"a": a},
-        covariates,
-        reach,
-        uses,
+        draw=lambda rng: {},
+        bank=lambda a: [[{"a": a}]],
+        start_values=start_values_of_single_member,
+        steps=lambda a: {"a": a},
+        covariates=covariates,
+        reach=reach,
+        uses=uses,
     )
 
 
@@ -79,12 +79,12 @@ def step_at_change_point(true: TrueSystem) -> Modulation:
     return Modulation(
         value_at,
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {at: true.random_time(rng)},
-        lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
-        start_values_of_single_member,
-        lambda a: {"a": a, at: 0.0},
-        ("time", str(true.table.time)) if timed else ("row",),
-        1.0,
+        draw=lambda rng: {at: true.random_time(rng)},
+        bank=lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
+        start_values=start_values_of_single_member,
+        steps=lambda a: {"a": a, at: 0.0},
+        covariates=("time", str(true.table.time)) if timed else ("row",),
+        reach=1.0,
         breaks=(lambda v: np.asarray(v[at])) if timed else None,
     )
 
@@ -105,12 +105,12 @@ def value_per_run(true: TrueSystem) -> Modulation:
     return Modulation(
         value_at,
         lambda a, drawn: {name: a * drawn[name] for name in names},
-        lambda rng: dict(zip(names, rng.standard_normal(n).tolist(), strict=True)),
-        lambda a: [[{name: a * (name == names[k]) for name in names} for k in present]],
-        start_values,
-        lambda a: {name: (a if k in present else 0.0) for k, name in enumerate(names)},
-        ("run",),
-        1.0,
+        draw=lambda rng: dict(zip(names, rng.standard_normal(n).tolist(), strict=True)),
+        bank=lambda a: [[{name: a * (name == names[k]) for name in names} for k in present]],
+        start_values=start_values,
+        steps=lambda a: {name: (a if k in present else 0.0) for k, name in enumerate(names)},
+        covariates=("run",),
+        reach=1.0,
     )
 
 
@@ -132,12 +132,12 @@ def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
     return Modulation(
         lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
-        lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
-        start_values_of_wave,
-        lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
-        ("time", str(rows.time)),
-        1.0,
+        draw=lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
+        bank=lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
+        start_values=start_values_of_wave,
+        steps=lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
+        covariates=("time", str(rows.time)),
+        reach=1.0,
         signed=False,
     )
 
@@ -149,10 +149,10 @@ def settling(true: TrueSystem) -> Modulation:
     return Modulation(
         lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
-        lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
-        start_values_of_single_member,
-        lambda a: {"a": a, "tau_s": 0.05 * longest},
-        ("time", "run", str(true.table.time)),
-        1.0,
+        draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
+        bank=lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
+        start_values=start_values_of_single_member,
+        steps=lambda a: {"a": a, "tau_s": 0.05 * longest},
+        covariates=("time", "run", str(true.table.time)),
+        reach=1.0,
     )

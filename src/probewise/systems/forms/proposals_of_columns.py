@@ -22,7 +22,7 @@ _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the 
 def formula_forms_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
     """Yield proposals that add to the reading: each column's influence, varying with the reading, and its dose.
 
-    The dose is the integral of |column - mean| or |column| since the start of the run; the change saturates with it.
+    The dose integrates abs(column - mean) or abs(column) from the start of the run; the change saturates with it.
     """
     for name, values in columns.items():
         yield from _varying_influence_form(about, name, values)

@@ -76,7 +76,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     Raises
     ------
     NotConvergedError
-        If none of six draws in each plan has the stratum's size, a pair's |cosine| < 0.5, an alias's loss < 3 nats.
+        If none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an alias's loss < 3.
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
@@ -163,7 +163,7 @@ def _draw_effects(
 ) -> _ConcealedEffects:
     """Draw the effects of a stratum once.
 
-    Raises NotConvergedError if they cannot have the size, a pair's |cosine| is 0.5 or more, or an alias loses 3 nats.
+    Raises NotConvergedError if they cannot have the size, a pair's abs(cosine) is 0.5 or more, an alias loses 3.
     """
 
     def draw_effect(name: str) -> HiddenEffect:

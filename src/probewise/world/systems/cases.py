@@ -223,7 +223,7 @@ def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
 def draw_system_case(seed: int, number: int) -> SystemCase:
     """Draw case `number` of a challenge on systems; it depends on the seed and the number alone.
 
-    Raises NotConvergedError if in none of 16 systems the effects can have the requested size (a pair |cosine| < 0.5).
+    Raises NotConvergedError if in none of 16 systems the effects can have the requested size (a pair: cosine in +-0.5).
     """
     stratum, n_earlier = system_stratum_of(number)
     drawing, noise = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)

@@ -91,7 +91,8 @@ def predict(
     scored = Recording(plan, recorded).usable
     step = sensor.instrumentation.step if plan.instrumentation.step is None else plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
-    model = chain if sensor.effects else DeduplicatedModel(chain, plan)
+    there = chain.plan_at_calibrated_height(plan)  # once, so that the chain lays out the scene once for all blocks
+    model = chain if sensor.effects else DeduplicatedModel(chain, there)
     for effect in sensor.effects_on_new_scans:
         for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
             warnings.warn(
@@ -114,8 +115,8 @@ def predict(
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = slice(first, first + per_block)
-        noise = chain.noise_parameters(theta[block], plan, sensor.noise_sd[block, None])
-        mixture.add(model.predict(theta[block], plan), noise)
+        noise = chain.noise_parameters(theta[block], there, sensor.noise_sd[block, None])
+        mixture.add(model.predict(theta[block], there), noise)
     return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)
 
 

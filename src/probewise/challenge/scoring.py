@@ -71,9 +71,10 @@ def are_names_right(result: Result, names: Sequence[str], *, noise: bool = True)
     """
     if names_match(names, right_names_of_each_effect(result, merged=True, noise=noise)):
         return True
-    if len(set(names) - NOISE) > len(result["hidden"]):
+    physics = sorted(set(names) - NOISE)
+    if len(physics) > len(result["hidden"]):
         return False
-    nats = result.get("alternative_nats", {}).get("+".join(sorted(set(names) - NOISE)), math.inf)
+    nats = result.get("alternative_nats", {}).get("+".join(physics), math.inf)
     due = set(result["truth"]) & NOISE if noise else set()
     return bool(nats < HONEST_NATS) and set(names) & NOISE == due
 

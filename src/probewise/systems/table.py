@@ -207,13 +207,21 @@ def published_covariate(name: str) -> str:
     return own if own in _OF_LIGHT_SENSOR else name
 
 
+def median_sd_of_column(table: RunTable, column: str) -> float | None:
+    """Return the median of a column of sds, without those that are 0 or missing; None if there is no other."""
+    values = table.covariates.get(column, np.empty(0))
+    known = values[np.isfinite(values) & (values > 0)]
+    return float(np.median(known)) if known.size else None
+
+
 def relative_sds_of_column(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
     """Return a column of sds over the typical one, by default its median, (n_points,); 1 where there is none."""
     values = table.covariates.get(column, np.full(len(table), np.nan))
     there = np.isfinite(values) & (values > 0)
-    if not there.any():
+    median = median_sd_of_column(table, column)
+    if median is None:
         return np.ones(len(table))
-    return np.where(there, values, 1.0) / np.where(there, np.median(values[there]) if typical is None else typical, 1.0)
+    return np.where(there, values, 1.0) / np.where(there, median if typical is None else typical, 1.0)
 
 
 def _checked_column(name: str, values: Any) -> NDArray[Any]:

@@ -194,9 +194,8 @@ class PlanAudit(ShowsItself):
 
     def summary(self) -> str:
         """Return a plain-text summary of the audit."""
-        lines = [
-            f"{len(self.plan)} readings in {count_with_noun(self.plan.scan_names, self.words.run)}; {self.assumed}"
-        ]
+        n_runs = len(self.plan.scan_names)
+        lines = [f"{len(self.plan)} readings in {n_runs} {self.words.run}{'' if n_runs == 1 else 's'}; {self.assumed}"]
         lines += _wrapped_lines("fine", [e.name for e in self.effects_with_detectability("fine")])
         lines += _wrapped_lines("aliased", [_name_with_alias(e) for e in self.effects_with_detectability("aliased")])
         lines += _wrapped_lines("invisible", [e.name for e in self.effects_with_detectability("invisible")])
@@ -216,11 +215,6 @@ class PlanAudit(ShowsItself):
             lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
         left = [e.name for e in self.after if e.detectability != "fine"]
         return "\n".join([*lines, *_wrapped_lines("left", left or ["nothing"])])
-
-
-def count_with_noun(names: Sequence[str], noun: str) -> str:
-    """Write the number of names with a noun, in the plural unless it is one."""
-    return f"{len(names)} {noun}{'' if len(names) == 1 else 's'}"
 
 
 def _name_with_alias(effect: EffectAudit) -> str:

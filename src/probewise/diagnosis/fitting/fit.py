@@ -226,7 +226,7 @@ def _fit_coroutine(
         if not len(tries):
             break
         expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
-        tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
+        tries = _points_after_steps(z, tries)
         # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
         about = (
             [_difference_points_and_steps(at) for at in tries] if model.sensor.predicts_in_bulk and not nearby else []
@@ -241,7 +241,7 @@ def _fit_coroutine(
         short = expected > tolerance and not best - values.min() > _AS_EXPECTED * expected
         if short and model.sensor.predicts_in_bulk:
             # In a curved valley that is oblique to the coordinates, damping by their scales stops every step.
-            more = np.clip(z + np.clip(_steps_along_valley(curvature, downhill), -2.0, 2.0), -FARTHEST, FARTHEST)
+            more = _points_after_steps(z, _steps_along_valley(curvature, downhill))
             found = objective((yield more)[:, usable], more)
             tries, values = (
                 np.concatenate([tries, more]),
@@ -261,6 +261,11 @@ def _fit_coroutine(
             break
     sd = float(law.likeliest_sigma(law(readings - predicted)[:, None])[0])
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)
+
+
+def _points_after_steps(z: FloatArray, steps: FloatArray) -> FloatArray:
+    """Return the points after steps from z, each coordinate by 2 at most and within the bounds, (n_steps, n_params)."""
+    return np.clip(z + np.clip(steps, -2.0, 2.0), -FARTHEST, FARTHEST)
 
 
 def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
+from probewise.systems.table import median_sd_of_column
 
 _STANDS_STILL = 0.02  # noise sds by which predictions may change when the integration step is halved
 _NOISE = 0.01  # of the range of the readings, if no noise is declared
@@ -119,9 +120,9 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
 def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tuple[float, str]:
     declared = simulator.noise.sd
     if isinstance(declared, str):
-        values = table.columns.get(declared)
-        if values is not None and values.dtype == np.float64 and (values > 0).any():
-            return float(np.median(values[np.isfinite(values) & (values > 0)])), f"the median of {declared}"
+        median = median_sd_of_column(table, declared)
+        if median is not None:
+            return median, f"the median of {declared}"
     elif declared is not None:
         return float(declared), "as declared"
     return _NOISE * float(np.ptp(predicted)), "a hundredth of the range of the readings, since none is declared"

@@ -26,6 +26,7 @@ from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
+from probewise.systems.table import median_sd_of_column
 
 _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
@@ -330,10 +331,8 @@ def _objective_or_infinity(found: Fit) -> float:
 
 def _noise_sd_of(simulator: Simulator, table: RunTable, recording: Recording, found: Fit) -> float:
     declared = simulator.noise.sd
-    if isinstance(declared, str):
-        values: FloatArray = table.covariates[declared]
-        return float(np.median(values[np.isfinite(values) & (values > 0)]))  # 0 in rows without a reading
-    if declared is not None:
-        return float(declared)
+    known = median_sd_of_column(table, declared) if isinstance(declared, str) else declared
+    if known is not None:
+        return float(known)
     rough = rough_sd(recording)
     return min(found.sd, rough) if rough > 0 else found.sd

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.cases import DrawnSystem, SystemCase
-from probewise.world.systems.fit import AddedForm, LeastSquaresFit, ModelWithForms, names_of_fitted_parameters
+from probewise.world.systems.fit import LeastSquaresFit, ModelWithForms, project_out
 from probewise.world.systems.forms.form import Form
 from probewise.world.systems.rivals import linearised_starts, vocabulary_name
 from probewise.world.systems.vocabulary import forms_of
@@ -52,16 +52,13 @@ def _least_nats(
     """Add effects, one of each list of forms, to a fit one after the other; return the least loss, nats."""
     if not more:
         return 0.5 * fitted.chi_square
-    starts = sorted(
-        linearised_starts(drawn.true_system, more[0], target, fitted, model), key=lambda candidate: candidate.nats
-    )
+    left = project_out((target - fitted.readings) / drawn.true_system.noise_sd, fitted.slopes)
+    starts = linearised_starts(drawn.true_system, more[0], left, fitted, model)
     found = [np.inf]
-    for candidate in starts[:_N_STARTS]:
-        free = names_of_fitted_parameters(candidate.form)
-        wider = replace(model, added=[*model.added, AddedForm(candidate.form, candidate.start, free)])
-        own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free]
+    for candidate in sorted(starts, key=lambda candidate: candidate.nats)[:_N_STARTS]:
+        wider, begin = model.with_form(candidate.form, candidate.start, fitted.coordinates)
         try:
-            again = wider.fit(target, np.concatenate([fitted.coordinates, own]), max_calls=12)
+            again = wider.fit(target, begin, max_calls=12)
         except NotConvergedError:
             continue
         found.append(_least_nats(drawn, target, wider, again, more[1:]))

@@ -17,7 +17,13 @@ from probewise.world.challenge.sizing import amplitude_of_size
 from probewise.world.challenge.strata import Stratum
 from probewise.world.systems.chain import simulate_noise_free
 from probewise.world.systems.designs import design_runs
-from probewise.world.systems.fit import AddedForm, LeastSquaresFit, ModelWithForms, project_out
+from probewise.world.systems.fit import (
+    AddedForm,
+    LeastSquaresFit,
+    ModelWithForms,
+    names_of_fitted_parameters,
+    project_out,
+)
 from probewise.world.systems.forms.form import Form, FormWithParameters, parameter_arrays
 from probewise.world.systems.forms.out_of_vocabulary import OUT_OF_VOCABULARY, forms_out_of_vocabulary
 from probewise.world.systems.forms.true_system import TrueSystem
@@ -393,7 +399,7 @@ def _effect_with_rivals(
 ) -> SystemEffect:
     """Return the effect with its rivals and covariates, found in a model that has the other concealed effects."""
     target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
-    beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
+    beside = [AddedForm(e.form, e.values, names_of_fitted_parameters(e.form)) for e in others]
     model = ModelWithForms(drawn.kind, drawn.diagnosed_table, beside)
     start = model.coordinates_of(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -72,6 +72,12 @@ class ModelWithForms:
         each = [self.kind.priors[name].coordinate(by_run[name][self._run_numbers]) for name in self.kind.per_run]
         numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.added for name in b.free]
         return np.concatenate([np.ravel(own), *each, numbers])
+
+    def with_form(self, form: Form, start: Mapping[str, float], x: FloatArray) -> tuple[ModelWithForms, FloatArray]:
+        """Return the model with one more form, and the coordinates `x` (n_coordinates,) with that form at its start."""
+        free = names_of_fitted_parameters(form)
+        own = [start[name] / (form.steps[name] * _FORM_STEP) for name in free]
+        return replace(self, added=[*self.added, AddedForm(form, start, free)]), np.concatenate([x, own])
 
     def parameters_at(self, x: FloatArray) -> dict[str, FloatArray]:
         """Return parameters by name at coordinates (n_samples, n_coordinates), (n_samples, 1 or, per run, n_points)."""

@@ -145,13 +145,15 @@ class _Integration:
         law = self.kind.law
         assert law is not None
         column = self.columns[name]
-        n_samples = max(len(t), len(column))
+        n_samples, shared = max(len(t), len(column)), len(column) == 1
         t, column = (np.broadcast_to(each, (n_samples, each.shape[1])) for each in (t, column))
         out = np.empty(t.shape)
         for j, number in enumerate(run):
             own = self._rows_by_run_number[int(number)]
             times = self.table.t[own]
-            if law.linear:
+            if law.linear and shared:
+                out[:, j] = np.interp(t[:, j], times, column[0, own])
+            elif law.linear:
                 out[:, j] = [np.interp(at, times, values) for at, values in zip(t[:, j], column[:, own], strict=True)]
             else:
                 before = np.clip(np.searchsorted(times, t[:, j] + 1e-12, side="right") - 1, 0, None)

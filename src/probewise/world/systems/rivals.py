@@ -14,10 +14,8 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.chain import apply_reading_effects, simulate_noise_free
 from probewise.world.systems.fit import (
-    AddedForm,
     LeastSquaresFit,
     ModelWithForms,
-    names_of_fitted_parameters,
     project_out,
 )
 from probewise.world.systems.forms.form import Form, FormWithParameters, parameter_arrays
@@ -78,7 +76,8 @@ def rivals_with_nats(
     -------
     Loss of log likelihood in nats by name, for those below 12, the smallest first; below TELLING_NATS (3): aliases.
     """
-    near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], target, fitted, model)
+    left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
+    near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
     hard = any(_has_costly_fit(b.form) for b in model.added)
     for candidate in near:
@@ -86,50 +85,36 @@ def rivals_with_nats(
         if hard:  # fits with dry friction or a bound take minutes: the linearised result is used
             found[name] = min(candidate.nats, found.get(name, np.inf))
             continue
-        wider = ModelWithForms(
-            true.kind,
-            true.table,
-            [*model.added, AddedForm(candidate.form, candidate.start, names_of_fitted_parameters(candidate.form))],
-        )
-        own = [
-            candidate.start[name] / (0.1 * candidate.form.steps[name])
-            for name in names_of_fitted_parameters(candidate.form)
-        ]
+        wider, begin = model.with_form(candidate.form, candidate.start, fitted.coordinates)
         try:
-            nats = (
-                0.5
-                * wider.fit(
-                    target,
-                    np.concatenate([fitted.coordinates, own]),
-                    max_calls=5 if _has_costly_fit(candidate.form) else 7,
-                ).chi_square
-            )
+            again = wider.fit(target, begin, max_calls=5 if _has_costly_fit(candidate.form) else 7)
         except NotConvergedError:
             continue
-        found[name] = min(nats, found.get(name, np.inf))
+        found[name] = min(0.5 * again.chi_square, found.get(name, np.inf))
     close = {name: nats for name, nats in found.items() if nats < _NEAR}
     return dict(sorted(close.items(), key=lambda item: item[1]))
 
 
 def _best_by_linearisation(
-    true: TrueSystem, forms: Sequence[Form], target: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
+    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
 ) -> list[StartOfFit]:
     """Return up to six candidates for full fits, smallest linearised loss first, with at most two starts per form."""
-    left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
     size = float(left @ left)
     near = [
         candidate
-        for candidate in linearised_starts(true, forms, target, fitted, model)
+        for candidate in linearised_starts(true, forms, left, fitted, model)
         if candidate.nats < _NEAR or 1 - 2 * candidate.nats / size > _COSINE**2
     ]
     return sorted(near, key=lambda c: c.nats)[:_MOST_FITS]
 
 
 def linearised_starts(
-    true: TrueSystem, forms: Sequence[Form], target: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
+    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
 ) -> list[StartOfFit]:
-    """Return up to two starts of each form for a fit beside `model`: those of the smallest linearised loss."""
-    left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
+    """Return up to two starts of each form for a fit beside `model`: those of the smallest linearised loss.
+
+    `left`, (n_points,), are the residuals in noise sds, less what the fit's own coordinates could still absorb.
+    """
     out = []
     for form, changes in templates_of(true, forms, fitted, model).items():
         own = []

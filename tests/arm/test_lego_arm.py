@@ -140,6 +140,18 @@ def test_readings_carry_the_time_from_the_start(paper_brick, clock):
     assert 500 < first.time_s < second.time_s < clock.now_s - 100 + 500
 
 
+@pytest.mark.parametrize("height_mm", [None, 20.0])
+def test_the_first_lowering_to_any_height_is_in_steps_that_a_person_confirms(bench, height_mm):
+    seen = []
+    with bench.arm as arm:
+        arm.first_down = lambda step_mm: seen.append((step_mm, bench.sensor_mm[2]))
+        for place in PLACES[:2]:
+            arm.go_down(*place, height_mm)
+    told, there = np.array(seen).T
+    np.testing.assert_allclose(told, np.linspace(SHIPPED.travel_height_mm, height_mm or SHIPPED.read_height_mm, 6)[:-1])
+    np.testing.assert_allclose(there, told, atol=2.5)
+
+
 def test_a_place_out_of_reach_moves_nothing(bench):
     with bench.arm as arm:
         for place in ((-1.0, 100.0), (524.0, 519.0), (2.0, 2.0), (math.nan, 1.0)):

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from probewise.arm import LegoArm
+from probewise.arm import LegoArm, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.calibration import FittedSensor, write_sensor
 from probewise.cli import main
@@ -44,6 +44,7 @@ def bricks(monkeypatch, make_paper_brick):
 
     monkeypatch.setattr("probewise.cli.arm.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("probewise.cli._explore_arm.open_nxt_arm", open_nxt_arm)
+    monkeypatch.setattr("probewise.cli._bench.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 100))
     deaths["opened"] = opened
     return deaths
@@ -153,6 +154,40 @@ def test_nobody_to_press_enter_is_told_of(bricks, plan_file, tmp_path, monkeypat
     assert status == 2
     assert "nobody is there to press Enter" in said
     assert bricks["opened"][0].at_rest
+
+
+class Terminal(io.StringIO):
+    """A terminal at which somebody has typed."""
+
+    def isatty(self):
+        return True
+
+
+LOWERING = [
+    ("\n", ["arm", "heights", "524,260", "300,200"]),
+    ("", ["arm", "scan", "300,200", "310,200"]),
+    ("\n", ["arm", "record", "PLAN", "--out", "OUT"]),
+    ("", ["explore", "--sensor", "SENSOR", "--out", "OUT", "--model", "naive"]),
+    ("\n", ["investigate", "--plan", "PLAN", "--out", "OUT"]),
+]
+
+
+@pytest.mark.parametrize(("typed", "words"), LOWERING, ids=["heights", "scan", "record", "explore", "investigate"])
+def test_a_person_confirms_the_first_lowering_of_an_arm_that_nobody_fitted(
+    typed, words, bricks, plan_file, sensor_file, tmp_path, monkeypatch, capsys
+):
+    """As long as nobody presses Enter, the sensor stays at travel height."""
+    monkeypatch.setattr("sys.stdin", Terminal(typed))
+    files = {"PLAN": plan_file, "SENSOR": sensor_file, "OUT": tmp_path / "out"}
+    status, said = run(capsys, *(files.get(word, word) for word in words), "--arm", "nxt:x")
+    assert status == 2
+    assert "the sensor may touch the table" in said
+    assert "The sensor should be 60 mm above the table; if so, and it may be lowered further, then press Enter" in said
+    assert "nobody is there to press Enter" in said
+    geometry = read_geometry(shipped_geometry_path())
+    counts = [bricks["opened"][0].motors[joint.port].position for joint in geometry.joints]
+    angles = [joint.angle_at(count, 0) for joint, count in zip(geometry.joints, counts, strict=True)]
+    assert geometry.position_mm(np.array([angles]))[0, 2] > geometry.travel_height_mm - 10
 
 
 @pytest.mark.slow

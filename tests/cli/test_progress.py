@@ -3,12 +3,14 @@
 import io
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from probewise import _progress
 from probewise._progress import progress_or_bar, progress_shown
+from probewise.cli._arm import prompter_for_answer
 from probewise.progress import silent
 from probewise.recordings import read_recording
 
@@ -31,6 +33,23 @@ def clock(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr(_progress.time, "monotonic", lambda: now_s[0])
     return now_s
+
+
+def test_a_question_is_not_overwritten_by_the_bar(hurried, monkeypatch):
+    """Nothing follows it on its line until it is answered."""
+    terminal, slow = Terminal(), Terminal("\n")
+    monkeypatch.setattr("sys.stderr", terminal)
+    monkeypatch.setattr(slow, "readline", lambda: (time.sleep(0.2), "\n")[1])
+    monkeypatch.setattr("sys.stdin", slow)
+    arm = SimpleNamespace(keep_awake=lambda: None)
+    with progress_shown(quiet=False) as progress:
+        progress("exploring")
+        time.sleep(0.1)
+        prompter_for_answer(arm)("Is it there? ")
+        before, after = terminal.getvalue().split("Is it there? ")
+        assert "exploring" in before
+        assert "exploring" not in after.split("\r")[0]
+        assert after.count("exploring") <= 1
 
 
 def test_lines_begin_after_two_seconds_and_come_every_five(clock, capsys):

@@ -183,20 +183,21 @@ class LegoArm:
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
         """Move the sensor over a place and lower it, by default to reading height.
 
-        If `first_down` is set, the first lowering to reading height is in steps, and `first_down` is called after each.
+        If `first_down` is set, the first lowering is in steps, and `first_down` is called after each.
 
         Raises
         ------
         ReachError
             If the place is out of reach at that height.
         """
-        read_mm, travel_mm = self.geometry.read_height_mm, self.geometry.travel_height_mm
-        if self.first_down is not None and height_mm is None:
+        travel_mm = self.geometry.travel_height_mm
+        end_mm = self.geometry.read_height_mm if height_mm is None else height_mm
+        if self.first_down is not None and end_mm < travel_mm:
             ask, self.first_down = self.first_down, None
-            for step_mm in np.linspace(travel_mm, read_mm, N_STEPS_DOWN + 1)[:-1].tolist():
+            for step_mm in np.linspace(travel_mm, end_mm, N_STEPS_DOWN + 1)[:-1].tolist():
                 self._lower_to(x_mm, y_mm, step_mm)
                 ask(step_mm)
-        self._lower_to(x_mm, y_mm, read_mm if height_mm is None else height_mm)
+        self._lower_to(x_mm, y_mm, end_mm)
 
     def _lower_to(self, x_mm: float, y_mm: float, height_mm: float) -> None:
         """Raise the sensor, turn the base, then lower the sensor over a place to a height."""

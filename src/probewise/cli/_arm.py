@@ -180,6 +180,17 @@ def enable_confirmed_lowering(arm: LegoArm) -> LegoArm:
     return arm
 
 
+def warn_and_confirm_lowering(chosen: ArmName, instrument: Instrument, geometry: Geometry | None) -> None:
+    """Warn if the sensor may hit the table; let a person who can watch confirm each step of the first lowering."""
+    from probewise.arm import LegoArm
+
+    if geometry is None or not chosen.may_differ_from_geometry or not isinstance(instrument, LegoArm):
+        return
+    warn_if_clearance_doubtful(geometry)
+    if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
+        enable_confirmed_lowering(instrument)
+
+
 def parse_place(name: str, text: str) -> tuple[float, float]:
     """Parse "X,Y" in mm; raise ParameterError, with the option's name, for anything else."""
     try:
@@ -281,18 +292,21 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
     keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
 
     def ask(text: str) -> str:
-        sys.stderr.write(text)
-        sys.stderr.flush()
+        from tqdm import tqdm
+
         answers: queue.Queue[str] = queue.Queue()
-        # Reading a line cannot be interrupted, so it runs in a daemon thread.
-        threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
-        while True:
-            try:
-                answer = answers.get(timeout=WAIT_S)
-            except queue.Empty:
-                keep_awake()
-            else:
-                break
+        with tqdm.external_write_mode(file=sys.stderr):  # a progress bar would overwrite the question
+            sys.stderr.write(text)
+            sys.stderr.flush()
+            # Reading a line cannot be interrupted, so it runs in a daemon thread.
+            threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
+            while True:
+                try:
+                    answer = answers.get(timeout=WAIT_S)
+                except queue.Empty:
+                    keep_awake()
+                else:
+                    break
         if not answer:
             raise CommandError("nobody is there to press Enter: standard input has ended; run it in a terminal")
         return answer.strip()

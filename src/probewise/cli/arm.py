@@ -21,6 +21,7 @@ from probewise.cli._arm import (
     prompter,
     prompter_for_answer,
     read_or_shipped_geometry,
+    warn_and_confirm_lowering,
     warn_if_clearance_doubtful,
 )
 from probewise.cli._common import (
@@ -648,22 +649,9 @@ def _open_instrument(
 def _warn_and_confirm_lowering(
     arguments: argparse.Namespace, instrument: LegoArm | OwnInstrument | SimulatedArm, geometry: Geometry
 ) -> None:
-    """Warn if the sensor may hit the table; let a person who can watch confirm each step of the first lowering."""
-    import sys
-
-    from probewise.arm import LegoArm
-
-    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
-    if (
-        chosen is None
-        or not chosen.may_differ_from_geometry
-        or arguments.dry_run
-        or not isinstance(instrument, LegoArm)
-    ):
-        return
-    warn_if_clearance_doubtful(geometry)
-    if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
-        enable_confirmed_lowering(instrument)
+    """Warn if the sensor may hit the table and let a person confirm its first lowering, unless nothing moves."""
+    if arguments.arm is not None and not arguments.dry_run:
+        warn_and_confirm_lowering(parse_arm(arguments.arm), instrument, geometry)
 
 
 def _refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:

@@ -14,7 +14,7 @@ from probewise.cli._arm import (
     InstrumentWithCallbacks,
     add_geometry,
     require_turns_and_lifts,
-    warn_if_clearance_doubtful,
+    warn_and_confirm_lowering,
     warn_if_place_sd_large,
 )
 from probewise.cli._common import (
@@ -173,8 +173,8 @@ def run(arguments: argparse.Namespace) -> int:
     before = _journal_to_resume(journal, resume=arguments.resume)
     site = open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
     print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
+    warn_and_confirm_lowering(inputs.arm, site.arm, inputs.geometry)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
-        warn_if_clearance_doubtful(inputs.geometry)
         warn_if_place_sd_large(inputs.geometry, inputs.experiment.stop_sd_mm)
     pictures = Pictures(out, inputs, arguments.live, site.outline_mm)
     steps = pictures.steps

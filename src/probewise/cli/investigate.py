@@ -10,7 +10,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import ARMS, ArmName, add_geometry, parse_arm, parse_place, prompter, read_or_shipped_geometry
+from probewise.cli._arm import (
+    ARMS,
+    ArmName,
+    add_geometry,
+    parse_arm,
+    parse_place,
+    prompter,
+    read_or_shipped_geometry,
+    warn_and_confirm_lowering,
+)
 from probewise.cli._common import (
     CommandError,
     Verb,
@@ -210,6 +219,7 @@ def _opened_plan_runner(
     opened, bench = open_arm_and_bench(
         chosen, geometry, arguments.geometry, seed=seed, start_s=folder.last_time_s, n_taken=folder.n_readings
     )
+    warn_and_confirm_lowering(chosen, opened, geometry)
     with opened as arm:
         by_hand, laid = prompter(arm), list[str]()
 

@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.arm import Pose
+from probewise.arm import Pose, Reading
+from probewise.calibration import FittedSensor
+from probewise.effects import HeightGradient
 from probewise.errors import ParameterError, ReachError
-from probewise.experiment import arm_over, explore, read_journal
+from probewise.experiment import arm_over, experiment_for, explore, paper_experiment, read_journal
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.recordings import Disc, Instrumentation, Plan
 from probewise.scene import Circle, Field, HypothesisScene
-from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, footprint_of, mean_ssf_field
 from probewise.world import Blob, World, gaussian_spot
 
 FIELD = Field(300.0, 200.0)
@@ -95,7 +97,6 @@ def test_a_run_with_heights_finds_the_circle_and_is_resumed(small, tmp_path):
     ("change", "name"),
     [
         ({"calibrated_height_mm": None}, "calibrated_height_mm"),
-        ({"heights_mm": ()}, "calibrated_height_mm"),
         ({"heights_mm": (0.0, 14.0)}, "heights_mm"),
         ({"heights_mm": (14.0, 1e9)}, "heights_mm is .* 1000000000.0.*calibrated at"),
     ],
@@ -103,6 +104,66 @@ def test_a_run_with_heights_finds_the_circle_and_is_resumed(small, tmp_path):
 def test_heights_that_mean_nothing_are_refused(small, change, name):
     with pytest.raises(ParameterError, match=name):
         asked(small, **change)
+
+
+LOW_MM, SLOPE = 5.0, 0.01
+CLOSE_WORLD = World(
+    gaussian_spot([Blob(1.0, (1.0, 1.5), (4.0, 3.0), 0.0)], pixel_mm=0.5),
+    black=10.0,
+    white=60.0,
+    noise_sd=0.0,
+    height_mm=LOW_MM,
+)
+SENSOR = np.array([0.5, 1.0, 1.5, 1 / 32, 1 / 18, 0.0, 10.0, 60.0])
+NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
+SAMPLES = SENSOR + 1e-4 * np.random.default_rng(0).standard_normal((500, 8))
+
+
+@pytest.fixture
+def close_sensor():
+    """A sensor calibrated 5 mm above a table that slopes by a hundredth."""
+    axis = np.arange(-20.0, 20.5, 0.5)
+    footprint = footprint_of(SENSOR[None, :6], 1)
+    return FittedSensor(
+        names=(*NAMES, "height_gradient.mm_per_mm"),
+        samples=np.column_stack([SAMPLES, np.full(500, SLOPE)]),
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.5),
+        field=mean_ssf_field(footprint, u_mm=axis, v_mm=axis),
+        effects=("height_gradient",),
+        instrumentation=Instrumentation(height_mm=LOW_MM),
+    )
+
+
+@pytest.mark.parametrize("arm_mm", [LOW_MM, 14.0])
+@pytest.mark.parametrize("pose_from", [experiment_for, paper_experiment])
+def test_effects_of_the_height_change_that_of_the_calibration(pose_from, arm_mm, close_sensor):
+    """The world reads higher by so many mm; whatever height the arm tells, designs and readings count as calibrated."""
+    experiment = pose_from(close_sensor, CIRCLE, FIELD)
+    poses = [Pose(float(x), 100.0) for x in (60.0, 78.0, 84.0, 140.0, 197.0, 203.0, 240.0)]
+    read = [
+        CLOSE_WORLD.read(DISC, pose.x_mm, pose.y_mm, time_s=0.0, rng=None, height_mm=LOW_MM + SLOPE * pose.x_mm)
+        for pose in poses
+    ]
+    problem = experiment.problem([Reading(0.0, pose, 0.0, {"height_mm": arm_mm}) for pose in poses])
+    np.testing.assert_allclose(problem.model.predict(TRUTH[None], problem.recording.plan)[0], read, atol=0.5)
+    designs = replace(problem.recording.plan, covariates={}, instrumentation=experiment.instrumentation)
+    np.testing.assert_allclose(experiment.forecast.predict(TRUTH[None], designs)[0], read, atol=0.5)
+
+
+def test_a_slope_among_the_rivals_is_one_hundredth_of_the_calibrated_height(close_sensor):
+    plain = replace(close_sensor, names=NAMES, samples=SAMPLES, effects=())
+    for sensor, height_mm in ((plain, LOW_MM), (replace(plain, instrumentation=Instrumentation()), 14.0)):
+        experiment = experiment_for(sensor, CIRCLE, FIELD, trust=0.9)
+        (slope,) = [kind.effect for kind in experiment.kinds if kind.left_out == HeightGradient.name]
+        assert slope.effect.typical == pytest.approx(0.01 * height_mm / np.hypot(300.0, 200.0))
+
+
+def test_a_journal_names_the_height_only_beside_others_to_choose(small, close_sensor):
+    """Journals of earlier versions did so, and go on."""
+    seed = np.random.SeedSequence(1)
+    assert experiment_for(close_sensor, CIRCLE, FIELD).settings(seed)["options"]["calibrated_height_mm"] is None
+    assert asked(small).settings(seed)["options"]["calibrated_height_mm"] == 14.0
 
 
 def test_an_arm_without_that_height_says_so():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -37,7 +37,7 @@ from probewise.inquiry import (
     forecast_of,
 )
 from probewise.priors import Joint, Prior
-from probewise.recordings.plan import Instrumentation
+from probewise.recordings.plan import Instrumentation, Recording
 from probewise.scene import Card
 from probewise.scene.albedo import Shape, require_shape
 from probewise.scene.any_of import AnyOf
@@ -100,7 +100,8 @@ class Experiment:
         Possible turns of the sensor, added to the arm's orientation, and numbers of repeated readings.
     heights_mm, calibrated_height_mm
         Possible heights above the surface, if selectable, and the height of the calibration; other heights scale the
-        footprint and dim the signal (see `sensor.commanded`).
+        footprint and dim the signal (see `sensor.commanded`). Without selectable heights every reading counts as one at
+        the height of the calibration, about which effects of the height change it; None: not known, 14 mm for these.
     batch
         Readings chosen together for their joint information; above 1 only with the default utility or
         `InformationGain`.
@@ -170,7 +171,7 @@ class Experiment:
         if not any(name.endswith("_mm") for name in self.shape.prior.names):
             raise ParameterError("shape", self.names, "a shape with a parameter in mm, which the run can stop on")
         if self.trust < 1:
-            rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
+            _ = self._rivals
         _ = self.readout, self.designs  # their constructors check the values
 
     def _require_thresholds_in_range(self) -> None:
@@ -195,10 +196,8 @@ class Experiment:
 
     def _require_heights(self) -> None:
         """Raise ParameterError unless the heights are positive and within a factor of ten of the calibration's."""
-        if bool(self.heights_mm) != (self.calibrated_height_mm is not None):
-            raise ParameterError(
-                "calibrated_height_mm", self.calibrated_height_mm, "a height where heights_mm may be chosen, else None"
-            )
+        if self.heights_mm and self.calibrated_height_mm is None:
+            raise ParameterError("calibrated_height_mm", None, "a height where heights_mm may be chosen")
         if not all(0 < height < math.inf for height in (*self.heights_mm, self.calibrated_height_mm or 1.0)):
             raise ParameterError("heights_mm", self.heights_mm, "finite, greater than 0")
         if self.calibrated_height_mm is not None:
@@ -260,23 +259,28 @@ class Experiment:
     @cached_property
     def forecast(self) -> Forecast:
         """Predictions of readings for many hypotheses at many designs, by tables where possible; built once."""
-        if self.calibrated_height_mm is None:
+        if not self.heights_mm or self.calibrated_height_mm is None:
             return forecast_of(self.model)
         return forecast_of(self.model, highest=max(self.heights_mm) / self.calibrated_height_mm)
 
     def problem(self, readings: Sequence[Reading]) -> SensorProblem:
         """Return the inference problem for these readings; with `trust` below 1, its times are paced (see `Pace`)."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
+        if not self.heights_mm and self.calibrated_height_mm is not None:
+            recording = _without_commanded_heights(recording)
         if self.trust < 1:
             recording = Pace.from_readings(readings).recording_with_paced_time(recording)
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
+    @property
+    def _rivals(self) -> tuple[SensorModelRival, ...]:
+        field_mm = self.grid.width_mm, self.grid.height_mm
+        return rivals_of(self.model, self.likelihood, field_mm, height_mm=self.calibrated_height_mm)
+
     @cached_property
     def kinds(self) -> tuple[HypothesisKind, ...]:
         """The competing kinds of hypotheses, see `kinds_of`; with `trust` 1, one kind for every shape."""
-        rivals: tuple[SensorModelRival, ...] = ()
-        if self.trust < 1:
-            rivals = rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
+        rivals = self._rivals if self.trust < 1 else ()
         models = self.forecast.model, self.model
         return kinds_of(
             self.shape, self.sensor_prior, self.prior, models, self.likelihood, trust=self.trust, rivals=rivals
@@ -330,7 +334,8 @@ class Experiment:
                 "orientations_rad": list(self.orientations_rad),
                 "repeats": list(self.repeats),
                 "heights_mm": list(self.heights_mm),
-                "calibrated_height_mm": self.calibrated_height_mm,
+                # Journals name it only beside heights to choose from; otherwise the sensor's file stands for it.
+                "calibrated_height_mm": self.calibrated_height_mm if self.heights_mm else None,
                 "batch": self.batch,
                 "stop_sd_mm": self.stop_sd_mm,
                 "stop_probability": self.stop_probability,
@@ -341,6 +346,12 @@ class Experiment:
                 "n_live": self.n_live,
             },
         }
+
+
+def _without_commanded_heights(recording: Recording) -> Recording:
+    """Return a recording whose readings all count as ones at the declared height, as the designs of the run do."""
+    covariates = {name: column for name, column in recording.plan.covariates.items() if name != "height_mm"}
+    return replace(recording, plan=replace(recording.plan, covariates=covariates))
 
 
 def largest_sd_mm(names: tuple[str, ...], sd: FloatArray) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,8 +32,9 @@ def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_sample
     theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
     weight = np.full(n_samples, 1.0 / n_samples)
     designs = experiment.designs
+    plan = replace(designs.plan(PATTERN), instrumentation=experiment.instrumentation)
     predictive = experiment.forecast.predictive(
-        theta, weight, designs, designs.plan(PATTERN), np.arange(experiment.grid.n_places), experiment.noise_sd
+        theta, weight, designs, plan, np.arange(experiment.grid.n_places), experiment.noise_sd
     )
     _, mass = next(predictive.level_weights(weight))
     levels = predictive.levels

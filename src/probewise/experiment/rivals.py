@@ -80,7 +80,7 @@ class SensorModelRival:
 
 
 def rivals_of(
-    model: SensorModel, likelihood: Likelihood, field_mm: tuple[float, float]
+    model: SensorModel, likelihood: Likelihood, field_mm: tuple[float, float], *, height_mm: float | None = None
 ) -> tuple[SensorModelRival, ...]:
     """Return the rivals of a sensor model: effects that it leaves out, and other noise.
 
@@ -92,6 +92,8 @@ def rivals_of(
         `GaussianKnown` with one sd, or `Rounded`; for any other, no noise models are among the rivals.
     field_mm
         Width and height of the field.
+    height_mm
+        Height of the sensor above the surface as it was calibrated; None: not known.
 
     Raises
     ------
@@ -110,7 +112,7 @@ def rivals_of(
     shown = {**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD
     for name, wide in shown.items():
         reach_mm = math.hypot(*field_mm) if wide else _SCAN_MM
-        effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _plan_there_and_back(reach_mm)))
+        effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _plan_there_and_back(reach_mm, height_mm)))
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, field_mm)]
     noise = DeclaredNoise.from_likelihood(likelihood)
@@ -154,7 +156,7 @@ class GainLoss(GainDrift):
         )
 
 
-def _plan_there_and_back(length_mm: float) -> Plan:
+def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
     """Return a plan of one scan of `length_mm` there and back over 150 s, from which effects take their scales."""
     n = 2 * int(_DURATION_S / EACH_S / 2) + 1
     zeros = np.zeros(n, dtype=np.int64)
@@ -167,5 +169,5 @@ def _plan_there_and_back(length_mm: float) -> Plan:
         scan_names=("field",),
         pattern=zeros,
         pattern_names=("field",),
-        instrumentation=Instrumentation(),
+        instrumentation=Instrumentation(height_mm=height_mm),
     )

@@ -235,7 +235,9 @@ def experiment_without_inference(
         orientations_rad=orientations_rad,
         repeats=repeats,
         heights_mm=heights_mm,
-        calibrated_height_mm=checked_calibrated_height_mm(sensor, model, heights_mm) if heights_mm else None,
+        calibrated_height_mm=(
+            checked_calibrated_height_mm(sensor, model, heights_mm) if heights_mm else sensor.instrumentation.height_mm
+        ),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -222,21 +223,77 @@ def test_rare_possible_hypotheses_are_doubtful_but_used(rng: np.random.Generator
 
 @pytest.mark.parametrize("n_possible", [1, 2, 3])
 def test_a_run_of_one_parameter_may_begin_with_few_possible_draws(n_possible: int) -> None:
-    """One, two or three of the twenty draws that the limit allows; the chains supply the rest."""
-    first = np.sort(np.random.default_rng(6).random(20))
+    """One, two or three of all draws that a run takes; the chains supply the rest."""
+    drawn: list[np.ndarray] = []
+
+    def take_note(x: np.ndarray) -> np.ndarray:
+        drawn.append(x[:, 0].copy())
+        return np.full(len(x), -np.inf)
+
+    with pytest.raises(NotConvergedError):
+        run_once(make_problem(take_note, [(0.0, 1.0)], vectorized=True), rng=np.random.default_rng(6), n_live=20)
+    first = np.sort(np.concatenate(drawn))
     low, high = 0.0, float(0.5 * (first[n_possible - 1] + first[n_possible]))
 
     def log_likelihood(x: np.ndarray) -> np.ndarray:
         return np.where((x[:, 0] >= low) & (x[:, 0] < high), 0.0, -np.inf)
 
     result = run_once(
-        make_problem(log_likelihood, [(0.0, 1.0)], vectorized=True),
-        rng=np.random.default_rng(6),
-        n_live=20,
-        max_calls=20,
+        make_problem(log_likelihood, [(0.0, 1.0)], vectorized=True), rng=np.random.default_rng(6), n_live=20
     )
-    assert result.log_start == pytest.approx(math.log(n_possible / 20))
+    assert result.log_start == pytest.approx(math.log(n_possible / len(first)))
+    assert result.complete
     assert (result.theta < high).all()
+
+
+class Slab:
+    """A problem of which the first `share` is possible, with a peak there; it counts its evaluations."""
+
+    def __init__(self, share: float) -> None:
+        self.prior, self.share, self.n_calls = problems.box(2, 0, 1), share, 0
+
+    def log_likelihood(self, theta: np.ndarray) -> np.ndarray:
+        self.n_calls += len(theta)
+        within = theta[:, 0] / self.share
+        return np.where(within < 1, -0.5 * ((within - 0.5) ** 2 + (theta[:, 1] - 0.5) ** 2) / 0.01, -np.inf)
+
+
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
+@pytest.mark.parametrize(
+    ("share", "max_calls"),
+    [*itertools.product((0.5, 0.1, 0.03), (100, 230, 1000, 3000)), (0.003, 3000), (0.001, 21_000)],
+)
+def test_the_call_limit_holds_where_a_part_of_the_prior_is_impossible(share: float, max_calls: int) -> None:
+    problem = Slab(share)
+    result = run(problem, rng=np.random.default_rng(2), n_live=50, max_calls=max_calls)
+    assert problem.n_calls == result.n_calls <= max_calls
+    if not result.complete:
+        assert f"stopped at {result.n_calls} of max_calls = {max_calls}" in result.warnings[0]
+    assert result.samples(10, rng=np.random.default_rng(3))[:, 0].max() < share
+
+
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
+def test_the_few_draws_that_the_call_limit_allows_give_the_evidence_by_simple_sampling() -> None:
+    """Scattered by its error about the truth: over 200 runs of 300 draws, about nine of which are possible."""
+    truth, found = math.log(0.03 * 2 * math.pi * 0.01), []
+    for seed in range(200):
+        result = run_once(Slab(0.03), rng=np.random.default_rng(seed), n_live=50, max_calls=300)
+        assert len(result.theta) < 50
+        found.append(result.log_z)
+    assert np.exp(np.array(found) - truth).mean() == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
+def test_a_run_that_the_call_limit_ended_at_its_first_draws_begins_anew_from_its_checkpoint(tmp_path: Path) -> None:
+    def once(max_calls: int | None, checkpoint: Path | None) -> NestedResult:
+        rng = np.random.default_rng(2)
+        return run_once(Slab(0.03), rng=rng, n_live=50, max_calls=max_calls, checkpoint=checkpoint)
+
+    path = tmp_path / "run.npz"
+    assert not once(300, path).complete
+    resumed = once(None, path)
+    assert resumed.complete
+    assert resumed.log_z == once(None, None).log_z
 
 
 def test_a_hypothesis_space_that_excludes_the_readings_is_an_error(rng: np.random.Generator) -> None:

@@ -110,9 +110,15 @@ class Bound:
     admits = mask_above  # its earlier name
 
 
+class OutOfCallsError(Exception):
+    """The evaluations that come next would exceed the limit; nothing was evaluated."""
+
+
 @dataclass
 class Evaluator:
     """Evaluates the likelihood of points and counts them in `n_calls`; errors name the parameters at which it failed.
+
+    Evaluations beyond `most_calls` in all, if not None, are refused with OutOfCallsError.
 
     With an `executor` (any `concurrent.futures.Executor`) a batch is split into `n_parts` parts; the
     problem must then be picklable. Results come back in order, so the run does not depend on the executor
@@ -123,6 +129,7 @@ class Evaluator:
     n_calls: int = 0
     executor: Executor | None = None
     n_parts: int = 1
+    most_calls: int | None = None
     names: tuple[str, ...] = field(init=False)
     space: Space = field(init=False)
 
@@ -177,10 +184,13 @@ class Evaluator:
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Evaluate the log likelihood of hypotheses, (n, n_params) -> (n,), and count the calls.
 
-        NotConvergedError if the likelihood raises, or returns the wrong shape, NaN or +inf.
+        NotConvergedError if the likelihood raises, or returns the wrong shape, NaN or +inf; OutOfCallsError beyond
+        `most_calls`.
         """
         if not len(theta):
             return np.empty(0)  # a likelihood need not take an empty batch
+        if self.most_calls is not None and self.n_calls + len(theta) > self.most_calls:
+            raise OutOfCallsError
         shared = self.executor is not None and len(theta) > 1
         parts = np.array_split(theta, min(self.n_parts, len(theta))) if shared else [theta]
         answers: list[object] = []

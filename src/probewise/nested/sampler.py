@@ -32,7 +32,7 @@ from probewise.nested.checkpoint import (
     RunState,
     settings_of_run,
 )
-from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
+from probewise.nested.evaluate import Bound, Evaluator, OutOfCallsError, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import relative_lineage_variance
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
@@ -140,7 +140,7 @@ def run_once(
     )
     if n_workers is not None:
         n_workers = checked_whole("n_workers", n_workers)
-    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
+    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1, most_calls=max_calls)
     n_params = len(evaluate.names)
     n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)
     rule = RemainingEvidence() if stop is None else stop
@@ -156,6 +156,8 @@ def run_once(
         keeper = CheckpointFile(Path(checkpoint), checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
     now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
+    if len(now.live.points) < n_live:  # a run with more calls begins anew
+        keeper = None
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)
     under_way = _RunUnderWay(
@@ -213,10 +215,13 @@ class _RunUnderWay:
         """Do rounds until the rule ends the run or the next round might exceed `max_calls`; return the result."""
         while self.now.ended is None:
             # A round can cost twice the last one: the volume halves while points are drawn from the prior.
-            if max_calls is not None and self.evaluate.n_calls + 2 * self.now.last_cost > max_calls:
-                reason = f"stopped at {self.evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
-                return self.finish(reason, f"{reason}; log Z lacks what a full run would have found")
-            after, state = _do_round(self.now, self.evaluate, self.n_replaced, self.rng)
+            few = max_calls is not None and self.evaluate.n_calls + 2 * self.now.last_cost > max_calls
+            if few or len(self.now.live.points) < self.n_live:
+                return self._finish_out_of_calls(max_calls)
+            try:
+                after, state = _do_round(self.now, self.evaluate, self.n_replaced, self.rng)
+            except OutOfCallsError:  # the first round, or one that costs more than twice the last
+                return self._finish_out_of_calls(max_calls)
             # One assignment, so that an interruption leaves a round either complete or not begun.
             self.now = replace(after, ended=self.rule(state))
             if progress is not None:
@@ -224,6 +229,11 @@ class _RunUnderWay:
             if self.keeper is not None:
                 self.keeper.save_if_due(self.now)
         return self.finish(self.now.ended)
+
+    def _finish_out_of_calls(self, max_calls: int | None) -> NestedResult:
+        """Compute the result of the whole rounds so far, with a warning."""
+        reason = f"stopped at {self.evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
+        return self.finish(reason, f"{reason}; log Z lacks what a full run would have found")
 
 
 def _checked_n_live_and_n_replaced(
@@ -320,7 +330,8 @@ def _initial_run_state(
 
     Impossible hypotheses (zero likelihood) are counted and discarded; the initial volume is the share m / n of possible
     ones. Where fewer than `n_live` are found in 100 `n_live` draws or more, chains supply the others, and go on until
-    all have forgotten their few starts. NotConvergedError if no draw is possible.
+    all have forgotten their few starts; where `max_calls` is too few for these chains, the draws found are all live
+    points. NotConvergedError if no draw is possible.
     """
     most = max(100 * n_live, 20_000) if max_calls is None else min(max(100 * n_live, 20_000), max_calls)
     n_params = len(evaluate.names)
@@ -353,12 +364,14 @@ def _initial_run_state(
         cloud = (
             points.u if found > max(n_params, 2) else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
         )
-        more, _ = move.draw(start, bound, cloud, evaluate, rng)
-        points = Points.join(points, more)
-        for _ in range(_MIXING):
-            points, tally = move.draw(points, bound, points.u, evaluate, rng)
-            move = move.adapted(tally)
-    live = LivePoints(points, BirthRecords.of_prior_draws(n_live), log_volume)
+        with contextlib.suppress(OutOfCallsError):
+            more, _ = move.draw(start, bound, cloud, evaluate, rng)
+            mixed, mixing = Points.join(points, more), move
+            for _ in range(_MIXING):
+                mixed, tally = mixing.draw(mixed, bound, mixed.u, evaluate, rng)
+                mixing = mixing.adapted(tally)
+            points, move = mixed, mixing
+    live = LivePoints(points, BirthRecords.of_prior_draws(len(points)), log_volume)
     return RunState(live, (), move, log_volume, error, (), n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
 
 
@@ -377,7 +390,7 @@ def _final_result(
     parts = [*(d.points for d in dead), live.points.take_rows(order)]
     theta = np.concatenate([part.theta for part in parts])
     log_likelihood, label = (np.concatenate([getattr(p, name) for p in parts]) for name in ("log_likelihood", "label"))
-    n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(n_live, 0, -1)])
+    n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(len(live.points), 0, -1)])
     evidence = integrate(
         log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import insertion_p_value, integrate
 from probewise.nested.sampler import replace_worst_live_points, run_once
-from probewise.priors import Empty
+from probewise.priors import Empty, Normal, Product
 
 # A right sampler is further off than this many of its own errors less than once in 10 000 runs.
 N_ERRORS = 3.9
@@ -334,6 +335,23 @@ def test_the_call_limit_gives_a_doubtful_result(rng: np.random.Generator) -> Non
     assert result.n_calls <= 3000
     assert "max_calls" in result.stop_reason
     assert result.samples(10, rng=rng).shape == (10, 2)
+
+
+@pytest.mark.parametrize(("at", "sd", "warned"), [(-9, 0.05, False), (7, 0.05, False), (8, 0.05, True), (9, 0.3, True)])
+def test_a_posterior_so_far_out_that_numbers_are_too_coarse_is_doubtful(at: float, sd: float, warned: bool) -> None:
+    """A measurement `at` prior sds, of the given sd: below the mean ln Z is right, above it samples pile up."""
+    result = quiet_run(
+        lambda x: -0.5 * ((x[:, 0] - at) / sd) ** 2 - math.log(sd * math.sqrt(2 * math.pi)), Normal(0.0, 1.0)
+    )
+    assert any("steps between floating-point numbers" in note for note in result.warnings) is warned
+    if not warned:
+        truth = -0.5 * (at**2 / (1 + sd**2) + math.log(2 * math.pi * (1 + sd**2)))
+        assert abs(result.log_z - truth) < N_ERRORS * result.log_z_error
+
+
+def quiet_run(log_likelihood: Callable[[np.ndarray], np.ndarray], marginal: Normal) -> NestedResult:
+    problem = problems.Known(Product({"p0": marginal}), log_likelihood, 0.0)
+    return run_once(problem, rng=np.random.default_rng(4), n_live=100)
 
 
 def test_progress_is_told_every_round(rng: np.random.Generator) -> None:

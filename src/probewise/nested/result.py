@@ -6,7 +6,7 @@ import io
 import json
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,19 @@ from typing import Any
 import numpy as np
 import scipy
 
-from probewise._arrays import IntArray, frozen_int
+from probewise._arrays import FloatArray, IntArray, frozen_int
 from probewise._kinds import checked_path
 from probewise._version import __version__
 from probewise.errors import FileError
 from probewise.nested import conversions
 from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, checked_array_of_length
+from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.atomic import write_bytes_atomically
 
 _FORMAT = "nested-result/4"
 # Lineage variance above which the run descends from too few lineages to estimate its own error.
 _MOST_MEMORY = 10.0
+_FEWEST_STEPS = 30.0  # between floating-point numbers, from quartile to quartile
 _PER_INSERTION = ("insertion_rank", "insertion_n_ranked")
 _ARRAYS = ("theta", *PER_POINT, *COUNTS, *_PER_INSERTION)
 
@@ -106,6 +108,31 @@ def warning_of_few_possible_draws(log_start: float, log_start_error: float, n_li
     if found >= n_live:
         return None
     return f"only {found} of {round(found / share)} hypotheses drawn from the prior are possible"
+
+
+def warning_of_coarse_coordinates(names: Sequence[str], u: FloatArray, weight: FloatArray) -> str | None:
+    """Return a warning if the posterior is too narrow in the sampling coordinates for floating-point numbers, or None.
+
+    Just below 1 numbers are 1e-16 apart, so this is the case about 8 sds above the mean of a normal prior. Below the
+    mean, near 0, there are numbers enough.
+
+    Parameters
+    ----------
+    names
+        Names of the parameters.
+    u, weight
+        Points in the sampling coordinates, (n, n_params), and their posterior weights, (n,), sum 1.
+    """
+    low, high = weighted_quantiles(u, weight, [0.25, 0.75])
+    steps = (high - low) / np.spacing(np.abs(low))
+    narrowest = int(np.argmin(steps))
+    if steps[narrowest] >= _FEWEST_STEPS:
+        return None
+    return (
+        f"half of the posterior of {names[narrowest]} lies within {steps[narrowest]:.0f} steps between floating-point "
+        "numbers, where its prior is mapped to 0 to 1: log Z and samples may be far off; take a prior with more "
+        "probability there"
+    )
 
 
 def warning_of_few_lineages(memory: float) -> str | None:

@@ -39,6 +39,7 @@ from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import (
     NestedResult,
     software_versions,
+    warning_of_coarse_coordinates,
     warning_of_few_lineages,
     warning_of_few_possible_draws,
 )
@@ -412,6 +413,10 @@ def _final_result(
         notes = (*notes, uncertain)
     if evidence.n_eff < _FEW_EFFECTIVE:
         notes = (*notes, f"only {evidence.n_eff:.0f} effective samples: use more n_live")
+    else:
+        u = np.concatenate([part.u for part in parts])
+        coarse = warning_of_coarse_coordinates(evaluate.names, u, np.exp(evidence.log_weight))
+        notes = notes if coarse is None else (*notes, coarse)
     return NestedResult(
         names=evaluate.names,
         theta=theta,

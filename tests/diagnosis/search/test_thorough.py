@@ -1,7 +1,7 @@
 """Nested sampling beside Laplace: the truth where it is known, agreement where it should be, and who wins."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +15,7 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agreement
-from probewise.effects import VOCABULARY, Extent
+from probewise.effects import VOCABULARY, Extent, Flicker
 from probewise.priors import Normal, Product
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.scene import KnownScene
@@ -97,6 +97,48 @@ def test_a_line_weighs_what_quadrature_says():
     assert null.nested == pytest.approx(truth, abs=0.02 + 4 * null.error)
     assert null.error < 0.1
     assert null.agree
+
+
+@dataclass(frozen=True)
+class Wave(Flicker):
+    """A flicker that says how often its two turns of phase hold each peak."""
+
+    @property
+    def n_peaks(self) -> int:
+        return 2
+
+
+@pytest.mark.slow
+def test_a_wave_weighs_what_quadrature_over_all_its_phases_says():
+    """Both peaks of two turns of phase are in the prior that nested sampling explores, so neither counts again."""
+    level = OwnModel(lambda p, plan: p["a"] + 0 * plan.time_s, Product({"a": Normal(0, 2)}))
+    plain = line_recording(0.0)
+    time, n = plain.plan.time_s, len(plain)
+    recording = replace(plain, readings=plain.readings - 0.05 * time + 0.4 * np.sin(2 * np.pi * 0.11 * time + 1.0))
+    wave = Wave(typical=0.1, lowest_hz=0.1, highest_hz=0.12, n_frequencies=8)
+    found = search(Prepared(recording, {wave.name: wave}, level, LightSensorApparatus(), recording))
+    candidate = next(own for own, _ in thorough._leading_hypotheses(found) if own.names == (wave.name,))
+    told = thorough._weigh_by_nested_sampling(
+        candidate, (), found, rng=np.random.default_rng(1), n_live=100, rounds=lambda *_: None
+    )
+    # The first turn of phase, twice; of the level by the trapezium rule too.
+    a, amp = np.linspace(0.5, 1.5, 61), np.linspace(0.01, 0.9, 61)
+    hz, phase = np.linspace(0.1, 0.12, 41), np.linspace(0.0, 2 * np.pi, 61)[:-1]
+    log_post = np.empty((len(hz), len(phase), len(amp), len(a)))
+    for k, own_hz in enumerate(hz):
+        shape = np.sin(2 * np.pi * own_hz * time + phase[:, None])
+        rest = recording.readings - amp[:, None] * shape[:, None]
+        mean, square = rest.mean(axis=-1), (rest**2).mean(axis=-1)
+        rss = n * (square[..., None] - 2 * a * mean[..., None] + a**2)
+        log_post[k] = math.lgamma(n / 2) - math.log(2) - n / 2 * np.log(math.pi * rss)
+    log_post += wave.prior.marginals["amp"].log_prob(amp)[:, None] + Normal(0, 2).log_prob(a)
+    most = log_post.max()
+    ends = np.where(np.isin(hz, hz[[0, -1]]), 0.5, 1.0)[:, None, None, None]
+    cell = (hz[1] - hz[0]) / 0.02 * phase[1] / (4 * np.pi) * (amp[1] - amp[0]) * (a[1] - a[0])
+    truth = math.log(2 * cell * (ends * np.exp(log_post - most)).sum()) + most
+    assert candidate.log_share == pytest.approx(math.log(2))
+    assert told.nested == pytest.approx(truth + candidate.log_detectable, abs=0.05 + 4 * told.error)
+    assert told.error < 0.1
 
 
 @pytest.mark.slow

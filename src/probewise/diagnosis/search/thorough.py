@@ -135,6 +135,7 @@ def _weigh_by_nested_sampling(
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     problem = _hypothesis_problem(candidate, noise, searched)
     once = fold_problem(problem, candidate.found.z)
+    log_factor = _log_prior_factor_of_whole_prior(candidate)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
         nested.run,
@@ -150,18 +151,26 @@ def _weigh_by_nested_sampling(
 
         def weighing_from_samples(theta: FloatArray) -> Weighing:
             found = _evidence_near_posterior(theta, once, run, rng)
-            log_z = found.log_z + candidate.log_prior_factor
+            log_z = found.log_z + log_factor
             return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
 
         told = weighing_from_samples(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
             told = max(told, weighing_from_samples(_draw_from_laplace(candidate, rng)), key=lambda own: own.nested)
-    more = explored.log_z + candidate.log_prior_factor - told.nested
+    more = explored.log_z + log_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:
         return told
     doubt = f"the whole prior holds more evidence than was found near the posterior, by {apart:.1f} standard errors"
     return replace(told, doubts=(*told.doubts, doubt))
+
+
+def _log_prior_factor_of_whole_prior(candidate: WeighedFit) -> float:
+    """Return the log prior factor in a candidate's evidence but for its equivalent peaks.
+
+    Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
+    """
+    return candidate.log_prior_factor - sum(math.log(effect.n_peaks) for effect in candidate.found.model.effects)
 
 
 def _hypothesis_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> HypothesisProblem:

@@ -17,6 +17,7 @@ from probewise.sensor.stages import Footprint
 
 _REACH = 6.5  # sds: beyond, a Gaussian's density is below 1e-9 of its peak
 _NEGLIGIBLE = 1e-9  # share of a field's light that is not drawn
+_ON_A_LINE = 1e-6  # of a pixel: root sum square distance from a line
 
 
 def mixture_parameter_names(n_gaussians: int) -> tuple[str, ...]:
@@ -303,13 +304,16 @@ def merged_mean_mixture(
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    Negative values of the field count as 0. Gaussians without mass are left out of the `n_gaussians`. Raises
-    ParameterError if a Gaussian would have no width, as for a single row of pixels.
+    Pixels count as points; but where all lie on a line, or there is one alone, as squares, whose width is added to the
+    covariance. Negative values of the field count as 0. Gaussians without mass are left out of the `n_gaussians`.
+    Raises ParameterError if one of several Gaussians would have no width, as one on a single pixel.
     """
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
-    covs = np.zeros((int(kept.sum()), 2, 2))
-    return _merge_gaussians(values[kept], field.centers_mm[kept], covs, n_gaussians)
+    places = field.centers_mm[kept]
+    across = np.linalg.svd(places - places.mean(axis=0), compute_uv=False).min() if len(places) > 1 else 0.0
+    width = field.pixel_mm**2 / 12 if across < _ON_A_LINE * field.pixel_mm else 0.0
+    return _merge_gaussians(values[kept], places, np.tile(width * np.eye(2), (len(places), 1, 1)), n_gaussians)
 
 
 def _quadratic_form(off: FloatArray, matrix: FloatArray) -> FloatArray:

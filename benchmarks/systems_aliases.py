@@ -1,7 +1,7 @@
 """Add what says the same in other words to the cases of a campaign on systems that was begun without it.
 
 To each case with one effect of the given sizes, the rivals of its effect are added (for the rows of the oracle); to
-each with one effect or two, the loss of what was said in other words. Both are found by the world alone, from the
+each with an effect, the loss of what was said in other words. Both are found by the world alone, from the
 noise-free readings; the diagnosis is not repeated. The campaign's own command then makes its table anew.
 
     python benchmarks/systems_aliases.py challenge_systems/cases.jsonl --sizes 12 --workers 2
@@ -50,7 +50,7 @@ def main() -> None:
         key
         for key, result in results.items()
         if "failed" not in result
-        and result["kind"] in ("single", "pair")
+        and result["kind"] != "clean"
         and ("alternative_nats" not in result or lacks_rivals(result, sizes))
     ]
     with ProcessPoolExecutor(arguments.workers) as pool:

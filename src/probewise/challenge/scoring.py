@@ -66,8 +66,9 @@ def are_names_right(result: Result, names: Sequence[str], *, noise: bool = True)
     """Return whether a hypothesis is right: its names match those of the effects or their aliases, or it is an alias.
 
     `noise`: whether noise effects have to be named. A hypothesis is an alias if the case holds its loss on the
-    noise-free readings ("alternative_nats", by names joined with "+") and that is below `HONEST_NATS`; one with more
-    names than there are effects is none: beside the right one, any name explains as much.
+    noise-free readings ("alternative_nats", by names joined with "+") and that is below `HONEST_NATS` or, where an
+    effect is outside the vocabulary, is that of a cosine of .9 (section 4); one with more names than there are effects
+    is none: beside the right one, any name explains as much.
     """
     if names_match(names, right_names_of_each_effect(result, merged=True, noise=noise)):
         return True
@@ -76,7 +77,12 @@ def are_names_right(result: Result, names: Sequence[str], *, noise: bool = True)
         return False
     nats = result.get("alternative_nats", {}).get("+".join(physics), math.inf)
     due = set(result["truth"]) & NOISE if noise else set()
-    return bool(nats < HONEST_NATS) and set(names) & NOISE == due
+    return bool(nats < _most_nats_of_alias(result)) and set(names) & NOISE == due
+
+
+def _most_nats_of_alias(result: Result) -> float:
+    strange = [hidden for hidden in result["hidden"] if not hidden["in_vocabulary"]]
+    return max([HONEST_NATS, *(0.5 * hidden["size_lambda"] ** 2 * (1 - _LIKE**2) for hidden in strange)])
 
 
 def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:

@@ -121,10 +121,9 @@ def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any]) -> dict[str,
     """Return how much worse what was said in other words explains a case, by its names joined with "+".
 
     Said are the hypotheses of more than 5 % and those of the credible set (`statements_to_score`), without effects on
-    the noise. The loss is that of `world.systems.nats_of_alternative`; infinite ones are left out, and so are all
-    where an effect is outside the vocabulary.
+    the noise. The loss is that of `world.systems.nats_of_alternative`; infinite ones are left out.
     """
-    if not case.effects or not all(effect.in_vocabulary for effect in case.effects):
+    if not case.effects:
         return {}
     likely = [tuple(names) for names, probability in said["hypotheses"] if probability > _LIKELY]
     labels = {*likely, *map(names_in_label, said["credible_set"])}

@@ -43,6 +43,13 @@ def test_probabilities_are_prior_times_evidence_summed_over_orders():
     assert by_mean["unknown",] / by_mean[()] == pytest.approx(PRIOR.unknown * math.e / (PRIOR.clean_mean * 4.0))
 
 
+def test_an_evidence_that_is_no_number_leaves_all_others_as_they_are():
+    spoilt = replace(EVIDENCES, fits={**EVIDENCES.fits, (1, ("drag",)): fit(math.nan)})
+    by_mean = posterior(spoilt).marginal_over_noise
+    assert by_mean.pop(("drag",)) == 0.0
+    assert by_mean == posterior().marginal_over_noise
+
+
 def test_orders_are_those_of_the_clean_mean_alone():
     assert posterior().order_probabilities == {1: pytest.approx(0.25), 2: pytest.approx(0.75)}
 

@@ -27,12 +27,25 @@ def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArr
     usable
         Row numbers of the usable readings, (n_usable,).
     """
+    return sum(float(log_ndtr(linearised_size(found, law, name, usable) - LEAST_VISIBLE)) for name in found.model.names)
+
+
+def linearised_size(found: Fit, law: NoiseLaw, name: str, usable: IntArray) -> float:
+    """Return an effect's lambda: the norm, in noise sds, of its change after a linearised refit of all else.
+
+    Parameters
+    ----------
+    found
+        The fit.
+    law
+        Its noise model.
+    name
+        The effect, one of the fit.
+    usable
+        Row numbers of the usable readings, (n_usable,).
+    """
     sd = found.sd / np.sqrt(law.fisher_information)
-    slopes, out = law(found.slopes) / sd, 0.0
-    for name in found.model.names:
-        rest = np.delete(slopes, found.model.coordinate_slice(name), axis=1)
-        change = law(found.change_by_effect(name, usable)[:, None])[:, 0] / sd
-        taken = np.linalg.solve(rest.T @ rest + np.eye(rest.shape[1]), rest.T @ change)
-        left = float(np.linalg.norm(np.append(change - rest @ taken, taken)))
-        out += float(log_ndtr(left - LEAST_VISIBLE))
-    return out
+    rest = np.delete(law(found.slopes) / sd, found.model.coordinate_slice(name), axis=1)
+    change = law(found.change_by_effect(name, usable)[:, None])[:, 0] / sd
+    taken = np.linalg.solve(rest.T @ rest + np.eye(rest.shape[1]), rest.T @ change)
+    return float(np.linalg.norm(np.append(change - rest @ taken, taken)))

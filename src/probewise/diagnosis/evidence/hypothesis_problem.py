@@ -81,14 +81,15 @@ class HypothesisProblem:
         """Return the log likelihood, averaged over the kept noise nodes: (n_samples, n_params) -> (n_samples,)."""
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
-        residuals = (self.recording.readings[usable] - predicted).T
         nodes, kept = self.noise.nodes, self._kept_node_indices
         laws, log_share = [nodes.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
-        terms = [
-            log_weight + log_likelihood_marginal_over_sigma(law, law(residuals))
-            for log_weight, law in zip(nodes.log_weights[kept], laws, strict=True)
-        ]
-        out = np.asarray(logsumexp(terms, axis=0)) + log_share
+        with np.errstate(all="ignore"):  # of predictions that ran away: impossible below
+            residuals = (self.recording.readings[usable] - predicted).T
+            terms = [
+                log_weight + log_likelihood_marginal_over_sigma(law, law(residuals))
+                for log_weight, law in zip(nodes.log_weights[kept], laws, strict=True)
+            ]
+            out = np.asarray(logsumexp(terms, axis=0)) + log_share
         return np.where(np.isfinite(out), out, -np.inf)
 
     @cached_property

@@ -93,6 +93,7 @@ def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
         out[nodes] = _tailed_log_evidences(found, [every.laws[node] for node in nodes], joined)
     out += [law.log_extra for law in every.laws]
     out += every.log_weights + log_multiplicity(found.model.sensor)
+    out[np.isnan(out)] = -math.inf  # slopes or residuals whose squares overflow: impossible
     return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every)
 
 

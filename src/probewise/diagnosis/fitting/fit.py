@@ -22,6 +22,8 @@ from probewise.sensor.stages import effects_with_columns
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 _AS_EXPECTED = 0.5  # of the gain to second order, from which a step without damping is taken without trying others
+_FARTHEST_CHANGE = 1e6  # in largest predictions: beyond it squares overflow, and a law without the effect has run away
+_IMPOSSIBLE_CHANGE = 1e3  # least change, in noise sds, of a row whose reading is impossible without the effect
 _VALLEY_DAMPINGS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # times the curvature along the valley
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
@@ -122,9 +124,19 @@ class Fit:
     settled: bool = False
 
     def change_by_effect(self, name: str, usable: IntArray) -> FloatArray:
-        """Return the predictions minus those without one of its effects, other parameters fixed, (n_usable,)."""
+        """Return the predictions minus those without one of its effects, other parameters fixed, (n_usable,).
+
+        All are finite: rows impossible without the effect (a root of a negative number, a law that runs away) count as
+        the largest change of the others, and as a thousand noise sds at least.
+        """
         without, stay = self.model.model_and_mask_without(name)
-        return np.asarray(self.predicted - without.predict(self.z[None, stay])[0, usable])
+        with np.errstate(invalid="ignore", over="ignore"):
+            change = self.predicted - without.predict(self.z[None, stay])[0, usable]
+        farthest = _FARTHEST_CHANGE * (float(np.abs(self.predicted).max(initial=0.0)) + self.sd)
+        possible = np.isfinite(change)
+        change = np.clip(change, -farthest, farthest)
+        largest = np.abs(change[possible]).max(initial=_IMPOSSIBLE_CHANGE * self.sd)
+        return np.asarray(np.where(possible, change, largest))
 
 
 def fit(
@@ -199,9 +211,10 @@ def _fit_coroutine(
     nearby = model.sensor.predicts_cheaply_nearby
 
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
-        whitened = law((readings - predicted).T)
-        sigma = law.likeliest_sigma(whitened)
-        return np.asarray(law.minus_log_likelihood(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
+        with np.errstate(all="ignore"):  # of predictions that ran away: not finite, and not taken
+            whitened = law((readings - predicted).T)
+            sigma = law.likeliest_sigma(whitened)
+            return np.asarray(law.minus_log_likelihood(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
     def request_slopes(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         points, steps = _difference_points_and_steps(z)

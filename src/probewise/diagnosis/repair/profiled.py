@@ -94,12 +94,14 @@ class ProfiledDensity:
             """
             near = z[:, None, :] + _STEP * np.concatenate([np.zeros((1, len(rest))) @ eye[rest], eye[rest]])
             predicted = found.model.predict(near.reshape(-1, z.shape[1]))[:, usable]
-            whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
-            sigma = law.likeliest_sigma(whitened[:, 0].T)
-            height = -law.minus_log_likelihood(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
-            normal = law.normal_pseudo_residuals(whitened[:, 0].T, sigma).T
-            joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
-            return np.where(np.isfinite(height), height, -np.inf), joined
+            with np.errstate(all="ignore"):  # of predictions that ran away: impossible below
+                whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
+                sigma = law.likeliest_sigma(whitened[:, 0].T)
+                height = -law.minus_log_likelihood(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
+                normal = law.normal_pseudo_residuals(whitened[:, 0].T, sigma).T
+                joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
+            possible = np.isfinite(height) & np.isfinite(joined).all(axis=(1, 2))
+            return np.where(possible, height, -np.inf), np.where(possible[:, None, None], joined, 0.0)
 
         state = z, *heights_and_slopes(z)
         for _ in range(_ROUNDS):

@@ -14,6 +14,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 
 _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected
+_RUNS_AWAY = 1e100  # of a prediction, whose square overflows: it counts as impossible
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class QuadraticPredictions:
         Parameters
         ----------
         predict
-            The model as a function of steps, (n_samples, n_params) -> (n_samples, n_points).
+            The model as a function of steps, (n_samples, n_params) -> (n_samples, n_points); finite at step 0.
         n_params
             Number of parameters, one step each.
         sd
@@ -47,10 +48,13 @@ class QuadraticPredictions:
         apart = first != second
         one = np.eye(n_params)
         y = predict(np.concatenate([np.zeros((1, n_params)), one, -one, one[first[apart]] + one[second[apart]]]))
+        y = np.where(np.abs(y) < _RUNS_AWAY, y, np.nan)
         up, down, both = y[1 : n_params + 1] - y[0], y[n_params + 1 : 2 * n_params + 1] - y[0], y[2 * n_params + 1 :]
+        # Readings impossible on one side are as on the other; on both, they say nothing.
+        up, down = (np.nan_to_num(np.where(np.isnan(a), -b, a)) for a, b in ((up, down), (down, up)))
         squares = np.empty((len(first), y.shape[1]))
         squares[~apart] = 0.5 * (up + down)
-        squares[apart] = both - y[0] - up[first[apart]] - up[second[apart]]
+        squares[apart] = np.nan_to_num(both - y[0] - up[first[apart]] - up[second[apart]])
         terms = np.concatenate([0.5 * (up - down), squares])
         lengths, axes = np.linalg.eigh(terms @ terms.T)
         kept = lengths > (_NEGLIGIBLE * sd) ** 2

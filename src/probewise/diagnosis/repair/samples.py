@@ -214,6 +214,8 @@ def _posterior_draws(
     normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, 1e-150))[:, 0]
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
     center = np.clip(center, -FARTHEST, FARTHEST)
+    if not np.isfinite(model.predict(center[None, :])[0, recording.usable]).all():
+        center = found.z  # the step left the domain of the formula
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)

@@ -97,8 +97,10 @@ class Refits:
         """Return whether a candidate's model, its effects in any order, fits better at z (n_params,) than its fit."""
         found, law = candidate.found, candidate.law
         readings = found.predicted + found.residuals
-        whitened = law(readings - model.predict(z[None, :])[0, self.templates.usable])[:, None]
-        there = float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0]) + 0.5 * float(z @ z)
+        predicted = model.predict(z[None, :])[0, self.templates.usable]
+        with np.errstate(all="ignore"):  # of predictions that ran away: no number is less
+            whitened = law(readings - predicted)[:, None]
+            there = float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0]) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 
     def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit | None:

@@ -158,14 +158,17 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
     log_z: dict[tuple[Names, Names], float] = {}
     for (_, names), fit in evidences.fits.items():
         for noise, evidence in fit.evidence.items():
-            log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
+            log_z[names, noise] = float(
+                np.logaddexp(log_z.get((names, noise), -np.inf), _or_impossible(evidence.log_z))
+            )
     log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
         # A named effect remains named if a smaller unknown one is left.
         key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
-        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_prior_with_unknown(names)))
+        value = _or_impossible(value) + prior.log_prior_with_unknown(names)
+        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
     for (names, noise), value in evidences.screened.items():
-        log_p[names, noise] = value + prior.log_prior_on_mean(names)
+        log_p[names, noise] = _or_impossible(value) + prior.log_prior_on_mean(names)
     for names, noise in log_p:
         uncertain = tuple(n for n in noise if n not in certain)
         log_p[names, noise] += -math.log(n_forms) + prior.log_prior_on_noise(uncertain, alone=not names)
@@ -177,6 +180,11 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         {key: math.exp(value - total) for key, value in log_p.items()},
         {n: math.exp(v - norm) for n, v in clean_by_order.items()},
     )
+
+
+def _or_impossible(log_z: float) -> float:
+    """Return a log evidence, minus infinity for one that is no number: all probabilities would be none."""
+    return -math.inf if math.isnan(log_z) else log_z
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -51,8 +52,17 @@ class WeighedFit:
         return replace(self.with_log_evidence_shifted(log_share - self.log_share), log_share=log_share, weights=weights)
 
     def with_log_evidence_shifted(self, by: float) -> WeighedFit:
-        """Return a copy with its log evidence shifted by these nats under every noise model."""
-        return replace(self, evidence={noise: replace(e, log_z=e.log_z + by) for noise, e in self.evidence.items()})
+        """Return a copy with its log evidence shifted by these nats under every noise model.
+
+        An evidence that is no number counts as minus infinity: it must not spoil the probabilities of all others.
+        """
+        return replace(
+            self,
+            evidence={
+                noise: replace(e, log_z=-math.inf if math.isnan(e.log_z + by) else e.log_z + by)
+                for noise, e in self.evidence.items()
+            },
+        )
 
     @property
     def n_gaussians(self) -> int:

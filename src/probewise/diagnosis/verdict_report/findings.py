@@ -9,8 +9,9 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence.detectable import linearised_size
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.fitting.fit import fit
+from probewise.diagnosis.fitting.fit import fit, fit_each_start
 from probewise.diagnosis.judgement.judged import Hypothesis
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import n_rows_since_previous_usable, noise_statistics, previous_usable
@@ -190,6 +191,15 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
     sigma = float(law.likeliest_sigma(law(found.residuals)[:, None])[0])
     refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)
+    if not math.isfinite(refit.objective):
+        # Without the effect these parameters predict no readings to start from; those of the null do.
+        null = searched.evidences.fits[holder.n_gaussians, ()].found.z
+        others = found.z[stay][len(null) :]
+        starts = [np.concatenate([null, share * others]) for share in (1.0, 0.0)]
+        again = fit_each_start(model, noise_free, starts, law.with_least_sigma(sigma), tolerance=0.02)
+        refit = min(again, key=lambda one: one.objective)
+    if not math.isfinite(refit.objective):
+        return linearised_size(found, law, name, prepared.usable_rows)
     return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.fisher_information)
 
 

@@ -79,7 +79,7 @@ def _terms_of_variables(variables: list[_ScaledVariable]) -> Iterator[_Term]:
     for x in variables:
         name, own = x.text, x.scale
         yield _Term(f"{name}^2", (x,), lambda v: v**2, 1 / own**2)
-        yield _Term(f"{name}^3", (x,), lambda v: v**3, 1 / own**3)
+        yield _Term(f"{name}^3", (x,), lambda v: v * v * v, 1 / own**3)
         yield _Term(f"|{name}|", (x,), np.abs, 1 / own)
         yield _Term(f"|{name}| {name}", (x,), lambda v: np.abs(v) * v, 1 / own**2)
         yield _Term(f"sqrt(|{name}|) sign({name})", (x,), lambda v: np.sqrt(np.abs(v)) * np.sign(v), own**-0.5)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -54,20 +53,21 @@ class HypothesisSamples:
         return self._known[key]
 
     def compatible_probabilities(self, best: WeighedFit) -> dict[Names, float]:
-        """Return the probability of each hypothesis whose SSF has the best candidate's form, by names; sum one.
+        """Return the probability of each refitted hypothesis whose SSF has the best candidate's form; sum one.
 
+        They are those of the verdict, over all noise models, so that samples contain what it says as often as it says.
         A user's own effects are excluded unless the best candidate has them.
         """
-        out: dict[Names, float] = {}
-        prepared = self.searched.prepared
+        prepared, by_mean = self.searched.prepared, self.searched.posterior.marginal_over_noise
         own = prepared.apparatus.user_effect_names(prepared.effects)
-        for names in dict.fromkeys(names for _, names in self.searched.evidences.fits):
-            log_z = [c.evidence[self.noise].log_z for c in self._candidates_of_same_form(best, names)]
+        out = {
+            names: by_mean.get(names, 0.0)
+            for names in dict.fromkeys(names for _, names in self.searched.evidences.fits)
             # A file cannot hold a user's own effect; it is kept only if it is in the best hypothesis.
-            if log_z and not own & ({*names} - {*best.names}):
-                out[names] = float(np.logaddexp.reduce(log_z)) + self.searched.prior.log_prior_on_mean(names)
-        total = np.logaddexp.reduce(list(out.values()))
-        return {names: math.exp(value - total) for names, value in out.items()}
+            if self._candidates_of_same_form(best, names) and not own & ({*names} - {*best.names})
+        }
+        total = sum(out.values())
+        return {names: p / total for names, p in out.items()} if total > 0 else {best.names: 1.0}
 
     def averaged_over_hypotheses(self, best: WeighedFit, probabilities: Mapping[Names, float]) -> ModelSamples:
         """Average the samples of the best candidate and of its most probable compatible rivals, by probability.

@@ -39,13 +39,14 @@ class HeavyTailedPrior:
             raise ParameterError("HeavyTailedPrior(smallest)", self.smallest, f"0 < smallest < {self.largest:g}")
 
     @cached_property
-    def _component_sds(self) -> FloatArray:
+    def component_sds(self) -> FloatArray:
+        """Sds of the normal distributions of equal weight that it mixes, (n_components,)."""
         return self.typical * _relative_component_sds(self.smallest, self.largest)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape."""
-        x = np.asarray(value, dtype=np.float64)[..., None] / self._component_sds
-        terms = np.exp(-0.5 * x * x) / (self._component_sds * math.sqrt(2 * math.pi))
+        x = np.asarray(value, dtype=np.float64)[..., None] / self.component_sds
+        terms = np.exp(-0.5 * x * x) / (self.component_sds * math.sqrt(2 * math.pi))
         with np.errstate(divide="ignore"):
             density = np.log(terms.mean(axis=-1))
         if not self.positive:
@@ -54,7 +55,7 @@ class HeavyTailedPrior:
 
     def _upper_tail_probability(self, x: FloatArray) -> FloatArray:
         """Return the probability above x of the two-sided mixture."""
-        return np.asarray(0.5 * erfc(x[..., None] / (self._component_sds * math.sqrt(2))).mean(axis=-1))
+        return np.asarray(0.5 * erfc(x[..., None] / (self.component_sds * math.sqrt(2))).mean(axis=-1))
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Evaluate the quantile function, any shape."""

@@ -20,6 +20,7 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
 from probewise.diagnosis.repair.annealing import Density, draw_by_annealing, importance_resample
+from probewise.diagnosis.repair.linear_amplitudes import LinearAmplitudes
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 from probewise.diagnosis.repair.surrogate import SurrogatePosterior
@@ -142,7 +143,8 @@ def sample_model(
     rng
         Source of randomness.
     annealed
-        Whether samples are moved to the posterior; otherwise they stay those of the Laplace approximation.
+        Whether samples are moved to the posterior; otherwise they stay those of the Laplace approximation, with
+        `LinearAmplitudes`.
     progress
         Called with the progress of annealing.
     """
@@ -216,6 +218,10 @@ def _posterior_draws(
     center = np.clip(center, -FARTHEST, FARTHEST)
     if not np.isfinite(model.predict(center[None, :])[0, recording.usable]).all():
         center = found.z  # the step left the domain of the formula
+    if not annealed:
+        linear = LinearAmplitudes.of(found, np.sqrt(np.diag(np.linalg.inv(curvature))))
+        if linear is not None:
+            return linear.draw(found, turned / sd, normal / sd, N_SAMPLES, rng=rng)
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)

@@ -92,6 +92,7 @@ def effects_found(
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
     beside = searched.effect_probabilities_given_unknown() if unknown >= _IS_UNKNOWN else {}
     unit = plan.instrumentation.unit
+    drawn: dict[tuple[WeighedFit, Names], ModelSamples] = {}
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)
         if beside.get(name, 0.0) >= _STANDS_BESIDE:
@@ -103,10 +104,11 @@ def effects_found(
             effect, values, size = _samples_of_insignificant(searched, effect, rng=rng)
         else:
             effect = next((e for e in holder.found.model.effects if e.name == name), effect)
-            own = samples
-            if name not in samples.effects:
+            own = samples if name in samples.effects else drawn.get((holder, noise))
+            if own is None:
                 evidence, weights = holder.evidence[noise], holder.weights
                 own = sample_model(holder.found, evidence, prepared.recording, weights=weights, rng=rng, annealed=False)
+                drawn[holder, noise] = own
             values, size = own.effect_samples(name), _lambda_of(searched, holder, name, noise)
         out.append(
             EffectFound(

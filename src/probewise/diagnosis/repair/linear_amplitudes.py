@@ -1,8 +1,8 @@
 """Draws from the linearised posterior of a fit, in which amplitudes are linear in their value.
 
 Readings are linear in an amplitude, but the coordinate of an amplitude with a heavy-tailed prior is a steep function of
-its value about 0: a normal distribution of the coordinate there becomes one of values that is far too wide. The prior is
-a mixture of normal distributions. Given the component of each amplitude, the values are jointly normal; given the
+its value about 0: a normal distribution of the coordinate there becomes one of values that is far too wide. The prior
+is a mixture of normal distributions. Given the component of each amplitude, the values are jointly normal; given the
 values, the components are independent. They are drawn in turn (Gibbs sampling).
 """
 
@@ -28,8 +28,8 @@ _ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly 
 class LinearAmplitudes:
     """Amplitudes of a fit whose posterior is wide in their coordinate.
 
-    `at` (n,): numbers of their coordinates; `priors`: their heavy-tailed priors; `values` (n,): the fit's; `per_z` (n,):
-    derivatives of their values by their coordinates there.
+    `at` (n,): numbers of their coordinates; `priors`: their heavy-tailed priors; `values` (n,): the fit's; `per_z`
+    (n,): derivatives of their values by their coordinates there.
     """
 
     at: tuple[int, ...]

@@ -353,6 +353,22 @@ def test_a_law_is_tried_with_as_many_waves_as_its_rows_tell_apart():
     assert tried[-1] == pytest.approx(0.5 / np.diff(times)[0])
 
 
+def test_a_wave_is_slow_enough_to_be_seen_as_a_whole_and_a_periodic_error_to_repeat():
+    """Half a wave follows any smooth bend: of an S-shaped one x had "a period of 1365" in a range of 362."""
+
+    def possible(name, waves_in_range, reach):
+        period = reach / waves_in_range
+        setting = {"a": 0.1, "period": period, "hz": 1 / period, "phase": 0.3}
+        prior = FORMS[name].prior
+        return np.isfinite(prior.log_prob(np.array([[setting[each] for each in prior.names]]))[0])
+
+    assert possible("interference", 1.0, 6.0)
+    assert not possible("interference", 0.85, 6.0)
+    drive = np.ptp(TABLE.columns["drive"])
+    assert possible("periodic_error:drive", 1.5, drive)
+    assert not possible("periodic_error:drive", 1.3, drive)
+
+
 def test_a_term_on_one_side_acts_beyond_its_threshold_alone():
     """Closed form: x' = 1 from 0, and x' = 1 - a (x - 2) above 2, goes as 2 + (1 - exp(-a (t - 2))) / a."""
     simulator = Simulator(

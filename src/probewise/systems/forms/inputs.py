@@ -25,6 +25,7 @@ _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the
 _MOST_FREQUENCIES = 600
 _MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
 _ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, some wave fits any readings
+_LEAST_WAVES = 1.5  # in a column's range: half a period is seen again; any bend is a part of a slower wave
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
 
@@ -226,7 +227,7 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
 
     act = _column_changer(name, add_wave)
     frequencies = trial_frequencies(
-        np.sort(values), [np.arange(len(values))], _max_n_trial_frequencies(about), _ROWS_OF_A_WAVE
+        np.sort(values), [np.arange(len(values))], _max_n_trial_frequencies(about), _ROWS_OF_A_WAVE, _LEAST_WAVES
     )
     guess = 1e-4 * float(np.std(values))
     typical = about.typical_amplitude(Stage.INPUT, act, sine_and_cosine_entries(guess, 1 / frequencies), guess)
@@ -234,7 +235,7 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         return
     marginals = {
         "a": about.amplitude_prior(typical, positive=True),
-        "period": LogUniform(float(1 / frequencies[-1]) * 0.98, float(2 / frequencies[0])),
+        "period": LogUniform(float(1 / frequencies[-1]) * 0.98, float(1 / frequencies[0]) / 0.9),
         "phase": PHASE,
     }
     yield Form(

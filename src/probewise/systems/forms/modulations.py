@@ -130,11 +130,16 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
 
 
 def trial_frequencies(
-    values: FloatArray, groups: list[Any], most: int = _MOST_FREQUENCIES, rows_each: int = 2
+    values: FloatArray,
+    groups: list[Any],
+    most: int = _MOST_FREQUENCIES,
+    rows_each: int = 2,
+    least_waves: float = 1.0,
 ) -> FloatArray:
-    """Return trial frequencies along a covariate, (n_trial,), rising evenly from half the resolution, 0.5 / range.
+    """Return trial frequencies along a covariate, (n_trial,), rising evenly from `least_waves` / range.
 
-    They go up to one wave in `rows_each` rows, and to 2 / range at least, in steps of about half the resolution; where
+    A wave slower than one in the range is never seen as a whole: nothing tells it from a drift or a bend. They go up to
+    one wave in `rows_each` rows, and to 2 `least_waves` / range at least, in steps of about half the resolution; where
     that gives fewer than 8 or more than `most`, there are 8 or `most`. `groups` are the rows of each run.
     """
     reach = float(np.ptp(values))
@@ -143,7 +148,7 @@ def trial_frequencies(
     highest = 1 / (rows_each * float(np.median(gaps))) if gaps.size else 1.0 / reach
     highest = min(highest, len(np.unique(values)) / (rows_each * reach))
     n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
-    return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
+    return np.asarray(np.linspace(least_waves / reach, max(highest, 2 * least_waves / reach), n))
 
 
 def max_n_trial_frequencies(n_points: int) -> int:

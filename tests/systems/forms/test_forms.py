@@ -369,6 +369,18 @@ def test_a_wave_is_slow_enough_to_be_seen_as_a_whole_and_a_periodic_error_to_rep
     assert not possible("periodic_error:drive", 1.3, drive)
 
 
+def test_rows_without_a_reading_resolve_no_waves():
+    """Inputs on a finer grid than the readings: waves that only these rows told apart fitted any readings."""
+    grid = np.linspace(0.0, 60.0, 241)
+    read = np.arange(241) % 4 == 0
+    table = RunTable({"t_s": grid, "drive": grid * 1.7, "y": np.where(read, 0.0, np.nan)}, time="t_s")
+    simulator = replace(_simulator(), run=None)
+    system = System.of(simulator, table)
+    forms = bind_forms(ReferenceFit(system, table, np.zeros(system.n_params), SD))
+    assert forms["interference"].bank()[:, :, 1].max() == pytest.approx(0.5 / 1.0)
+    assert forms["periodic_error:drive"].bank()[:, :, 1].min() == pytest.approx(4 * 1.7)
+
+
 def test_a_term_on_one_side_acts_beyond_its_threshold_alone():
     """Closed form: x' = 1 from 0, and x' = 1 - a (x - 2) above 2, goes as 2 + (1 - exp(-a (t - 2))) / a."""
     simulator = Simulator(

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
@@ -74,6 +74,12 @@ class ReferenceFit:
         with np.errstate(all="ignore"):
             apart = np.subtract(*(law.rates(s, dict(parameters), dict(columns))[other] for s in (nudged, there)))
         return bool(np.any(np.abs(apart) > 0))
+
+    @cached_property
+    def has_reading(self) -> BoolArray:
+        """Mask of the rows with a reading, (n_points,); of all rows, where none has one."""
+        there = np.isfinite(self.table.columns[self.system.simulator.reading])
+        return there if there.any() else np.ones_like(there)
 
     @property
     def can_fit_value_per_run(self) -> bool:

@@ -15,7 +15,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, Form, Say, mean_with_sd
-from probewise.systems.forms.modulations import max_n_trial_frequencies, trial_frequencies
+from probewise.systems.forms.frequencies import max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
 from probewise.systems.table import RunTable, covariate_of_column
@@ -216,11 +216,11 @@ def _max_n_trial_frequencies(about: ReferenceFit) -> int:
 
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
-    values = about.table.covariates[name]
-    values = values[np.isfinite(values)]
+    column = about.table.covariates[name]
+    values = column[np.isfinite(column) & about.has_reading]  # others resolve no wave: it would fit any readings
     if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
         return
-    origin = origin_of_column(values)
+    origin = origin_of_column(column[np.isfinite(column)])
 
     def add_wave(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * (c - origin) / theta[:, 1:2] + theta[:, 2:3]))

@@ -11,14 +11,14 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailedPrior
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import Uniform
+from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import ChangePoints, mean_with_sd
+from probewise.systems.forms.frequencies import frequency_prior, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_MOMENTS = 512
-_MOST_FREQUENCIES = 1024
-_ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial frequencies of one form: a fifth of a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,42 +129,11 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
     )
 
 
-def trial_frequencies(
-    values: FloatArray,
-    groups: list[Any],
-    most: int = _MOST_FREQUENCIES,
-    rows_each: int = 2,
-    least_waves: float = 1.0,
-) -> FloatArray:
-    """Return trial frequencies along a covariate, (n_trial,), rising evenly from `least_waves` / range.
-
-    A wave slower than one in the range is never seen as a whole: nothing tells it from a drift or a bend. They go up to
-    one wave in `rows_each` rows, and to 2 `least_waves` / range at least, in steps of about half the resolution; where
-    that gives fewer than 8 or more than `most`, there are 8 or `most`. `groups` are the rows of each run.
-    """
-    reach = float(np.ptp(values))
-    gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
-    gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
-    highest = 1 / (rows_each * float(np.median(gaps))) if gaps.size else 1.0 / reach
-    highest = min(highest, len(np.unique(values)) / (rows_each * reach))
-    n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
-    return np.asarray(np.linspace(least_waves / reach, max(highest, 2 * least_waves / reach), n))
-
-
-def max_n_trial_frequencies(n_points: int) -> int:
-    """Return the affordable number of trial frequencies of a form of a law: 64 to 1,024, fewer for more rows."""
-    return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, _MOST_FREQUENCIES))
-
-
-def frequency_prior(frequencies: FloatArray) -> LogUniform:
-    """Return the log-uniform prior of a frequency: over the trial frequencies and a little beyond."""
-    return LogUniform(float(0.9 * frequencies[0]), float(frequencies[-1] * 1.02))
-
-
-def sinusoid_modulation(table: RunTable, time_unit: str) -> Modulation:
+def sinusoid_modulation(about: ReferenceFit) -> Modulation:
     """Return the modulation a sin(2 pi hz t + phase), all three free; hz per unit of time, t from `time_origin`."""
+    table, time_unit = about.table, about.time_unit
     origin = time_origin(table)
-    frequencies = trial_frequencies(table.time_s, table.rows_by_scan())
+    frequencies = trial_frequencies_in_time(about)
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))

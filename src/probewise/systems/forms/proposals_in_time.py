@@ -12,7 +12,7 @@ from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Form, mean_with_sd
-from probewise.systems.forms.modulations import frequency_prior, trial_frequencies
+from probewise.systems.forms.frequencies import frequency_prior, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, text_rounded_to_spread, time_origin
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
 from probewise.systems.table import RunTable
@@ -35,7 +35,7 @@ def formula_forms_in_time(about: ReferenceFit) -> Iterator[Form]:
 def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
     own, table, origin = about.system.simulator, about.table, time_origin(about.table)
-    frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
+    frequencies = trial_frequencies_in_time(about, _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         a, hz, phase, share, edge = (theta[:, k : k + 1] for k in range(5))
@@ -79,7 +79,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
 def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a sinusoid in the reading whose frequency rises or falls linearly along the recording."""
     own, table = about.system.simulator, about.table
-    frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
+    frequencies = trial_frequencies_in_time(about, _MOST_SWEPT, _ROWS_OF_A_WAVE)
     begin, end = float(table.time_s.min()), float(table.time_s.max())
     middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
 

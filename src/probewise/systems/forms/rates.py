@@ -15,7 +15,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, mean_with_sd
-from probewise.systems.forms.modulations import frequency_prior, max_n_trial_frequencies, trial_frequencies
+from probewise.systems.forms.frequencies import frequency_prior, max_n_trial_frequencies, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.motion import LawWithEffects, Limit
 
@@ -156,7 +156,7 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
 def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
     table = about.table
     time, origin = table.time, time_origin(table)
-    frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), max_n_trial_frequencies(len(table)))
+    frequencies = trial_frequencies_in_time(about, max_n_trial_frequencies(len(table)))
 
     def act(value: LawWithEffects, theta: FloatArray, rows: Any) -> LawWithEffects:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]

@@ -86,7 +86,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
             covariates=("level",),
         )
     if table.has_varying_time:
-        how = modulations.sinusoid_modulation(table, about.time_unit)
+        how = modulations.sinusoid_modulation(about)
         yield from modulated_form(
             about,
             "interference",

@@ -1,6 +1,5 @@
 """Forms of the vocabulary: each does what its name says, by a route of its own."""
 
-import timeit
 from dataclasses import replace
 
 import numpy as np
@@ -440,16 +439,31 @@ def test_the_rates_of_a_law_lack_nothing_where_no_time_passes():
     assert not any(name.endswith(":s") for name in names)
 
 
-def test_a_cubic_term_takes_no_longer_than_the_other_terms_of_a_rate():
-    """A power that numpy does not know takes twenty times as long, at every step of every integration."""
+def test_a_cubic_term_is_minus_the_third_power():
     law = Law({"x": 0.0}, lambda s, p, u: {"x": p["rate"] + 0 * s["x"]}, max_step_s=0.2)
     about = _about(Simulator("y", "V", {"rate": (0.0, 2.0)}, law=law, time="t_s", run="run", noise=Noise(sd=SD)))
-    forms, values = bind_forms(about), np.random.default_rng(3).normal(size=(300, 1))
-
-    def seconds_and_term(name):
-        ((_, term),) = forms[name].act(LawWithEffects(law), np.ones((300, 1)), None).terms
-        return min(timeit.repeat(lambda: term({"x": values}, {}, {}), number=50, repeat=20)), term
-
-    (cubic, term), (quadratic, _) = seconds_and_term("cubic:x:x"), seconds_and_term("quadratic:x:x")
+    values = np.random.default_rng(3).normal(size=(300, 1))
+    ((_, term),) = bind_forms(about)["cubic:x:x"].act(LawWithEffects(law), np.ones((300, 1)), None).terms
     np.testing.assert_allclose(term({"x": values}, {}, {}), -(values**3), rtol=1e-14)
-    assert cubic < 3 * quadratic
+
+
+def test_a_fast_wave_in_times_that_come_in_clusters_is_tried_where_the_residuals_have_their_peak():
+    """Nights of three readings, years apart: their average spacing, 25 days, is no limit of what they tell apart."""
+    rng = np.random.default_rng(5)
+    nights = np.concatenate([np.sort(rng.choice(200, 30, replace=False)), 3650 + np.arange(0, 40, 2)])
+    times = np.sort((nights[:, None] + np.sort(rng.uniform(0.0, 0.3, (len(nights), 3)), axis=1)).ravel())
+    wave = 3 * SD * np.sin(2 * np.pi * times / 4.785) + SD * rng.standard_normal(times.size)
+    simulator = Simulator("y", "V", {"offset": (-5, 5)}, simulate=lambda p, u: p["offset"] + 0 * u["t"], time="t")
+    table = RunTable({"t": times, "y": wave}, time="t")
+    system = System.of(simulator, table)
+    form = bind_forms(ReferenceFit(system, table, np.zeros(system.n_params), SD))["interference"]
+    assert form.suggested is not None
+    assert np.abs(form.bank()[:, 0, 1] - 1 / 4.785).min() < 0.25 / np.ptp(times)
+    assert np.isfinite(form.prior.log_prob(np.array([[SD, 1 / 4.785, 0.0]])))[0]
+    # What these readings suggest is nothing to test them by: the draws of a null would have suggested others.
+    assert np.array_equal(form.with_fewer_variants().bank(), form.entries)
+    assert form.entries[:, :, 1].max() < 0.1
+
+
+def test_evenly_spaced_rows_suggest_no_further_frequencies():
+    assert FORMS["interference"].suggested is None

@@ -91,6 +91,9 @@ class Form:
         Whether it looks back to earlier times of a run, which time must then not fall within.
     counted_from
         From where it counts a time or a column, in words; "" for 0, or if it does not count.
+    suggested
+        Further trial settings, as `entries`, that the readings suggest: refits may start there. A test of the readings
+        leaves them out, for other readings would have suggested others.
     """
 
     name: str
@@ -110,6 +113,7 @@ class Form:
     fixed: tuple[str, ...] = ()
     needs_rising_time: bool = False
     counted_from: str = ""
+    suggested: FloatArray | None = None
 
     @cached_property
     def prior(self) -> Product:
@@ -126,8 +130,8 @@ class Form:
         return self.act(value, theta, plan)
 
     def bank(self) -> FloatArray:
-        """Return the template bank: trial settings, (n_entries, n_columns, n_params)."""
-        return self.entries
+        """Return the template bank: trial settings, (n_entries, n_columns, n_params), suggested ones last."""
+        return self.entries if self.suggested is None else np.concatenate([self.entries, self.suggested])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Describe the effect in plain words, given the parameters' mean and sd, (n_params,) each."""
@@ -177,8 +181,14 @@ class Form:
         return tuple(out)
 
     def with_fewer_variants(self) -> Form:
-        """Return the form with its change points thinned to at most 48 intervals."""
+        """Return the form with its change points thinned to at most 48 intervals, and without suggested settings."""
+        if self.suggested is not None:
+            return self._without_suggested
         return self if self.change_points is None else replace(self, change_points=self.change_points.thinned())
+
+    @cached_property
+    def _without_suggested(self) -> Form:
+        return replace(self, suggested=None)
 
     def variant_masks(self, plan: Any) -> VariantMasks | None:
         """Return the masks of the rows after each candidate change point, (n_variants, n_points); None for other forms.

@@ -14,7 +14,7 @@ from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_poi
 from probewise.priors import Uniform
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import ChangePoints, mean_with_sd
-from probewise.systems.forms.frequencies import frequency_prior, trial_frequencies_in_time
+from probewise.systems.forms.frequencies import frequency_prior, residual_peaks, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.table import RunTable, covariate_of_column
 
@@ -25,9 +25,9 @@ _MOST_MOMENTS = 512
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `marginals` is a function of the amplitude's prior, `entries` of the amplitude's typical size, `units` of the
-    quantity's unit, `says` of the quantity's name and unit and the parameters' mean and sd. The other attributes become
-    those of the `Form`.
+    `marginals` is a function of the amplitude's prior, `entries` and `suggested` of the amplitude's typical size,
+    `units` of the quantity's unit, `says` of the quantity's name and unit and the parameters' mean and sd. The other
+    attributes become those of the `Form`.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
@@ -40,6 +40,7 @@ class Modulation:
     change_points: ChangePoints | None = None
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     counted_from: str = ""
+    suggested: Callable[[float], FloatArray | None] = lambda size: None
 
 
 def _single_entry_bank(size: float) -> FloatArray:
@@ -134,6 +135,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
     table, time_unit = about.table, about.time_unit
     origin = time_origin(table)
     frequencies = trial_frequencies_in_time(about)
+    peaks = residual_peaks(about, frequencies)
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))
@@ -142,7 +144,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
         at_rows=at_rows,
         marginals=lambda a: {
             "a": replace(a, positive=True),
-            "hz": frequency_prior(frequencies),
+            "hz": frequency_prior(np.append(frequencies, peaks.highest)),
             "phase": PHASE,
         },
         entries=lambda size: sine_and_cosine_entries(size, frequencies),
@@ -154,4 +156,5 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
         covariates=("time",),
         counted_from=origin_in_words(table.time, origin, time_unit),
         joined=starting_point_of_wave,
+        suggested=lambda size: sine_and_cosine_entries(size, peaks.at) if peaks.at.size else None,
     )

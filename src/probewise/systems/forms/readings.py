@@ -49,6 +49,7 @@ def modulated_form(
             change_points=how.change_points,
             joined=how.joined,
             counted_from=how.counted_from,
+            suggested=how.suggested(typical),
         )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.fitting.fit import Fit, fit, residual_degrees_of_freedom
 from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.noise.memory import innovations_given_rest
 from probewise.recordings.plan import Recording
 
 LEAST_ROWS = 8
@@ -38,12 +39,26 @@ class HeldOutGain:
     by_scan: tuple[tuple[str, float], ...]
 
 
-def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts) -> HeldOutGain:
+def held_out_gain(
+    null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts, *, law_of_null: NoiseLaw
+) -> HeldOutGain:
     """Refit both models without one part of the readings at a time, and compare their log densities of that part.
 
     A held-out reading is predicted from the other parts alone. If the part has parameters of its own, which other parts
-    do not determine, its readings are predicted sequentially, each given those before it. Parts of fewer than eight
-    readings are not held out, and of more than ten parts only ten.
+    do not determine, or if the noise has memory, its readings are predicted sequentially, each given those before it:
+    together they have the joint density of the part given the rest. Parts of fewer than eight readings are not held
+    out, and of more than ten parts only ten.
+
+    Parameters
+    ----------
+    null, repaired
+        The two models, fitted to all readings.
+    recording
+        What was read.
+    law, law_of_null
+        Noise distribution of the repaired model, and of the null.
+    held_out
+        Number of the part of each usable reading, and names of the parts.
     """
     plan, usable = recording.plan, recording.usable
     parts, names = held_out
@@ -51,7 +66,8 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
     def gain_per_reading(out: BoolArray) -> FloatArray:
         rows = np.zeros(len(plan), dtype=np.bool_)
         rows[np.flatnonzero(usable)[out]] = True
-        repaired_one, null_one = (_refit_log_densities(f, recording, rows, law, out) for f in (repaired, null))
+        each = ((repaired, law), (null, law_of_null))
+        repaired_one, null_one = (_refit_log_densities(f, recording, rows, own, out) for f, own in each)
         return repaired_one - null_one
 
     return mean_gain_over_parts(parts, gain_per_reading, names)
@@ -110,21 +126,20 @@ def _refit_log_densities(
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
     rest, own = law.take_readings(~out), law.take_readings(out)
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
-    asked = np.flatnonzero(rows & recording.usable)
     of_its_own = ~np.any(found.slopes[~out], axis=0) & np.any(found.slopes[out], axis=0)
     turned = np.where(of_its_own, 0.0, rest(without.slopes))
     # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the other
     # readings may bound them on one side only, as for a ceiling.
     about = np.where(of_its_own, found.z, without.z)
-    predicted, slopes = (part[asked] for part in found.model.predict_and_differentiate(about))
+    predicted, slopes = (part[recording.usable] for part in found.model.predict_and_differentiate(about))
     free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information))
     sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
     curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
-    miss = recording.readings[asked] - predicted
-    if of_its_own.any():
-        return _sequential_log_densities(
-            own, miss, slopes, without.z - about, np.asarray(np.linalg.inv(curvature), dtype=np.float64), sigma_2
-        )
+    miss = recording.readings[recording.usable] - predicted
+    if of_its_own.any() or law.has_memory:
+        covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
+        return sequential_log_densities(law, out, miss, slopes, without.z - about, covariance, sigma_2)
+    miss, slopes = miss[out], slopes[out]
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     narrow, wide = (
         _log_normal_density(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
@@ -133,29 +148,50 @@ def _refit_log_densities(
     return np.asarray(np.logaddexp(narrow, wide) * own.kept)
 
 
-def _sequential_log_densities(
-    law: NoiseLaw, miss: FloatArray, slopes: FloatArray, mean: FloatArray, covariance: FloatArray, sigma_2: float
+def sequential_log_densities(
+    law: NoiseLaw,
+    out: BoolArray,
+    miss: FloatArray,
+    slopes: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    sigma_2: float,
 ) -> FloatArray:
-    """Return the log density of each reading given those before it, (n,), 0 for lost ones.
+    """Return the log density of each held-out reading given the others and those held out before it, 0 for lost ones.
 
-    `mean` and `covariance` are those of the coordinates before the first reading. Whitened readings are independent,
-    given the coordinates; a constant of the whitening, the same for every model of the mean, is left out.
+    Parameters
+    ----------
+    law
+        Noise distribution of all readings.
+    out
+        Mask of the held-out readings, (n_points,).
+    miss, slopes
+        Residuals of all readings, (n_points,), and slopes, (n_points, n_params), at one point.
+    mean, covariance
+        Of the coordinates about that point, from the readings that are not held out.
+    sigma_2
+        Variance of a whitened reading.
+
+    Returns
+    -------
+    Log densities, (n_out,), whose sum is the log of the joint density.
     """
-    innovations, turned = law(miss), law(slopes)
-    mean, covariance, out = mean.copy(), covariance.copy(), np.zeros(len(miss))
+    whitened, sd = innovations_given_rest(law, np.concatenate([slopes, miss[:, None]], axis=1), out)
+    turned, innovations, kept = whitened[:, :-1], whitened[:, -1], law.kept[out]
+    mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
     noise_2 = sigma_2 * (law.sd_factor_of_rounding**2 if law.flat else 1.0)
-    for k in np.flatnonzero(law.kept):
+    shares = np.array([1 - law.share, law.share])
+    for k in np.flatnonzero(kept):
         row = turned[k]
         gain = covariance @ row
         left, spread = innovations[k] - row @ mean, max(float(row @ gain), 0.0)
         parts = np.array([noise_2 + spread, noise_2 * law.times**2 + spread])
-        shares = np.array([1 - law.share, law.share])
         density = _log_normal_density(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
-        out[k] = np.logaddexp(*density)
-        variance = float(np.exp(density - out[k]) @ parts)  # the most probable noise variance of this reading
+        densities[k] = np.logaddexp(*density)
+        variance = float(np.exp(density - densities[k]) @ parts)  # the most probable noise variance of this reading
         mean += gain * left / variance
         covariance -= np.outer(gain, gain) / variance
-    return out
+    return np.asarray((densities - np.log(sd)) * kept)
 
 
 def _log_normal_density(miss: FloatArray, variance: FloatArray) -> FloatArray:

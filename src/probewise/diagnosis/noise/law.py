@@ -131,30 +131,26 @@ class NoiseLaw:
         return float(self.whitened_density.fisher_information)
 
     def take_readings(self, rows: BoolArray) -> NoiseLaw:
-        """Return the distribution of the readings in a mask, (n_points,): exact for whole scans, else an approximation.
-
-        Each keeps its correlation, with the nearest one taken before it that a chain of correlations reaches, if any.
-        """
+        """Return the distribution of the readings in a mask, (n_points,), whatever the others read."""
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
-        above = self._nearest_taken_before(rows)
+        above, carry = self._nearest_taken_before(rows)
         before = np.maximum(above, 0) if self.before.size else self.before
-        carry = np.where(above >= 0, self.carry[rows], 0.0)
         return replace(self, sd=self.sd[rows], carry=carry, lost=self.lost[rows], walk=walk, before=before)
 
-    def _nearest_taken_before(self, rows: BoolArray) -> IntArray:
-        """Return for each reading taken the nearest one taken before it with which it is correlated, -1 for none.
+    def _nearest_taken_before(self, rows: BoolArray) -> tuple[IntArray, FloatArray]:
+        """Return for each reading taken the nearest taken before it, and its correlation with that: (n_taken,) both.
 
-        The result (n_taken,) numbers the readings taken.
+        The readings taken are numbered; -1 and 0 where none before it is correlated. Along a chain of correlations that
+        of two readings is the product of those in between.
         """
-        number, linked = np.cumsum(rows) - 1, self.carry != 0
-        if not self.before.size:  # those above it, as long as each has a correlation with the one above
-            chain = np.cumsum(~linked)[rows]
-            return np.where(np.diff(chain, prepend=-1) == 0, np.arange(len(chain)) - 1, -1)
-        nearest = np.full(len(rows), -1)
-        for k in np.flatnonzero(linked).tolist():  # a reading comes after the one before it
-            above = self.before[k]
-            nearest[k] = number[above] if rows[above] else nearest[above]
-        return nearest[rows]
+        number, nearest, carry = np.cumsum(rows) - 1, np.full(len(rows), -1), np.zeros(len(rows))
+        for k in np.flatnonzero(self.carry).tolist():  # a reading comes after the one before it
+            above = self.before[k] if self.before.size else k - 1
+            if rows[above]:
+                nearest[k], carry[k] = number[above], self.carry[k]
+            elif nearest[above] >= 0:
+                nearest[k], carry[k] = nearest[above], self.carry[k] * carry[above]
+        return nearest[rows], carry[rows]
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Whiten columns, shape (n_points,) or (n_points, n_columns); rows of lost readings become 0."""

@@ -56,7 +56,10 @@ def improvement_of(
         return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value_after=test.p_value)
     law, prepared = best.evidence[noise].likeliest_law, searched.prepared
     parts = prepared.apparatus.held_out_parts(prepared.recording)
-    held = held_out_gain(null.found, best.found, prepared.recording, law, parts)
+    # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
+    own = null.evidence[null.possible_noise(noise)].likeliest_law
+    own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
+    held = held_out_gain(null.found, best.found, prepared.recording, law, parts, law_of_null=own)
     p_after = bayes_factor_p_value(
         after, searched.template_banks_for_global_test(best.found), after.draw_null_residuals(N_DRAWS, rng=rng)
     )

@@ -143,7 +143,7 @@ def diagnose_prepared(
     return Diagnosis(
         recording=prepared.everything,
         judged=judged,
-        repair=repair_of(prepared, test, best, drawn, change),
+        repair=repair_of(prepared, best, drawn, change),
         where=where,
         next_measurement=asked,
         report=VerdictReport(reason, found, noise, weighings, remainder, formula),

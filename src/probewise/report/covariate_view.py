@@ -73,6 +73,8 @@ class ResidualNoise:
             share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
             sd = sd * np.sqrt(1 + found["ratio"] * share)
         sd = np.hypot(sd, found.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
+        if "sd_per_row" in found:  # beside a walk the readings leave the mean open, not the residuals
+            return cls(sd, found.get("rho", 0.0), None)
         null = diagnosis.null
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
         return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, plan))
@@ -249,7 +251,8 @@ def _covariates_and_periods_to_fold(
 def _view_against_repair_change(diagnosis: Diagnosis) -> CovariateView:
     unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
     return CovariateView(
-        diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})"
+        diagnosis.repair.after.readings_with_walk - diagnosis.repair.before.readings_with_walk,
+        f"change that the repair makes ({unit})",
     )
 
 

@@ -136,7 +136,14 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
     where = f" {_place_caption(diagnosis, shown.place)}" if shown.place else ""
     circles = f"Orange circles: the model as calibrated{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
-    return f"Residuals, averaged in bins. {circles} {band}{where} {bars}"
+    return f"Residuals, averaged in bins. {circles}{_walk_note(diagnosis)} {band}{where} {bars}"
+
+
+def _walk_note(diagnosis: Diagnosis) -> str:
+    """Return the sentence, after a space, that residuals do not contain the noise's random walk; "" without one."""
+    if not diagnosis.repair.after.has_walk:
+        return ""
+    return " Residuals count from the random walk of the zero that all readings show: what it explains is not in them."
 
 
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
@@ -157,7 +164,8 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
             ("Does the repair predict?", _heldout_gain_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd))
         )
     if diagnosis.repair.changes_predictions:
-        left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after"
+        beside = " (beside the random walk of the zero)" if diagnosis.repair.after.has_walk else ""
+        left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after{beside}"
         model = diagnosis.apparatus.words.model
         only_here = f". The unknown part is corrected in these readings only; {model} does not contain it"
         facts.append(("Residuals", f"{left}{only_here if diagnosis.repair.by_rows else ''}."))
@@ -358,7 +366,7 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     opening = paragraph(
         "Residuals of the calibrated model against each covariate in which they are significant: the headline's "
         "first, then the most visible. Each dot is a reading; by chance alone, 95 % of the means would lie in the grey "
-        "band."
+        f"band.{_walk_note(diagnosis)}"
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
     more = (element("details", element("summary", f"{len(rest)} more"), *rest),) if rest else ()
@@ -369,12 +377,17 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
     run = diagnosis.apparatus.words.run
     which = f"The {run} that the repair changes most" if diagnosis.repair.changes_predictions else f"One {run}"
     colours = "orange as calibrated, blue repaired" if diagnosis.repair.changes_predictions else "orange"
+    walk = ", each with the random walk of the zero that all readings show" if diagnosis.repair.after.has_walk else ""
     return (
         figure(
             drawn["before_after.svg"],
-            f"{which}: readings (black) and predictions ({colours}), and below the residuals with their running means.",
+            f"{which}: readings (black) and predictions ({colours}{walk}), and below the residuals with their running "
+            "means.",
         ),
-        figure(drawn["residuals.svg"], "All residuals against time and against predicted reading, with running means."),
+        figure(
+            drawn["residuals.svg"],
+            f"All residuals against time and against predicted reading, with running means.{_walk_note(diagnosis)}",
+        ),
     )
 
 
@@ -426,6 +439,7 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
         (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value_and_interval_texts(p))
         for p in noise.parameters
     )
+    beside = ", the random walk aside" if diagnosis.repair.after.has_walk else ""
     return (
         paragraph(
             typeset_numbers(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")
@@ -434,7 +448,7 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
         figure(
             drawn["noise.svg"],
             f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
-            "Middle: scatter by predicted reading. Below: histogram on a logarithmic scale.",
+            f"Middle: scatter by predicted reading{beside}. Below: histogram on a logarithmic scale{beside}.",
         ),
     )
 

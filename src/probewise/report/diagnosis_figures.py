@@ -152,12 +152,17 @@ def _spread_within_categories(at: FloatArray) -> FloatArray:
 
 
 def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
-    """Draw the scan that the repair changes most (else the longest): readings, one or both models, residuals below."""
+    """Draw the scan that the repair changes most (else the longest): readings, one or both models, residuals below.
+
+    A random walk of the noise, as all readings show it, is part of both models' lines.
+    """
     recording, plan = diagnosis.recording, diagnosis.recording.plan
-    rows = rows_of_scan_changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
+    before, after = diagnosis.repair.before, diagnosis.repair.after
+    rows = rows_of_scan_changed_most(plan, after.readings_with_walk - before.readings_with_walk)
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
-    models = [(BEFORE, diagnosis.repair.before.readings[rows]), (AFTER, diagnosis.repair.after.readings[rows])]
+    walking = ", with the walk" if after.has_walk else ""
+    models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in ((BEFORE, before), (AFTER, after))]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = unit_name(plan.instrumentation.unit)
     models = models if diagnosis.repair.changes_predictions else models[:1]
@@ -216,7 +221,8 @@ def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) 
     if name == "quantisation" and "step" in found:
         return lambda ax: readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
     if name in ("correlated_noise", "random_walk"):
-        return lambda ax: residual_autocorrelation(residuals, recording.plan.scan, rho=found.get("rho"), ax=ax)
+        walking = residuals + diagnosis.repair.after.walk
+        return lambda ax: residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
     if name == "outliers":
         return lambda ax: residual_histogram(residuals / chance.sd, 1.0, ax=ax)
     model_sd = chance.sd if np.ptp(chance.sd) > 0 else None

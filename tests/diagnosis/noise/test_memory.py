@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.noise.memory import innovations_given_rest
+from probewise.diagnosis.noise.memory import innovations_given_rest, walk_given_readings
 
 _N = 40
 
@@ -83,3 +83,24 @@ def test_readings_left_out_of_a_chain_hand_their_correlation_on():
         r = np.random.default_rng(4).normal(size=kept.sum())
         assert np.sum(taken(r) ** 2) == pytest.approx(r @ np.linalg.solve(own, r))
         assert taken.half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(own)[1])
+
+
+def test_the_smoothed_walk_is_its_conditional_mean():
+    law, covariance = _laws()["walk"]
+    seen = ~law.lost
+    residuals = np.random.default_rng(5).normal(size=_N)
+    of_walk = covariance - np.diag(law.sd**2)
+    expected = of_walk[:, seen] @ np.linalg.solve(covariance[np.ix_(seen, seen)], residuals[seen])
+    np.testing.assert_allclose(walk_given_readings(law, residuals), expected)
+    assert not walk_given_readings(_laws()["ar"][0], residuals).any()
+
+
+def test_an_outlying_reading_does_not_pull_the_smoothed_walk():
+    walk = 0.05 * np.cumsum(np.random.default_rng(6).normal(size=200))
+    residuals = walk + np.random.default_rng(7).normal(size=200)
+    residuals[100] += 30.0
+    nothing = np.zeros(200)
+    plain = NoiseLaw(nothing + 1, nothing, nothing > 0, walk=np.full(200, 0.05**2))
+    tailed = NoiseLaw(nothing + 1, nothing, nothing > 0, share=0.05, times=10.0, walk=np.full(200, 0.05**2))
+    assert abs(walk_given_readings(tailed, residuals)[100] - walk[100]) < 0.5
+    assert walk_given_readings(plain, residuals)[100] - walk[100] > 0.5

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.repair import PredictionAndResiduals, Repair, repair_of
 from probewise.diagnosis.thinning import rows_to_diagnose
@@ -64,10 +65,14 @@ def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_re
     assert len(rows) < n
     recording = everything.take(rows)
     prepared = Prepared(recording, {}, None, None, everything)
-    test = SimpleNamespace(null=SimpleNamespace(found=fitted(recording, 4.0)))
-    best = SimpleNamespace(fit=SimpleNamespace(found=fitted(recording, 5.0)), improvement=None)
+    best = SimpleNamespace(
+        calibrated=fitted(recording, 4.0),
+        repaired=fitted(recording, 5.0),
+        improvement=None,
+        problem=SimpleNamespace(law=white_noise(len(rows))),
+    )
     drawn = SimpleNamespace(null=None, repaired=None)
-    found = repair_of(prepared, test, best, drawn, np.full(len(rows), 2.0))
+    found = repair_of(prepared, best, drawn, np.full(len(rows), 2.0))
     assert found.by_rows
     np.testing.assert_array_equal(found.before.readings, 4.0)
     used = np.isin(np.arange(n), rows)

@@ -62,6 +62,17 @@ def test_the_gain_on_held_out_parts_is_that_of_the_conditional_densities(diagnos
     assert gain.heldout_log_density_per_reading > 4 * gain.heldout_sd
 
 
+def test_residuals_count_from_the_walk_and_the_lines_contain_it(diagnosis):
+    y = _recorded()[1]
+    gain, repair = diagnosis.improvement, diagnosis.repair
+    assert 0.7 * _SD < gain.rms_after < 1.1 * _SD < gain.rms_before
+    for shown, rms in ((repair.before, gain.rms_before), (repair.after, gain.rms_after)):
+        assert shown.has_walk
+        np.testing.assert_allclose(shown.readings_with_walk + shown.residuals, y)
+        assert np.sqrt(np.mean(shown.residuals**2)) == pytest.approx(rms)
+        assert abs(shown.residuals.mean()) < _SD / 2
+
+
 def test_rows_after_the_recording_have_the_whole_walk_in_their_sd(diagnosis):
     """As the guide says: predictions look at no reading, and the walk counts from the recording's first row."""
     t = np.arange(_N, _N + 30, dtype=float)

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.repair.improvement import Improvement, improvement_of
+from probewise.diagnosis.repair.under_noise import fit_under_noise
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
@@ -21,6 +23,7 @@ _RUIN = -1.0  # nats per held-out reading below which named effects are withdraw
 class BestRepair:
     """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null.
 
+    `calibrated` and `repaired`: the null and that fit as they are under the noise found, which figures show.
     `out_of_vocabulary`: if the verdict is `unknown`, its effects with a formula but no name in the vocabulary.
     """
 
@@ -28,6 +31,8 @@ class BestRepair:
     noise: Names
     problem: Linearised
     improvement: Improvement
+    calibrated: Fit
+    repaired: Fit
     out_of_vocabulary: Names = ()
 
     @classmethod
@@ -43,9 +48,12 @@ class BestRepair:
     ) -> BestRepair:
         """Build from a fit and its noise effects, and measure the fit's gain over the null."""
         noise = fit.possible_noise(noise)
-        after = Linearised.of(fit.found, fit.evidence[noise].likeliest_law)
-        gain = improvement_of(searched, test, fit, noise, after, rng=rng)
-        return cls(fit, noise, after, gain, out_of_vocabulary)
+        law, recording = fit.evidence[noise].likeliest_law, searched.prepared.recording
+        repaired = fit_under_noise(fit, law, recording)
+        calibrated = repaired if fit is test.null else fit_under_noise(test.null, law, recording)
+        after = Linearised.of(repaired, law)
+        gain = improvement_of(searched, test, fit, noise, after, shown=(calibrated, repaired), rng=rng)
+        return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
 
 
 def predicts_far_worse(gain: Improvement) -> bool:

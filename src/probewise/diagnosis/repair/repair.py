@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 
 from probewise._arrays import FloatArray, read_only_floats
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.noise.memory import walk_given_readings
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples
@@ -23,14 +23,30 @@ from probewise.effects.vocabulary import sentence_from_samples
 
 @dataclass(frozen=True, eq=False)
 class PredictionAndResiduals:
-    """A model's predicted readings of every row, and residuals, NaN without a usable reading: (n_points,) each."""
+    """A model's predicted readings of every row, and residuals, NaN without a usable reading: (n_points,) each.
+
+    `walk`, (n_points,), is the random walk of the offset that all readings show about the prediction, by default 0.
+    Residuals are what neither explains.
+    """
 
     readings: FloatArray
     residuals: FloatArray
+    walk: FloatArray = field(default_factory=lambda: np.zeros(1))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "readings", read_only_floats(self.readings))
         object.__setattr__(self, "residuals", read_only_floats(self.residuals))
+        object.__setattr__(self, "walk", read_only_floats(np.broadcast_to(self.walk, self.readings.shape)))
+
+    @property
+    def has_walk(self) -> bool:
+        """Whether the noise contains a random walk."""
+        return bool(np.any(self.walk))
+
+    @property
+    def readings_with_walk(self) -> FloatArray:
+        """Predicted readings with the walk, (n_points,): what residuals count from."""
+        return np.asarray(self.readings + self.walk)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +60,7 @@ class Repair:
     improvement
         Gain of the repaired model.
     before, after
-        Predictions and residuals of the calibrated and of the repaired model, for all rows.
+        Predictions and residuals of the calibrated and of the repaired model, for all rows, under the same noise.
     by_rows
         Whether an unknown effect is corrected row by row; `improvement` and `after` include that, `model` does not.
     """
@@ -91,38 +107,33 @@ class Repair:
     """The old name of `unstated_effects`."""
 
 
-def repair_of(
-    prepared: Prepared, test: GlobalTest, best: BestRepair, drawn: NullBestAndRepairedSamples, change: FloatArray
-) -> Repair:
+def repair_of(prepared: Prepared, best: BestRepair, drawn: NullBestAndRepairedSamples, change: FloatArray) -> Repair:
     """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
 
     Parameters
     ----------
-    prepared, test, best, drawn
-        Input of the search; global test of the null; the best fit; samples of the models.
+    prepared, best, drawn
+        Input of the search; the best fit; samples of the models.
     change
         Correction of the predictions of the readings that are used, (n_usable,), 0 if there is none.
     """
-    null, fit = test.null.found, best.fit.found
-    everything = prepared.everything
+    everything, law = prepared.everything, best.problem.law
+    used = prepared.usable_rows_of_everything
     by_rows = np.zeros(len(everything))
-    by_rows[prepared.usable_rows_of_everything] = change
-    if prepared.is_thinned:
-        readings = np.where(everything.usable, everything.readings, np.nan)
-        plain, repaired = (
-            replace(found.model, plan=everything.plan).predict(found.z[None, :])[0] for found in (null, fit)
-        )
-        before = PredictionAndResiduals(plain, readings - plain)
-        after = PredictionAndResiduals(repaired + by_rows, readings - repaired - by_rows)
-    else:
-        before = PredictionAndResiduals(
-            _predictions_of_all_rows(null), prepared.expand_usable_to_all_rows(null.residuals)
-        )
-        after = PredictionAndResiduals(
-            _predictions_of_all_rows(fit) + by_rows, prepared.expand_usable_to_all_rows(fit.residuals - change)
-        )
+    by_rows[used] = change
+    readings = np.where(everything.usable, everything.readings, np.nan)
+
+    def shown(found: Fit, added: FloatArray) -> PredictionAndResiduals:
+        model = replace(found.model, plan=everything.plan) if prepared.is_thinned else found.model
+        predicted = np.asarray(model.predict(found.z[None, :])[0] + added)
+        left = found.residuals - added[used]
+        walk = np.zeros(len(everything))
+        if law.walk.size:  # between readings, the expected walk is straight; it begins at 0 before the first row
+            known = walk_given_readings(law, left)
+            walk = np.interp(np.arange(len(everything)), np.append(-1, used), np.append(0.0, known))
+        if prepared.is_thinned:
+            return PredictionAndResiduals(predicted, readings - predicted - walk, walk)
+        return PredictionAndResiduals(predicted, prepared.expand_usable_to_all_rows(left - walk[used]), walk)
+
+    before, after = shown(best.calibrated, np.zeros(len(everything))), shown(best.repaired, by_rows)
     return Repair(drawn.null, drawn.repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
-
-
-def _predictions_of_all_rows(found: Fit) -> FloatArray:
-    return np.asarray(found.model.predict(found.z[None, :])[0])

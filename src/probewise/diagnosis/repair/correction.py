@@ -14,12 +14,18 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.held_out import HeldOutGain, mean_gain_over_parts, partition_into_blocks
+from probewise.diagnosis.evidence.held_out import (
+    HeldOutGain,
+    mean_gain_over_parts,
+    partition_into_blocks,
+    sequential_log_densities,
+)
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.improvement import N_DRAWS, Improvement
+from probewise.diagnosis.repair.under_noise import residuals_beside_walk
 from probewise.diagnosis.residuals.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.search.searched import Searched
 
@@ -62,9 +68,9 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
     columns = bases[min(map(int, rivals), key=lambda i: (int(bases.widths[i]), -float(scores[i])))]
     norms = np.sqrt(np.mean(columns**2, axis=0))
     columns = columns[:, norms > 0] / norms[norms > 0]
-    everything = np.ones(len(found.residuals), dtype=np.bool_)
     plain = np.zeros((len(columns), 0))
-    change = found.residuals - _predictive_residuals_and_variances(found, problem, columns, everything, everything)[0]
+    amount, _ = _amounts_and_covariance(found, problem, columns, np.ones(len(columns), dtype=np.bool_))
+    change = np.concatenate([found.slopes, columns], axis=1) @ amount
 
     def gain_per_reading(out: BoolArray) -> FloatArray:
         return _held_out_log_densities(found, problem, columns, out) - _held_out_log_densities(
@@ -89,7 +95,7 @@ def improvement_and_correction(
         The improvement of `best` including the correction, and the correction of the usable readings, (n_usable,).
     """
     prepared, bases, problem = searched.prepared, searched.misfit_templates.unknown_bases, best.problem
-    found, gain = best.fit.found, best.improvement
+    found, gain = best.repaired, best.improvement
     parts, part_names = prepared.apparatus.held_out_parts(prepared.recording)
     fixed = correct_by_best_basis(found, problem, bases, parts)
     if fixed.gains_nothing:
@@ -124,7 +130,7 @@ def improvement_and_correction(
             heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
             heldout_sd=math.hypot(gain.heldout_sd, held.sd),
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
-            rms_after=float(np.sqrt(np.mean(found.residuals**2))),
+            rms_after=float(np.sqrt(np.mean(residuals_beside_walk(found.residuals, problem.law) ** 2))),
             p_value_after=bayes_factor_p_value(
                 problem,
                 searched.template_banks_for_global_test(best.fit.found),
@@ -136,31 +142,39 @@ def improvement_and_correction(
     return gain, change
 
 
-def _predictive_residuals_and_variances(
-    found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray, asked: BoolArray
+def _amounts_and_covariance(
+    found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit parameters and amplitudes to the `kept` rows; return residuals and variances of the mean, `asked` rows."""
-    sd, p = problem.sd, found.slopes.shape[1]
-    design = np.concatenate([found.slopes, columns], axis=1)
+    """Fit shifts of the parameters, and amplitudes, to the `kept` readings; return means and covariance of both.
+
+    Readings count by their own sd and by what they have in common with others; lost ones do not count.
+    """
+    sd, p, law = problem.sd, found.slopes.shape[1], problem.law.take_readings(kept)
+    design = law(np.concatenate([found.slopes, columns], axis=1)[kept])
+    left = law(found.residuals[kept])
     center = np.concatenate([-found.z, np.zeros(columns.shape[1])])
     # Amplitudes first have a wide prior, then one with their own common size as scale (empirical Bayes): the
     # uncertainty for a new scan equals the scatter of the known ones.
     size = sd * SCALES[5]
     for _ in range(3):
         precision = np.concatenate([np.ones(p), np.full(columns.shape[1], size**-2)])
-        covariance = np.linalg.inv(design[kept].T @ design[kept] / sd**2 + np.diag(precision))
-        amount = covariance @ (design[kept].T @ found.residuals[kept] / sd**2 + precision * center)
+        covariance = np.linalg.inv(design.T @ design / sd**2 + np.diag(precision))
+        amount = covariance @ (design.T @ left / sd**2 + precision * center)
         if columns.shape[1] > 1:
             size = max(float(np.sqrt(np.mean(amount[p:] ** 2))), 1e-3 * sd)
-    return (
-        found.residuals[asked] - design[asked] @ amount,
-        np.asarray(np.einsum("ij,jk,ik->i", design[asked], covariance, design[asked])),
-    )
+    return np.asarray(amount), np.asarray(covariance)
 
 
 def _held_out_log_densities(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
-    miss, spread = _predictive_residuals_and_variances(found, problem, columns, ~out, out)
-    kept_miss, _ = _predictive_residuals_and_variances(found, problem, columns, ~out, ~out)
-    n_free = max(len(kept_miss) - found.slopes.shape[1] - columns.shape[1], 1)
-    total = float(kept_miss @ kept_miss) / n_free + spread
-    return np.asarray(-0.5 * np.log(2 * math.pi * total) - 0.5 * miss**2 / total)
+    """Return the log density of each held-out reading from a correction fitted to the others, 0 for lost ones."""
+    law = problem.law.without_tail_or_rounding()
+    amount, covariance = _amounts_and_covariance(found, problem, columns, ~out)
+    design = np.concatenate([found.slopes, columns], axis=1)
+    rest, own = law.take_readings(~out), law.take_readings(out)
+    kept_miss = rest((found.residuals - design @ amount)[~out])
+    sigma_2 = float(kept_miss @ kept_miss) / max(rest.n_kept - design.shape[1], 1)
+    if law.has_memory:
+        return sequential_log_densities(law, out, found.residuals, design, amount, covariance, sigma_2)
+    miss = (found.residuals - design @ amount)[out]
+    total = sigma_2 * own.sd**2 + np.einsum("ij,jk,ik->i", design[out], covariance, design[out])
+    return np.asarray((-0.5 * np.log(2 * math.pi * total) - 0.5 * miss**2 / total) * own.kept)

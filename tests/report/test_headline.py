@@ -29,6 +29,9 @@ def found(
     few=False,
     beside=(),
     withdrawn=False,
+    shared=(),
+    leader=(),
+    open_beside=(),
 ):
     named = [EffectFound(name, 0.9, 20.0 - k, "", ()) for k, name in enumerate((*combination, *beside))]
     stated = [Hypothesis(tuple(names), 0.9 / max(len(rivals), 1)) for names in rivals]
@@ -41,7 +44,14 @@ def found(
         improvement=SimpleNamespace(p_value_after=after),
         effects=tuple(named) if combination != ("unknown",) else (),
         hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
-        judged=SimpleNamespace(unknown_shares=shares or {}, too_little=few, withdrawn=withdrawn),
+        judged=SimpleNamespace(
+            unknown_shares=shares or {},
+            too_little=few,
+            withdrawn=withdrawn,
+            shared=shared,
+            leader=leader,
+            beside_shared=tuple(Hypothesis(tuple(names), p) for names, p in open_beside),
+        ),
     )
 
 
@@ -97,6 +107,17 @@ def test_rivals_are_told_by_what_they_do_not_share():
     said = headline(found("cannot_tell", ("lag",), rivals=(("lag", "outliers"), ("backlash", "outliers"))))
     assert "outlying" not in said
     assert "a sensor that follows slowly or backlash" in said
+
+
+def test_what_all_rivals_share_is_named_and_what_is_open_beside_it_is_said():
+    open_beside = [(("outliers",), 0.5), (("glint",), 0.5)]
+    said = headline(found("named", ("lag",), shared=("lag",), leader=("lag", "outliers"), open_beside=open_beside))
+    assert (
+        said == "The model leaves out a sensor that follows slowly; besides, outlying readings or a glint at one place."
+    )
+    rivals = [("lag", "outliers"), ("backlash", "outliers")]
+    said = headline(found("cannot_tell", rivals[0], rivals=rivals, shared=("outliers",)))
+    assert said.startswith("Beside outlying readings, something is missing: a sensor that follows slowly or")
 
 
 def test_nothing_is_no_rival_of_something_missing():

@@ -25,6 +25,7 @@ class PriorOdds:
     physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is that of an unknown effect.
     `unknown_explains_most`: an unknown effect is the verdict only if it has more evidence than each named one alone.
     `named_needs_half`: effects on the mean are `named` only with half the probability, whatever noise is beside them.
+    `shared_is_named`: effects that nearly all hypotheses share are `named`, whatever is open beside them.
     `twofold` are the effects that may occur twice; `twice` is the probability that one does, given that it occurs;
     None: that of any second effect.
     """
@@ -44,6 +45,7 @@ class PriorOdds:
     unknown_complexity_penalty: float = 24.0
     unknown_explains_most: bool = False
     named_needs_half: bool = False
+    shared_is_named: bool = False
     twice: float | None = None
     twofold: frozenset[str] = frozenset()
 

@@ -237,7 +237,8 @@ def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
         often = f"with nothing missing, less than 1 recording in a million looks as odd as this ({p})"
     if diagnosis.verdict == "noise":
         gained = f"its log evidence over white noise is {diagnosis.improvement.log_evidence:.0f} nats"
-        said = f"For the noise model, hardly: {gained}. The mean shows nothing significant: {often}."
+        mean = "nothing significant" if p_value >= ALARM else "nothing that any effect explains better"
+        said = f"For the noise model, hardly: {gained}. The mean shows {mean}: {often}."
     elif diagnosis.verdict == "unknown" and p_value > _CHANCE:
         said = f"For the mean, yes: {often}. But chance would not put so many outlying readings together."
     else:

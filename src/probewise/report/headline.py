@@ -16,6 +16,7 @@ MOST_WORDS = 20
 _SURE = 0.5
 _RIVAL = 0.1  # probability from which a hypothesis is named as a rival
 _MOST_RIVALS = 3
+_CANNOT_TELL = "Something is missing, but these readings cannot tell what."
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -42,7 +43,8 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
         case "named":
             more = ["Something more is missing."] if diagnosis.improvement.p_value_after < ALARM else []
             said = _left_out_versions(diagnosis, "The model leaves out")
-            return [" ".join([one, *more]) for one in said] + said
+            beside = [f"{one[:-1]}; besides, {either}" for one in said[:1] for either in _open_beside_shared(diagnosis)]
+            return beside + [" ".join([one, *more]) for one in said] + said
 
 
 def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:
@@ -87,19 +89,37 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
         return [f"{plain}; if so, most likely {hypothesis_in_words(leading)}.", f"{plain}."]
     rivals = [h.effects for h in diagnosis.hypotheses[:_MOST_RIVALS] if h.probability > _RIVAL]
     said = []
+    something = "Something is missing"
+    if diagnosis.judged.shared:
+        something = f"Beside {join_names(map(effect_in_words, diagnosis.judged.shared))}, something is missing"
     if len(rivals) > 1:
-        said = [
-            f"Something is missing: {_join_rival_hypotheses(rivals[:n])}; these readings cannot tell which."
-            for n in (3, 2)
-        ]
+        joined = [_join_rival_hypotheses(rivals[:n]) for n in (3, 2)]
+        said = [f"{something}: {either}; these readings cannot tell which." for either in joined]
+        said += [f"{something}: {either}." for either in joined] if diagnosis.judged.shared else []
+        said.append(f"{something}, most likely {_without_shared(rivals)[0]}; these readings cannot tell.")
     elif diagnosis.judged.withdrawn:
         leader = hypothesis_in_words(diagnosis.hypotheses[0].effects)
         said = [f"Something is missing; {leader} fits best, but predicts new readings worse."]
-    return [*said, "Something is missing, but these readings cannot tell what."]
+    return [*said, f"{something}, but these readings cannot tell what.", _CANNOT_TELL]
+
+
+def _open_beside_shared(diagnosis: Diagnosis) -> list[str]:
+    """List wordings of what may act beside named effects that all rivals share, the most complete first."""
+    if not diagnosis.judged.leader:
+        return []
+    rivals = [h.effects for h in diagnosis.judged.beside_shared[:_MOST_RIVALS] if h.probability > _RIVAL]
+    if len(rivals) < 2 or () in rivals:
+        return []
+    return [f"{_join_rival_hypotheses(rivals[:n])}." for n in (3, 2)]
 
 
 def _join_rival_hypotheses(rivals: Sequence[tuple[str, ...]]) -> str:
     """Name hypotheses, given their effects, as in "A, B or C", without the effects that all share."""
-    shared = frozenset.intersection(*map(frozenset, rivals))
-    *others, last = (hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals)
+    *others, last = _without_shared(rivals)
     return f"{', '.join(others)} or {last}" if others else last
+
+
+def _without_shared(rivals: Sequence[tuple[str, ...]]) -> list[str]:
+    """List hypotheses in words, given their effects, without the effects that all share."""
+    shared = frozenset.intersection(*map(frozenset, rivals))
+    return [hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals]

@@ -3,7 +3,13 @@
 import pytest
 
 from probewise.diagnosis.advice.aliases import Alias
-from probewise.diagnosis.judgement.judged import Hypothesis, Judged, ranked_hypotheses, verdict_and_combination
+from probewise.diagnosis.judgement.judged import (
+    Hypothesis,
+    Judged,
+    ranked_hypotheses,
+    verdict_and_combination,
+    with_shared_effects,
+)
 
 NOISE = frozenset({"outliers"})
 
@@ -61,6 +67,44 @@ def test_of_a_simulator_nothing_is_named_below_one_half():
     assert verdict(three, named_needs_half=True) == ("cannot_tell", ("lag",))
     noisy = {(("lag",), ()): 0.4, (("lag",), ("outliers",)): 0.2, (("glint",), ()): 0.4}
     assert verdict(noisy, named_needs_half=True) == ("named", ("lag",))
+
+
+def by_what_is_shared(verdict, combination, probabilities, *, p_value=1e-6, aliases=()):
+    hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
+    judged = with_shared_effects(Judged(verdict, combination, p_value, hypotheses, aliases=aliases), NOISE)
+    return judged.verdict, judged.combination, judged.repaired_by
+
+
+def test_an_effect_that_nearly_all_hypotheses_share_is_named_whatever_is_open_beside_it():
+    """The model is repaired by the most probable set that holds it."""
+    probabilities = {("drift", "lag"): 0.25, ("lag", "outliers"): 0.2, ("glint", "lag"): 0.5, ("drift",): 0.05}
+    judged = by_what_is_shared("cannot_tell", ("glint", "lag"), probabilities)
+    assert judged == ("named", ("lag",), ("glint", "lag"))
+    doubtful = by_what_is_shared("cannot_tell", ("glint", "lag"), probabilities, p_value=0.2)
+    assert doubtful[0] == "cannot_tell"
+
+
+def test_an_effect_with_a_credible_alias_is_not_shared():
+    """Half of the probability is not enough: of 0.52 and 0.48, the prior alone decides."""
+    assert by_what_is_shared("cannot_tell", ("lag",), {("lag",): 0.52, ("drift",): 0.48})[0] == "cannot_tell"
+    joint = {("drift", "lag"): 0.8, ("lag",): 0.1, ("drift",): 0.1}  # each is in nine tenths, both in eight
+    assert by_what_is_shared("cannot_tell", ("drift", "lag"), joint)[1] in (("drift",), ("lag",))
+
+
+def test_a_shared_fault_of_the_noise_names_no_physics():
+    probabilities = {("lag", "outliers"): 0.4, ("drift", "outliers"): 0.4, ("outliers",): 0.2}
+    judged = by_what_is_shared("cannot_tell", ("lag", "outliers"), probabilities)
+    assert judged[:2] == ("cannot_tell", ("lag", "outliers"))
+
+
+def test_noise_is_no_verdict_if_most_of_the_probability_is_on_the_mean():
+    """The leader is sought among classes of aliases: a jump and its twin, not a lone drift that is more probable."""
+    probabilities = {("outliers",): 0.3, ("drift",): 0.26, ("step",): 0.24, ("jump",): 0.2}
+    pair = Alias(("jump", "step"), 1.0, "repeat", 26)
+    judged = by_what_is_shared("noise", ("outliers",), probabilities, aliases=(pair,))
+    assert judged[:2] == ("cannot_tell", ("step",))
+    assert by_what_is_shared("noise", ("outliers",), probabilities, aliases=(pair,), p_value=0.3)[1] == ()
+    assert by_what_is_shared("noise", ("outliers",), {("outliers",): 0.5, ("drift",): 0.5})[0] == "noise"
 
 
 def test_what_fails_on_held_out_readings_is_withdrawn():

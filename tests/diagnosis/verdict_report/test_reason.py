@@ -12,6 +12,8 @@ OVEN = Words(null="the oven's law", find_signal="switch the heater on", settles_
 GROUNDS = Grounds(OVEN, 100, 24, sentences={"lag": "the probe follows with 8 s", "step": "it jumps by 2 at 40 s"})
 LAG, CLEAN, UNKNOWN = Hypothesis(("lag",), 0.7), Hypothesis((), 0.2), Hypothesis(("unknown",), 0.1)
 
+OPEN = (Hypothesis(("lag", "step"), 0.5), Hypothesis(("lag",), 0.3), Hypothesis(("drift", "lag"), 0.2))
+
 
 def judged(verdict, combination=(), **more):
     return Judged(verdict, combination, 1e-4, (LAG, CLEAN, UNKNOWN), **more)
@@ -25,7 +27,29 @@ SAID = [
         "The probe follows with 8 s; it jumps by 2 at 40 s (p = 0.0001). "
         "Something more is missing: the repaired model has p = 0.002.",
     ),
-    (judged("noise", ("lag",)), {}, "The probe follows with 8 s; nothing is missing from the mean (p = 0.0001)."),
+    (
+        replace(judged("noise", ("lag",)), p_value=0.3),
+        {},
+        "The probe follows with 8 s; nothing is missing from the mean (p = 0.3).",
+    ),
+    (
+        judged("noise", ("lag",)),
+        {},
+        "The probe follows with 8 s; a test of the mean alone gives p = 0.0001, which no effect explains better than "
+        "this noise.",
+    ),
+    (
+        replace(judged("named", ("lag",)), hypotheses=OPEN, shared=("lag",), leader=("lag", "step")),
+        {},
+        "The probe follows with 8 s (p = 0.0001). Beside that, these 100 readings cannot tell apart step (0.50), "
+        "nothing more (0.30) and drift (0.20).",
+    ),
+    (
+        replace(judged("cannot_tell", ("lag",)), hypotheses=OPEN, shared=("lag",)),
+        {"settles": "repeat run 2"},
+        "The probe follows with 8 s. Beside that, these 100 readings cannot tell apart step (0.50), nothing more "
+        "(0.30) and drift (0.20); to tell them apart: repeat run 2.",
+    ),
     (
         judged("clean"),
         {},

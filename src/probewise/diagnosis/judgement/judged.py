@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 
 from probewise.diagnosis.advice.aliases import Alias, aliases_with_separating_plans
 from probewise.diagnosis.judgement.global_test import GlobalTest
+from probewise.diagnosis.judgement.shared_effects import OUT_OF_THE_QUESTION, probabilities_beside, shared_effects
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.search.searched import Searched
@@ -17,7 +18,6 @@ from probewise.effects import name_without_copy_suffix
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
 _CREDIBLE = 0.95
-_OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: rivals below it are not credible; priors differ by less
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class Judged:
     verdict
         "clean", "named", "noise" (named, but all effects are on the noise), "unknown" or "cannot_tell".
     combination
-        Most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown.
+        Most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown. Of a simulator,
+        the `shared` effects if only these can be named.
     p_value
         p-value of the global test of the mean, under the noise model found.
     hypotheses
@@ -57,6 +58,10 @@ class Judged:
         Whether there are too few readings for a verdict, or all are equal.
     withdrawn
         Whether the leading hypothesis is not stated because it predicts held-out readings far worse than the null.
+    shared
+        Effects that nearly all hypotheses have, whatever else acts; always () for a light sensor.
+    leader
+        Most probable set of effects that holds the `combination`, by which the model is repaired, if that is another.
     """
 
     verdict: Verdict
@@ -68,12 +73,25 @@ class Judged:
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
     too_little: bool = False
     withdrawn: bool = False
+    shared: Names = ()
+    leader: Names = ()
 
     def with_verdict_withdrawn(self) -> Judged:
         """Return a copy whose verdict is `cannot_tell`, names no effect and is marked as `withdrawn`."""
-        return replace(self, verdict="cannot_tell", combination=(), withdrawn=True)
+        return replace(self, verdict="cannot_tell", combination=(), withdrawn=True, shared=(), leader=())
 
     withdraw = with_verdict_withdrawn  # its old name
+
+    @property
+    def repaired_by(self) -> Names:
+        """The set of effects by which the model is repaired: the `combination`, or the larger set that leads."""
+        return self.leader or self.combination
+
+    @property
+    def beside_shared(self) -> tuple[Hypothesis, ...]:
+        """What may act beside the `shared` effects, most probable first; () is nothing more."""
+        found = probabilities_beside(self.shared, {h.effects: h.probability for h in self.hypotheses})
+        return tuple(Hypothesis(names, p) for names, p in found.items())
 
     @property
     def unknown_probability(self) -> float:
@@ -133,7 +151,7 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         # recordings at most seven would be withdrawn, all of them right.
         named = [h.effects for h in hypotheses if h.effects not in ((), ("unknown",))]
         verdict, combination = "cannot_tell", named[0] if named else ()
-    return Judged(
+    judged = Judged(
         verdict,
         combination,
         test.p_value,
@@ -143,6 +161,49 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         unknown_shares=searched.probabilities_of_unknown_forms(),
         too_little=prepared.has_too_little_data,
     )
+    if searched.prior.shared_is_named and not judged.too_little:
+        judged = with_shared_effects(judged, prepared.pure_noise_effect_names, certain=frozenset(searched.certain))
+    return judged
+
+
+def with_shared_effects(
+    judged: Judged, noise_names: frozenset[str], *, certain: frozenset[str] = frozenset()
+) -> Judged:
+    """Return the judgement by what hypotheses have in common, where none of them alone decides.
+
+    - `noise` needs half of the probability for nothing on the mean. With less the verdict is `cannot_tell`, with the
+      most probable combination that has an effect on the mean, by classes of aliases.
+    - Instead of `cannot_tell` the shared effects are `named` if one of them is on the mean: they act whatever is left
+      open beside them. As for any other name, the p-value must be .01 or less.
+
+    Parameters
+    ----------
+    judged
+        The judgement by single combinations.
+    noise_names, certain
+        Effects on the noise; effects that the readings show beyond doubt, which need no significant test.
+    """
+    probability = {h.effects: h.probability for h in judged.hypotheses}
+    shared = shared_effects(probability)
+    judged = replace(judged, shared=shared)
+    if judged.verdict == "noise" and sum(p for names, p in probability.items() if {*names} <= noise_names) < 0.5:
+        leader = _leader_on_mean(probability, noise_names, judged.aliases) if judged.p_value <= ALARM else ()
+        judged = replace(judged, verdict="cannot_tell", combination=leader)
+    physics = {*shared} - noise_names
+    if judged.verdict != "cannot_tell" or not physics or (judged.p_value > ALARM and not physics <= certain):
+        return judged
+    leader = max((names for names in probability if {*shared} <= {*names}), key=lambda names: probability[names])
+    return replace(judged, verdict="named", combination=shared, leader=leader)
+
+
+def _leader_on_mean(
+    probability: Mapping[Names, float], noise_names: frozenset[str], aliases: tuple[Alias, ...]
+) -> Names:
+    """Return the most probable combination with an effect on the mean, of the most probable class of aliases."""
+    physics = {k: p for k, p in probability.items() if k != ("unknown",) and not {*k} <= noise_names}
+    classes = [_combination_and_alias_swaps(names, aliases) & physics.keys() for names in physics]
+    likeliest = max(classes, key=lambda members: sum(physics[names] for names in members), default=set())
+    return max(likeliest, key=lambda names: physics[names], default=())
 
 
 def _unknown_if_out_of_vocabulary(mean: Names) -> Names:
@@ -229,7 +290,7 @@ def verdict_from_probabilities(
         return "cannot_tell", ()
     top = max(named, key=lambda effects: named[effects])
     if named[top] >= 0.5:
-        if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
+        if any(named.get(other, 0.0) > OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
             return "cannot_tell", top
         return ("noise" if set(top) <= noise_names else "named"), top
     of_class = _combination_and_alias_swaps(top, aliases)

@@ -79,9 +79,9 @@ def judged_and_best_repair(
         return judged, BestRepair.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
     on_noise = searched.prepared.noise_effect_names
     if judged.verdict in ("named", "noise", "clean"):
-        stated = tuple(name for name in judged.combination if name in on_noise)
+        stated = tuple(name for name in judged.repaired_by if name in on_noise)
         noise = searched.posterior.likeliest_noise(stated)
-    on_mean = tuple(name for name in judged.combination if name not in on_noise)
+    on_mean = tuple(name for name in judged.repaired_by if name not in on_noise)
     best = BestRepair.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
     if judged.verdict == "named" and predicts_far_worse(
         best.improvement

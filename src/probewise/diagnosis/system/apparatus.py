@@ -143,6 +143,7 @@ class SimulatorApparatus:
             twice=_TWICE,
             unknown_explains_most=True,
             named_needs_half=True,
+            shared_is_named=True,
         )
 
     def null_forms(self, recording: Recording) -> Any:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from probewise.diagnosis.apparatus import Words
-from probewise.diagnosis.judgement.judged import Judged
+from probewise.diagnosis.judgement.judged import Hypothesis, Judged
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.verdict_report.words import p_in_words
@@ -114,28 +114,45 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
 
 
 def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
-    rivals = [h for k, h in enumerate(judged.hypotheses[:3]) if k < 2 or h.probability >= _WORTH_NAMING]
-    *others, last = (f"{h.label} ({h.probability:.2f})" for h in rivals)
-    rivals_said = f"{', '.join(others)} and {last}" if others else last
     cure = "" if grounds.settles is None else f"{TO_SEPARATE}{grounds.settles}"
-    return f"These {grounds.n_readings} readings cannot tell apart {rivals_said}{cure}."
+    said = _joined_effect_sentences(judged.shared, grounds)
+    if said:
+        return f"{said}. {_open_beside_shared(judged, grounds)}{cure}."
+    return f"These {grounds.n_readings} readings cannot tell apart {_rivals_in_words(judged.hypotheses)}{cure}."
+
+
+def _open_beside_shared(judged: Judged, grounds: Grounds) -> str:
+    """Say what these readings cannot tell beside the effects that nearly all hypotheses share, without a full stop."""
+    beside = _rivals_in_words(judged.beside_shared, nothing="nothing more")
+    return f"Beside that, these {grounds.n_readings} readings cannot tell apart {beside}"
+
+
+def _rivals_in_words(hypotheses: Sequence[Hypothesis], *, nothing: str = "clean") -> str:
+    rivals = [h for k, h in enumerate(hypotheses[:3]) if k < 2 or h.probability >= _WORTH_NAMING]
+    *others, last = (f"{h.label if h.effects else nothing} ({h.probability:.2f})" for h in rivals)
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def _noise_sentence(judged: Judged, grounds: Grounds) -> str:
-    return (
-        f"{_joined_effect_sentences(judged, grounds)}; nothing is missing from the mean ({p_in_words(judged.p_value)})."
-    )
+    p = p_in_words(judged.p_value)
+    mean = f"nothing is missing from the mean ({p})"
+    if judged.p_value < ALARM:
+        mean = f"a test of the mean alone gives {p}, which no effect explains better than this noise"
+    return f"{_joined_effect_sentences(judged.combination, grounds)}; {mean}."
 
 
 def _named_sentence(judged: Judged, grounds: Grounds) -> str:
     after = grounds.p_value_after
+    named = f"{_joined_effect_sentences(judged.combination, grounds)} ({p_in_words(judged.p_value)})."
+    beside = f" {_open_beside_shared(judged, grounds)}." if len(judged.beside_shared) > 1 and judged.leader else ""
     more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
-    return f"{_joined_effect_sentences(judged, grounds)} ({p_in_words(judged.p_value)}).{more}"
+    return f"{named}{beside}{more}"
 
 
-def _joined_effect_sentences(judged: Judged, grounds: Grounds) -> str:
-    said = "; ".join(grounds.sentences[name] for name in judged.combination if name in grounds.sentences)
-    return said if _is_users_own_name(said.split()[0], judged.combination) else f"{said[0].upper()}{said[1:]}"
+def _joined_effect_sentences(names: Sequence[str], grounds: Grounds) -> str:
+    """Join the sentences of effects, without a full stop; "" if there are none."""
+    said = "; ".join(grounds.sentences[name] for name in names if name in grounds.sentences)
+    return said if not said or _is_users_own_name(said.split()[0], names) else f"{said[0].upper()}{said[1:]}"
 
 
 def _is_users_own_name(word: str, names: Iterable[str]) -> bool:

@@ -21,17 +21,28 @@ def of(log_z):
 )
 def test_a_formula_counts_as_the_one_effect_that_explains_nearly_as_much(wave, known):
     evidences = of({("interference",): wave, ("offset_drift",): 3.0, (FORMULA,): 100.0})
-    assert evidences.reported_names((FORMULA,)) == known
+    shares = evidences.reported_shares((FORMULA,))
+    assert max(shares, key=shares.get) == known
+    assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_two_names_together_stand_in_for_a_formula_that_the_readings_cannot_tell_from_them():
+    """Exact twins, drag and a square law of a state that keeps its sign, share its probability: neither leads."""
+    drag, square, third = (tuple(sorted(("depends", name))) for name in ("drag", "quadratic", "settling"))
+    evidences = of({("depends",): 55.0, drag: 98.0, square: 98.0, third: 96.0, (FORMULA,): 100.0})
+    shares = evidences.reported_shares((FORMULA,))
+    assert shares == {drag: pytest.approx(0.5), square: pytest.approx(0.5)}
+    assert of({drag: 96.0, (FORMULA,): 100.0}).reported_shares((FORMULA,)) == {("unknown",): 1.0}
 
 
 @pytest.mark.parametrize(("named", "known"), [(51.0, ("offset_drift",)), (49.0, ("unknown",))])
 def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named, known):
     evidences = of({("offset_drift",): named, (FORMULA, "offset_drift"): 100.0})
-    assert evidences.reported_names((FORMULA, "offset_drift")) == known
+    assert evidences.reported_shares((FORMULA, "offset_drift")) == {known: 1.0}
 
 
 def test_names_stay_and_the_unknown_stays():
     evidences = of({("interference",): 5.0})
-    assert evidences.reported_names(("interference",)) == ("interference",)
-    assert evidences.reported_names(("unknown",)) == ("unknown",)
-    assert evidences.reported_names(()) == ()
+    assert evidences.reported_shares(("interference",)) == {("interference",): 1.0}
+    assert evidences.reported_shares(("unknown",)) == {("unknown",): 1.0}
+    assert evidences.reported_shares(()) == {(): 1.0}

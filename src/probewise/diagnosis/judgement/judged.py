@@ -120,7 +120,7 @@ class Judged:
 def judge(searched: Searched, test: GlobalTest) -> Judged:
     """Return the verdict, with probabilities and aliases, from a search and the global test."""
     prepared, posterior = searched.prepared, searched.posterior
-    hypotheses = ranked_hypotheses(posterior.probabilities, searched.evidences.reported_names)
+    hypotheses = ranked_hypotheses(posterior.probabilities, searched.evidences.reported_shares)
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
@@ -206,24 +206,24 @@ def _leader_on_mean(
     return max(likeliest, key=lambda names: physics[names], default=())
 
 
-def _unknown_if_out_of_vocabulary(mean: Names) -> Names:
-    return ("unknown",) if effects_out_of_vocabulary(mean) else mean
+def _unknown_if_out_of_vocabulary(mean: Names) -> Mapping[Names, float]:
+    return {("unknown",) if effects_out_of_vocabulary(mean) else mean: 1.0}
 
 
 def ranked_hypotheses(
     probabilities: Mapping[tuple[Names, Names], float],
-    reported_as: Callable[[Names], Names] = _unknown_if_out_of_vocabulary,
+    reported_as: Callable[[Names], Mapping[Names, float]] = _unknown_if_out_of_vocabulary,
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 
     `probabilities` are by the effects on the mean and those on the noise; `reported_as` maps the former to the
-    combination under which they count.
+    combinations under which they count, with the share of their probability that each gets.
     """
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
-        known = reported_as(mean)
-        key = known if known == ("unknown",) else tuple(sorted((*known, *noise_effects_in_vocabulary(noise))))
-        joined[key] = joined.get(key, 0.0) + p
+        for known, share in reported_as(mean).items():
+            key = known if known == ("unknown",) else tuple(sorted((*known, *noise_effects_in_vocabulary(noise))))
+            joined[key] = joined.get(key, 0.0) + p * share
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)

@@ -66,22 +66,35 @@ class Evidences:
         named = self.fits[order, names].evidence[noise].log_z
         return named - self.fits[order, ()].evidence[noise].log_z > self.unknown[order, names, noise] - named
 
-    def reported_names(self, mean: Names) -> Names:
-        """Return the names by which a combination is reported: its own, or ("unknown",) if any is out of vocabulary.
+    def reported_shares(self, mean: Names) -> dict[Names, float]:
+        """Return by which names a combination is reported, with shares of its probability that sum to one.
 
-        There are two exceptions: the combination's named part is reported if it alone has over half of the gain over
-        the null; instead of a formula alone, the best single named effect if it has nine tenths of the formula's gain.
+        Those are its own names, or ("unknown",) if any is out of vocabulary, with two exceptions. The combination's
+        named part is reported if it alone has over half of the gain over the null. A formula alone is shared out among
+        the named effects that explain as much, by their evidence (`_stand_ins_for_formula`).
         """
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
-            return mean
-        share = 0.5
+            return {mean: 1.0}
         if not named and mean[0].startswith(PROPOSAL):
-            single = (names for _, names in self.fits if len(names) == 1 and not effects_out_of_vocabulary(names))
-            named, share = max(single, key=self._largest_log_z, default=()), _NEARLY_ALL
+            log_z = {names: self._largest_log_z(names) for names in self._stand_ins_for_formula(mean)}
+            total = logsumexp(list(log_z.values())) if log_z else 0.0
+            return {names: math.exp(value - total) for names, value in log_z.items()} or {("unknown",): 1.0}
         nothing = self._largest_log_z(())
-        gain = self._largest_log_z(named) - nothing
-        return named if named and gain > share * (self._largest_log_z(mean) - nothing) else ("unknown",)
+        explains_more = self._largest_log_z(named) - nothing > 0.5 * (self._largest_log_z(mean) - nothing)
+        return {named if named and explains_more else ("unknown",): 1.0}
+
+    def _stand_ins_for_formula(self, formula: Names) -> list[Names]:
+        """List the named effects that a formula counts as, since they explain as much; [] if there are none.
+
+        Single effects explain as much with nine tenths of its gain over the null. Without any, combinations do, which
+        were chosen from many more, if their evidence is at most three nats below: the readings cannot tell which.
+        """
+        nothing, its_own = self._largest_log_z(()), self._largest_log_z(formula)
+        named = {names for _, names in self.fits if names and not effects_out_of_vocabulary(names)}
+        gains = {names: self._largest_log_z(names) - nothing for names in named}
+        singles = [names for names in gains if len(names) == 1 and gains[names] > _NEARLY_ALL * (its_own - nothing)]
+        return singles or [names for names in gains if gains[names] > its_own - nothing - ALIASED_NATS]
 
     def one_name_outweighs_unnamed(self) -> bool:
         """Return whether some named effect, on mean or noise, has more evidence alone than any unnamed effect alone.

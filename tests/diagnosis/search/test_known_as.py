@@ -46,3 +46,16 @@ def test_names_stay_and_the_unknown_stays():
     assert evidences.reported_shares(("interference",)) == {("interference",): 1.0}
     assert evidences.reported_shares(("unknown",)) == {("unknown",): 1.0}
     assert evidences.reported_shares(()) == {(): 1.0}
+
+
+def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formulas_alone():
+    def fit(log_z, *names):
+        evidence = {("outliers",): SimpleNamespace(log_z=log_z)}
+        return SimpleNamespace(names=names, n_gaussians=0, evidence=evidence)
+
+    square = "formula:reading:temp_c:t^2"
+    alone, more, best = fit(5.0, "lag"), fit(7.0, square, "lag"), fit(8.0, FORMULA, "lag")
+    others = fit(20.0, "lag", "settling"), fit(30.0, FORMULA), fit(40.0, FORMULA, "lag", "settling")
+    evidences = Evidences({(0, tuple(sorted(each.names))): each for each in (alone, more, best, *others)})
+    assert evidences.best_formula_beside(alone, ("outliers",)) is best
+    assert evidences.best_formula_beside(others[2], ("outliers",)) is None

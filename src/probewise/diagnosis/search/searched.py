@@ -93,8 +93,19 @@ class Evidences:
         nothing, its_own = self._largest_log_z(()), self._largest_log_z(formula)
         named = {names for _, names in self.fits if names and not effects_out_of_vocabulary(names)}
         gains = {names: self._largest_log_z(names) - nothing for names in named}
-        singles = [names for names in gains if len(names) == 1 and gains[names] > _NEARLY_ALL * (its_own - nothing)]
-        return singles or [names for names in gains if gains[names] > its_own - nothing - ALIASED_NATS]
+        alike = [names for names in gains if gains[names] > its_own - nothing - ALIASED_NATS]
+        return [k for k in gains if len(k) == 1 and gains[k] > _NEARLY_ALL * (its_own - nothing)] or alike
+
+    def best_formula_beside(self, fit: WeighedFit, noise: Names) -> WeighedFit | None:
+        """Return the refit of largest evidence that adds formulas alone to the effects of another fit, if any."""
+        options = [
+            (more.evidence[noise].log_z, more)
+            for (n, names), more in self.fits.items()
+            if n == fit.n_gaussians
+            and {*fit.names} < {*names}
+            and all(name.startswith(PROPOSAL) for name in {*names} - {*fit.names})
+        ]
+        return max(options, key=lambda option: option[0], default=(0.0, None))[1]
 
     def one_name_outweighs_unnamed(self) -> bool:
         """Return whether some named effect, on mean or noise, has more evidence alone than any unnamed effect alone.

@@ -9,6 +9,7 @@ from importlib.resources import files
 from typing import Any
 
 from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.diagnosis.verdict_report.beyond import Formula
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, require_diagnosis
 from probewise.diagnosis.verdict_report.findings import ParameterFound
 from probewise.effects import name_without_copy_suffix
@@ -94,9 +95,11 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     }
     remainder, formula = diagnosis.report.remainder, diagnosis.report.formula
     if remainder is not None:
-        document["remainder"] = asdict(remainder)
+        document["remainder"] = {key: value for key, value in asdict(remainder).items() if key != "formula"}
+        if remainder.formula is not None:
+            document["remainder"]["formula"] = _formula_json(remainder.formula)
     if formula is not None:
-        document["formula"] = asdict(formula) | {"parameters": [_parameter_json(p) for p in formula.parameters]}
+        document["formula"] = _formula_json(formula)
     return document | (
         {"thorough": [_weighing_json(w) for w in diagnosis.report.weighings]} if diagnosis.report.weighings else {}
     )
@@ -117,6 +120,10 @@ def _weighing_json(twice: Weighing) -> dict[str, Any]:
         "agree": twice.agree,
         "doubts": list(twice.doubts),
     }
+
+
+def _formula_json(formula: Formula) -> dict[str, Any]:
+    return asdict(formula) | {"parameters": [_parameter_json(p) for p in formula.parameters]}
 
 
 def _parameter_json(found: ParameterFound) -> dict[str, Any]:

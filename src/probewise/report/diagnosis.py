@@ -20,6 +20,7 @@ from probewise.diagnosis import (
     notes_on_calls,
     p_in_words,
 )
+from probewise.diagnosis.repair.repair import Repair
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import name_without_copy_suffix
@@ -173,7 +174,7 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         facts.append(
             (
                 "In the repaired model",
-                _combination_shares_in_words(diagnosis.repair.combination_shares, diagnosis.apparatus.words.model),
+                _combination_shares_in_words(diagnosis.repair, diagnosis.apparatus.words.model),
             )
         )
     return facts
@@ -219,12 +220,16 @@ def _signed_nats(nats: float, sd: float) -> str:
     return f"{typeset_numbers(written if written.startswith('-') else f'+{written}')} nats"
 
 
-def _combination_shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str:
+def _combination_shares_in_words(repair: Repair, model: str) -> str:
+    """Say which effects all samples of the repaired model contain, and which only a share of them."""
+    everywhere, opening, nothing = repair.effects_in_all_samples, f"Posterior samples in {model} contain", "no effect"
+    if everywhere:
+        opening, nothing = f"{opening} {join_names(map(effect_in_words, everywhere))}; beside that", "nothing more"
     held = (
-        f"{join_names(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
-        for names, share in shares.items()
+        f"{join_names(map(effect_in_words, names)) if names else nothing} ({100 * share:.0f} %)"
+        for names, share in repair.combination_shares.items()
     )
-    return f"Posterior samples in {model} contain: {', '.join(held)}."
+    return f"{opening}: {', '.join(held)}."
 
 
 def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:

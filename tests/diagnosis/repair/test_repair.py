@@ -17,6 +17,7 @@ LAG = SimpleNamespace(name="lag", counted_from="", sentence=lambda mean, sd: f"i
 def repair(absent=None, residuals=(1.0, np.nan)):
     model = SimpleNamespace(
         absent=absent or {},
+        effects=("lag", "step", "outliers"),
         chain=SimpleNamespace(effects=(LAG,)),
         effect_samples=lambda name: np.array([[2.0], [2.0], [0.0], [0.0]]),
     )
@@ -32,6 +33,7 @@ def test_a_repair_that_predicts_the_same_changes_nothing():
 def test_what_samples_lack_is_left_open_in_its_share():
     marks = {"lag": np.array([False, False, True, False]), "step": np.array([True, True, True, False])}
     assert repair(marks).combination_shares == {("lag",): 0.5, (): 0.25, ("lag", "step"): 0.25}
+    assert repair(marks).effects_in_all_samples == ("outliers",)
 
 
 def test_what_is_carried_and_not_stated_is_said_of_the_samples_that_hold_it():

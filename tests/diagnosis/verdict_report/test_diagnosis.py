@@ -40,6 +40,7 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
         by_rows=False,
         improvement=None,
         combination_shares={twice: 1.0},
+        effects_in_all_samples=("lag",),
         unstated_effects=lambda stated: (),
     )
     found = replace(
@@ -49,3 +50,6 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
         repair=repair,
     )
     assert "again" not in found.summary()
+    assert "samples of the repaired model: lag in all, beside that interference with interference in 100%" in (
+        found.summary()
+    )

@@ -92,6 +92,11 @@ class Repair:
     left_open = combination_shares
     """The old name of `combination_shares`."""
 
+    @property
+    def effects_in_all_samples(self) -> tuple[str, ...]:
+        """Effects that all samples of the repaired model contain."""
+        return tuple(name for name in self.model.effects if name not in self.model.absent)
+
     def unstated_effects(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
         """List the repaired model's effects that are not `stated`: name, share of the samples with it, sentence."""
         out = []

@@ -182,10 +182,13 @@ class Diagnosis(ShowsItself):
             for _, share, sentence in self.unstated_effects
         ]
         if self.repair.combination_shares:
+            everywhere = " with ".join(map(name_without_copy_suffix, self.repair.effects_in_all_samples))
+            nothing = "nothing more" if everywhere else "no effect"
             shares = ", ".join(
-                f"{' with '.join(map(name_without_copy_suffix, n)) or 'no effect'} in {p:.0%}"
+                f"{' with '.join(map(name_without_copy_suffix, n)) or nothing} in {p:.0%}"
                 for n, p in self.repair.combination_shares.items()
             )
+            shares = f"{everywhere} in all, beside that {shares}" if everywhere else shares
             lines.append(f"samples of the repaired model: {shares}")
         return "\n".join(lines)
 

@@ -30,3 +30,17 @@ def test_each_order_of_the_ssf_counts_with_its_own_evidence():
 def test_nothing_stands_beside_what_was_not_weighed():
     searched = SimpleNamespace(evidences=Evidences({}), prior=PriorOdds(), certain=())
     assert Searched.effect_probabilities_given_unknown(searched) == {}
+
+
+def test_what_is_unknown_has_a_noise_too():
+    """Of the unknown half, four parts in five have outliers; those of the named half do not count."""
+    probabilities = {
+        (("unknown",), ("outliers",)): 0.3,
+        (("unknown",), ()): 0.1,
+        (("arm_knock",), ("correlated_noise", "outliers")): 0.1,
+        (("lag",), ("correlated_noise",)): 0.5,
+    }
+    fits = {(0, ()): SimpleNamespace(log_z=0.0), (0, ("arm_knock",)): SimpleNamespace(log_z=9.0)}
+    searched = SimpleNamespace(evidences=Evidences(fits), posterior=SimpleNamespace(probabilities=probabilities))
+    beside = Searched.noise_probabilities_given_unknown(searched)
+    assert beside == pytest.approx({"outliers": 0.8, "correlated_noise": 0.2})

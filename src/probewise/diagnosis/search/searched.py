@@ -319,6 +319,18 @@ class Searched:
                 out[name] = out.get(name, 0.0) + weight / sum(weights.values())
         return out
 
+    def noise_probabilities_given_unknown(self) -> dict[str, float]:
+        """Return, by effect on the noise, the probability that it acts, given that what acts on the mean is unknown."""
+        unknown: dict[Names, float] = {}
+        for (mean, noise), p in self.posterior.probabilities.items():
+            share = self.evidences.reported_shares(mean).get(("unknown",), 0.0)
+            unknown[noise] = unknown.get(noise, 0.0) + p * share
+        total, out = sum(unknown.values()) or 1.0, dict[str, float]()
+        for noise, p in unknown.items():
+            for name in noise:
+                out[name] = out.get(name, 0.0) + p / total
+        return out
+
     def template_banks_for_global_test(self, found: Fit) -> list[TemplateBank]:
         """Return the two banks by which a fit is tested: of the effects that it lacks, and of unknown effects."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]

@@ -90,7 +90,9 @@ def effects_found(
     prepared = searched.prepared
     out, plan = [], prepared.everything.plan
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
-    beside = searched.effect_probabilities_given_unknown() if unknown >= _IS_UNKNOWN else {}
+    beside = {}
+    if unknown >= _IS_UNKNOWN:
+        beside = searched.effect_probabilities_given_unknown() | searched.noise_probabilities_given_unknown()
     unit = plan.instrumentation.unit
     drawn: dict[tuple[WeighedFit, Names], ModelSamples] = {}
     for name, effect in prepared.effects.items():

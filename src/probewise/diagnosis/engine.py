@@ -135,7 +135,10 @@ def diagnose_prepared(
     noise = noise_found(searched, best, drawn.best, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)
-    grounds = _facts_for_reason(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
+    grounds = replace(
+        _facts_for_reason(searched, test, best, drawn=drawn, found=found, where=where, asked=asked),
+        nuisances=noise.nuisances,
+    )
     reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
     if prepared.is_thinned:
         n_usable = int(prepared.everything.usable.sum())

@@ -39,6 +39,11 @@ SAID = [
         "this noise.",
     ),
     (
+        replace(judged("noise", ("lag",)), p_value=0.3),
+        {"nuisances": ("the sd falls to an eighth",)},
+        "The probe follows with 8 s; the sd falls to an eighth; nothing is missing from the mean (p = 0.3).",
+    ),
+    (
         replace(judged("named", ("lag",)), hypotheses=OPEN, shared=("lag",), leader=("lag", "step")),
         {},
         "The probe follows with 8 s (p = 0.0001). Beside that, these 100 readings cannot tell apart step (0.50), "

@@ -262,6 +262,12 @@ def _sd_without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> Flo
     return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
 
 
+def noise_effect_samples(effect: NoiseEffect, noise: NoiseEvidence, *, rng: np.random.Generator) -> FloatArray:
+    """Draw the parameters of an effect in a noise model from its posterior, (N_SAMPLES, n_params)."""
+    nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
+    return _uniform_draws_about_nodes(effect, noise, nodes, rng=rng)
+
+
 def _uniform_draws_about_nodes(
     effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator
 ) -> FloatArray:

@@ -16,7 +16,7 @@ from probewise.diagnosis.judgement.judged import Hypothesis
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import n_rows_since_previous_usable, noise_statistics, previous_usable
 from probewise.diagnosis.repair.best_repair import BestRepair
-from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
+from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
 from probewise.diagnosis.verdict_report.words import substitute_reading_unit
@@ -58,11 +58,15 @@ class EffectFound:
 
 @dataclass(frozen=True)
 class NoiseFound:
-    """The noise `model` ("white", or effects joined by "+"), the p-value of deviations from it, and its parameters."""
+    """The noise `model` ("white", or effects joined by "+"), the p-value of deviations from it, and its parameters.
+
+    `nuisances` are sentences on effects of the model that no combination and no repaired model holds.
+    """
 
     model: str
     p_value: float
     parameters: tuple[ParameterFound, ...]
+    nuisances: tuple[str, ...] = ()
 
 
 def effects_found(
@@ -222,9 +226,16 @@ def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, 
     p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + _N_DRAWS)
     unit = prepared.recording.plan.instrumentation.unit
     parameters = [_parameter_found("sd", unit, samples.noise_sd)]
-    for name in noise_effects_in_vocabulary(best.noise):
-        parameters += parameters_found(prepared.effects[name], samples.effect_samples(name), unit)
-    return NoiseFound("+".join(best.noise) or "white", p_value, tuple(parameters))
+    nuisances = []
+    for name in best.noise:
+        effect = cast(NoiseEffect, prepared.effects[name])
+        if name in samples.effects:
+            values = samples.effect_samples(name)
+        else:
+            values = noise_effect_samples(effect, best.fit.evidence[best.noise], rng=rng)
+            nuisances.append(sentence_from_samples(effect, values))
+        parameters += parameters_found(effect, values, unit)
+    return NoiseFound("+".join(best.noise) or "white", p_value, tuple(parameters), tuple(nuisances))
 
 
 def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:

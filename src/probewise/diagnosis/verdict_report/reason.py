@@ -44,6 +44,8 @@ class Grounds:
         p-value of the global test of the repaired model.
     settles
         The readings that would separate the hypotheses, in words; None if there are none.
+    nuisances
+        Sentences on the noise that was found beside what has a name in the vocabulary.
     """
 
     words: Words
@@ -57,6 +59,7 @@ class Grounds:
     shows_in: tuple[str, ...] = ()
     p_value_after: float = 1.0
     settles: str | None = None
+    nuisances: tuple[str, ...] = ()
 
 
 def reason_of(judged: Judged, grounds: Grounds) -> str:
@@ -138,20 +141,22 @@ def _noise_sentence(judged: Judged, grounds: Grounds) -> str:
     mean = f"nothing is missing from the mean ({p})"
     if judged.p_value < ALARM:
         mean = f"a test of the mean alone gives {p}, which no effect explains better than this noise"
-    return f"{_joined_effect_sentences(judged.combination, grounds)}; {mean}."
+    return f"{_joined_effect_sentences(judged.combination, grounds, *grounds.nuisances)}; {mean}."
 
 
 def _named_sentence(judged: Judged, grounds: Grounds) -> str:
     after = grounds.p_value_after
-    named = f"{_joined_effect_sentences(judged.combination, grounds)} ({p_in_words(judged.p_value)})."
+    named = (
+        f"{_joined_effect_sentences(judged.combination, grounds, *grounds.nuisances)} ({p_in_words(judged.p_value)})."
+    )
     beside = f" {_open_beside_shared(judged, grounds)}." if len(judged.beside_shared) > 1 and judged.leader else ""
     more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
     return f"{named}{beside}{more}"
 
 
-def _joined_effect_sentences(names: Sequence[str], grounds: Grounds) -> str:
-    """Join the sentences of effects, without a full stop; "" if there are none."""
-    said = "; ".join(grounds.sentences[name] for name in names if name in grounds.sentences)
+def _joined_effect_sentences(names: Sequence[str], grounds: Grounds, *more: str) -> str:
+    """Join the sentences of effects, and `more`, without a full stop; "" if there are none."""
+    said = "; ".join([*(grounds.sentences[name] for name in names if name in grounds.sentences), *more])
     return said if not said or _is_users_own_name(said.split()[0], names) else f"{said[0].upper()}{said[1:]}"
 
 

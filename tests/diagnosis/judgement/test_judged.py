@@ -69,6 +69,16 @@ def test_of_a_simulator_nothing_is_named_below_one_half():
     assert verdict(noisy, named_needs_half=True) == ("named", ("lag",))
 
 
+def test_of_a_simulator_the_leader_is_the_effect_on_the_mean_with_the_most_probability_over_all_noises():
+    """An alias of a hundredth does not tip the class over one half, either."""
+    split = {(("lag",), ()): 0.33, (("lag",), ("outliers",)): 0.27, (("drift",), ()): 0.4}
+    assert verdict(split, named_needs_half=True) == ("named", ("lag",))
+    pair = Alias(("drift", "lag"), 0.95, "repeat", 26)
+    split = {(("lag",), ()): 0.49, (("lag",), ("outliers",)): 0.42, (("drift",), ()): 0.02, ((), ()): 0.07}
+    assert verdict(split, aliases=(pair,), same=[("drift",)], named_needs_half=True) == ("named", ("lag",))
+    assert verdict({((), ("outliers",)): 0.6, (("lag",), ()): 0.4}, named_needs_half=True) == ("noise", ("outliers",))
+
+
 def by_what_is_shared(verdict, combination, probabilities, *, p_value=1e-6, aliases=()):
     hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
     judged = with_shared_effects(Judged(verdict, combination, p_value, hypotheses, aliases=aliases), NOISE)

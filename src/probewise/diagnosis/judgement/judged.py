@@ -241,17 +241,37 @@ def verdict_and_combination(
 ) -> tuple[Verdict, Names]:
     """Return the verdict and the combination it names; effects on the mean also need a global test with p up to .01.
 
-    Effects in `certain`, which the readings show beyond doubt, need no significant test. With `named_needs_half`, they
-    also need half the probability, whatever effects on the noise are beside them; otherwise the verdict is
-    `cannot_tell`, with the combination.
+    Effects in `certain`, which the readings show beyond doubt, need no significant test. With `named_needs_half`,
+    effects on the mean count whatever effects on the noise are beside them, and need half the probability; otherwise
+    the verdict is `cannot_tell`, with the combination.
     """
-    verdict, combination = verdict_from_probabilities(hypotheses, noise_names, aliases, aliased_with)
-    if verdict == "named" and named_needs_half:
-        mean = {*combination} - noise_names
-        if sum(h.probability for h in hypotheses if {*h.effects} - noise_names == mean) < 0.5:
+    if named_needs_half:
+        by_mean, fullest = _joined_over_noise(hypotheses, noise_names)
+        verdict, combination = verdict_from_probabilities(by_mean, noise_names, aliases, aliased_with)
+        if verdict == "named" and max(h.probability for h in by_mean if h.effects == combination) < 0.5:
             verdict = "cannot_tell"
+        combination = fullest.get(combination, combination)
+    else:
+        verdict, combination = verdict_from_probabilities(hypotheses, noise_names, aliases, aliased_with)
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
+
+
+def _joined_over_noise(
+    hypotheses: tuple[Hypothesis, ...], noise_names: frozenset[str]
+) -> tuple[tuple[Hypothesis, ...], dict[Names, Names]]:
+    """Join hypotheses with the same effects on the mean; those with effects on the noise alone stay apart.
+
+    Returns
+    -------
+    The joined hypotheses, by their effects on the mean; and by these the effects of the most probable one of each.
+    """
+    joined, fullest = dict[Names, float](), dict[Names, Names]()
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        mean = tuple(name for name in hypothesis.effects if name not in noise_names) or hypothesis.effects
+        joined[mean] = joined.get(mean, 0.0) + hypothesis.probability
+        fullest.setdefault(mean, hypothesis.effects)
+    return tuple(Hypothesis(mean, p) for mean, p in joined.items()), fullest
 
 
 def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:

@@ -91,7 +91,7 @@ class Evidences:
         were chosen from many more, if their evidence is at most three nats below: the readings cannot tell which.
         """
         nothing, its_own = self._largest_log_z(()), self._largest_log_z(formula)
-        named = {names for _, names in self.fits if names and not effects_out_of_vocabulary(names)}
+        named = dict.fromkeys(names for _, names in self.fits if names and not effects_out_of_vocabulary(names))
         gains = {names: self._largest_log_z(names) - nothing for names in named}
         alike = [names for names in gains if gains[names] > its_own - nothing - ALIASED_NATS]
         return [k for k in gains if len(k) == 1 and gains[k] > _NEARLY_ALL * (its_own - nothing)] or alike

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from mixtures import fixed_mixture
 
-from probewise.diagnosis import EffectFound, ParameterFound, Place, audit_plan_of_diagnosis, diagnose
+from probewise.diagnosis import (
+    EffectFound,
+    Hypothesis,
+    Judged,
+    ParameterFound,
+    Place,
+    audit_plan_of_diagnosis,
+    diagnose,
+)
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
@@ -245,8 +253,10 @@ def place_of(covariate, start):
 
 
 def test_a_columns_values_are_no_categories_though_it_is_called_as_those_of_a_light_sensor():
-    simulator, plan = SimpleNamespace(time="t", reading="y"), SimpleNamespace(scan_names=("1", "2"))
-    apparatus = SimulatorApparatus(SimpleNamespace(system=SimpleNamespace(simulator=simulator)))
+    simulator = SimpleNamespace(time="t", reading="y", parameters={})
+    plan, table = SimpleNamespace(scan_names=("1", "2")), SimpleNamespace(columns={})
+    about = SimpleNamespace(system=SimpleNamespace(simulator=simulator), table=table, states={})
+    apparatus = SimulatorApparatus(about)
     found = SimpleNamespace(apparatus=apparatus, recording=SimpleNamespace(plan=plan))
     for name in ("scan", "direction", "orientation"):
         assert category_name_by_value(found, place_of(name, 0.0)) is None
@@ -283,3 +293,29 @@ def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():
     said = page._next_readings_in_words(found)
     assert said.startswith("Nothing that is worth the time: the best plan of up to")
     assert "factor of 0.0 nats. It is in next_plan.csv: scan again (8 readings, about 1 minute)." in said
+
+
+def test_rivals_are_told_in_words_and_a_formula_keeps_its_blanks():
+    formula = "formula:reading:outlet_c:exp(7.46 (flow - 0.4626))"
+    known = {formula: formula, "offset per run": "offset_per_run"}
+    said = page._hypothesis_label_in_words(f"{formula} with lag", known)
+    assert said == "a term exp(7.46 (flow - 0.4626)) in outlet_c and a sensor that follows slowly"
+    assert page._hypothesis_label_in_words("offset per run", known) == "an offset of its own in each run"
+    assert page._hypothesis_label_in_words("interference with interference", {}) == "two waves in the readings"
+
+
+def test_names_in_a_reason_are_said_in_words():
+    hypotheses = (
+        Hypothesis(("correlated_noise", "cubic:v:x", "forcing:v"), 0.5),
+        Hypothesis(("correlated_noise", "cubic:v:x", "input_offset:u_v"), 0.5),
+    )
+    judged = Judged("named", ("cubic:v:x",), 1e-9, hypotheses, shared=("correlated_noise", "cubic:v:x"))
+    reason = "Beside that, these 9 readings cannot tell apart forcing:v (0.50) and input_offset:u_v (0.50)."
+    found = SimpleNamespace(reason=reason, hypotheses=hypotheses, judged=judged)
+    said = "Beside that, these 9 readings cannot tell apart a constant force on v (0.50) and an offset of u_v (0.50)."
+    assert page._reason_in_words(found) == said
+
+
+def test_a_time_constant_in_days_is_called_tau():
+    assert page._parameter_label(ParameterFound("tau_s", "day", 3.0, 0.1, (2.8, 3.2))) == "tau"
+    assert page._parameter_label(ParameterFound("offset_mm", "mm", 3.0, 0.1, (2.8, 3.2))) == "offset"

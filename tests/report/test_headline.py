@@ -135,6 +135,17 @@ def test_only_of_an_effect_that_was_withdrawn_it_is_said_that_it_predicts_worse(
     assert said == "Something is missing, but these readings cannot tell what."
 
 
+def test_a_formula_is_no_covariate():
+    said = headline(found("unknown", ("unknown",), shares={"formula:reading:y:x^2, x beyond 3": 1.0}))
+    assert said == "Something is missing that no known effect explains; it looks most like a term x^2, x beyond 3 in y."
+
+
+def test_the_likeliest_of_rivals_too_long_to_be_listed_is_named():
+    rivals = [("hysteresis",), ("lag",)]
+    said = headline(found("cannot_tell", rivals[0], rivals=rivals))
+    assert said.startswith("Something is missing, most likely an offset between both directions of motion;")
+
+
 def test_many_rivals_of_which_none_is_probable_are_not_named():
     said = headline(found("cannot_tell", rivals=[(name,) for name in NAMES[:12]]))
     assert said == "Something is missing, but these readings cannot tell what."

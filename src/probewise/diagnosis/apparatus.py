@@ -29,7 +29,8 @@ class Words:
     `null`: the calibrated model; `find_signal`: how to obtain a signal; `settles_nothing`: no reading separates two
     aliased effects; `run`: name of a group of rows; `next_plan`, `model`: files of the next readings and of the
     repaired model; `no_cure`: no further rows would make an effect detectable; `covariates`: words for a table's time,
-    row, level and previous row; None: not a table.
+    row, level and previous row; None: not a table. `own_names`: what a person has named, such as columns, which no
+    sentence capitalises.
     """
 
     null: str
@@ -40,6 +41,13 @@ class Words:
     model: str = "sensor.json"
     no_cure: str = "no scan of this arm helps"
     covariates: Mapping[str, str] | None = None
+    own_names: frozenset[str] = frozenset()
+
+    def as_sentence(self, text: str) -> str:
+        """Return a text with a capital first letter, unless its first word is a person's own name."""
+        first = (text.split() or [""])[0].rstrip(",.;:")
+        own = "_" in first or first in self.own_names
+        return text if own else f"{text[:1].upper()}{text[1:]}"
 
     def covariate_in_words(self, name: str) -> str:
         """Return the name of a covariate in words: of a table as `covariates` has it, else without underscores."""

@@ -23,7 +23,7 @@ from probewise.diagnosis import (
 from probewise.diagnosis.repair.repair import Repair
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.thinning import rows_to_diagnose
-from probewise.effects import name_without_copy_suffix
+from probewise.effects import name_without_copy_suffix, spoken_name
 from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import covariate_in_words_and_unit, term_family_in_words
@@ -31,9 +31,12 @@ from probewise.report.covariate_view import ResidualNoise, ranked_places_with_vi
 from probewise.report.diagnosis_figures import encoded_figures, first_figure_content, noun_of_held_out_part
 from probewise.report.effect_words import (
     EFFECTS_IN_WORDS,
+    FORMS_IN_WORDS,
     effect_has_words,
     effect_in_words,
+    effects_in_words,
     hypothesis_in_words,
+    join_lists,
     join_names,
 )
 from probewise.report.headline import headline
@@ -41,9 +44,11 @@ from probewise.report.html import Markup, Section, definition_list, element, fig
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
 from probewise.report.words import (
     count_with_noun,
+    duration_text,
     number_text,
     probability_text,
     range_text,
+    rounded_count_text,
     typeset_numbers,
     unit_name,
 )
@@ -57,6 +62,7 @@ _LIKELY = 0.05  # probability of an effect from which it has a paragraph of its 
 _CHANCE = 0.05  # p-value above which chance is a sufficient explanation
 _TELLS_SOMETHING = 0.5  # nats
 _WEAK = " too weak to be detected so far"
+_IN_UNIT_OF_TIME = ("tau_s", "at_s")
 _NOISE_CAPTIONS = {
     "correlated_noise": "Correlation of residuals, by how many readings they lie apart.",
     "random_walk": "Correlation of residuals, by how many readings they lie apart: for a random walk it falls slowly.",
@@ -152,12 +158,12 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
-        ("What was found", _as_sentence(_reason_in_words(diagnosis))),
+        ("What was found", _as_sentence(diagnosis, _reason_in_words(diagnosis))),
     ]
     if diagnosis.report.formula is not None:
         facts.append(("As a formula", _formula_in_words(diagnosis.report.formula)))
     if diagnosis.report.remainder is not None:
-        facts.append(("Beside that", _as_sentence(diagnosis.report.remainder.sentence)))
+        facts.append(("Beside that", _as_sentence(diagnosis, diagnosis.report.remainder.sentence)))
     if not diagnosis.judged.too_little:
         facts.append(("Could it be chance?", _could_be_chance_in_words(diagnosis)))
     if gain.heldout_by_scan and diagnosis.repair.changes_predictions:
@@ -202,10 +208,20 @@ def _formula_in_words(formula: Formula) -> str:
 
 
 def _reason_in_words(diagnosis: Diagnosis) -> str:
-    """Return the verdict's reason, effect names with spaces for underscores, without its sentence on the next plan."""
+    """Return the verdict's reason without its sentence on the next plan, hypotheses and effects in words for names."""
     said = diagnosis.reason.partition(TO_SEPARATE)[0]
+    for hypothesis in (*diagnosis.hypotheses, *diagnosis.judged.beside_shared):
+        if len(hypothesis.effects) > 1 or ":" in hypothesis.label or hypothesis.label in FORMS_IN_WORDS:
+            said = _with_words_for(said, hypothesis.label, hypothesis_in_words(hypothesis.effects), before=r" \(")
+    for name in {name for hypothesis in diagnosis.hypotheses for name in hypothesis.effects if ":" in name}:
+        said = _with_words_for(said, name_without_copy_suffix(name), effect_in_words(name), before="")
     names = "|".join(EFFECTS_IN_WORDS)
     return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
+
+
+def _with_words_for(text: str, name: str, words: str, *, before: str) -> str:
+    """Put words for a name wherever it stands alone, as no part of a longer one, and before this pattern."""
+    return re.sub(rf"(?<![\w:+]){re.escape(name)}(?![\w:+])(?={before})", lambda _: words, text)
 
 
 def _heldout_gain_in_words(nats: float, sd: float) -> str:
@@ -224,9 +240,9 @@ def _combination_shares_in_words(repair: Repair, model: str) -> str:
     """Say which effects all samples of the repaired model contain, and which only a share of them."""
     everywhere, opening, nothing = repair.effects_in_all_samples, f"Posterior samples in {model} contain", "no effect"
     if everywhere:
-        opening, nothing = f"{opening} {join_names(map(effect_in_words, everywhere))}; beside that", "nothing more"
+        opening, nothing = f"{opening} {join_names(effects_in_words(everywhere))}; beside that", "nothing more"
     held = (
-        f"{join_names(map(effect_in_words, names)) if names else nothing} ({100 * share:.0f} %)"
+        f"{join_names(effects_in_words(names)) if names else nothing} ({100 * share:.0f} %)"
         for names, share in repair.combination_shares.items()
     )
     return f"{opening}: {', '.join(held)}."
@@ -237,7 +253,7 @@ def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
     if p_value > _CHANCE:
         often = f"with nothing missing, {100 * p_value:.0f} of 100 recordings look as odd as this ({p})"
     elif p_value > 1e-6:
-        often = f"with nothing missing, 1 recording in {1 / p_value:,.0f} looks as odd as this ({p})"
+        often = f"with nothing missing, 1 recording in {rounded_count_text(1 / p_value)} looks as odd as this ({p})"
     else:
         often = f"with nothing missing, less than 1 recording in a million looks as odd as this ({p})"
     if diagnosis.verdict == "noise":
@@ -259,9 +275,9 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if plan is None:
         return "No measurement that this apparatus can take would tell more."
     told = plan.expected_log_bayes_factor
-    asked = (
-        f"{count_with_noun(len(plan.plan), 'reading')}, about {count_with_noun(max(round(plan.minutes), 1), 'minute')}"
-    )
+    asked = count_with_noun(len(plan.plan), "reading")
+    if not isinstance(diagnosis.apparatus, SimulatorApparatus) or diagnosis.apparatus.tells_duration:
+        asked += f", about {duration_text(plan.minutes)}"
     description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
     if told < _TELLS_SOMETHING:
         return (
@@ -269,16 +285,26 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
             f"Bayes factor of {number_text(told, 1)} nats. It is in {file}: {description} ({asked})."
         )
     said = f"{description}: {asked}, {file}."
-    *others, last = map(_hypothesis_label_in_words, plan.between)
-    rivals = f"{others[0]} from {last}" if len(others) == 1 else f"{', '.join(others)} and {last}"
-    return f"{said[:1].upper()}{said[1:]} Expected to separate {rivals} by {number_text(told, 1)} nats."
+    rivals = [_hypothesis_label_in_words(label, _names_by_spoken_name(diagnosis)) for label in plan.between]
+    separated = " from ".join(rivals) if len(rivals) == 2 else join_lists(rivals)
+    nats = number_text(told, 0 if told >= 10 else 1)
+    return f"{said[:1].upper()}{said[1:]} Expected to separate {separated} by {nats} nats."
 
 
-def _hypothesis_label_in_words(label: str) -> str:
-    """Write a hypothesis's label "A with B" in words; one with any part that is no effect's name keeps its words."""
+def _names_by_spoken_name(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return the names of effects and formulas that a diagnosis knows, by the words for them in labels of rivals."""
+    names = {name for hypothesis in diagnosis.hypotheses for name in hypothesis.effects}
+    return {spoken_name(name): name for name in (*names, *diagnosis.judged.unknown_shares, *diagnosis.repaired.effects)}
+
+
+def _hypothesis_label_in_words(label: str, known: Mapping[str, str]) -> str:
+    """Write a hypothesis's label "A with B" in words; one with any part that is no effect's name keeps its words.
+
+    `known` are names by their words in labels, which a formula's own words cannot be told from.
+    """
     named, weak, _ = label.partition(_WEAK)
-    names = [part.replace(" ", "_") for part in named.split(" with ")]
-    said = join_names(map(effect_in_words, names)) if all(effect_has_words(name) for name in names) else named
+    names = [known.get(part, part if ":" in part else part.replace(" ", "_")) for part in named.split(" with ")]
+    said = join_names(effects_in_words(names)) if all(effect_has_words(name) for name in names) else named
     return f"{said}, too weak to be detected so far" if weak else said
 
 
@@ -286,7 +312,9 @@ def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     credible = [hypothesis_in_words(_effects_in_label(label)) for label in diagnosis.judged.credible]
     return (
         *(
-            paragraph(_as_sentence(f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}"))
+            paragraph(
+                _as_sentence(diagnosis, f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}")
+            )
             for e in diagnosis.effects
             if e.probability > _LIKELY
         ),
@@ -334,7 +362,7 @@ def _unknown_candidate_in_words(name: str) -> str:
 def _unstated_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Build a paragraph for each effect in the repaired model's samples that is not among the diagnosis's `effects`."""
     return tuple(
-        paragraph(_as_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
+        paragraph(_as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.unstated_effects
     )
 
@@ -474,13 +502,19 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
             _effect_words_and_name(effect.name) if k == 0 else "",
             probability_text(effect.probability) if k == 0 else "",
             number_text(effect.size_lambda, 1) if k == 0 else "",
-            p.name.removesuffix(f"_{p.unit}").replace("_", " "),
+            _parameter_label(p),
             *(_value_and_interval_texts(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
         )
         for effect in effects
         for k, p in enumerate(effect.parameters)
     ]
     return table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
+
+
+def _parameter_label(found: ParameterFound) -> str:
+    """Name a parameter without its unit: "tau", also where the time of a table, in tau_s, is in days."""
+    own = found.name.removesuffix("_s") if found.name in _IN_UNIT_OF_TIME else found.name
+    return own.removesuffix(f"_{found.unit}").replace("_", " ")
 
 
 def _effect_words_and_name(name: str) -> str:
@@ -564,8 +598,8 @@ def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     )
 
 
-def _as_sentence(text: str) -> str:
-    return typeset_numbers(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
+def _as_sentence(diagnosis: Diagnosis, text: str) -> str:
+    return typeset_numbers(f"{diagnosis.apparatus.words.as_sentence(text).rstrip('.')}.")
 
 
 def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
@@ -49,10 +51,32 @@ def hypothesis_in_words(effects: Sequence[str]) -> str:
     """Return a hypothesis in words, given its effects: () for clean, ("unknown",) for an effect out of vocabulary."""
     if not effects:
         return "nothing is missing"
-    return "something without a name" if tuple(effects) == ("unknown",) else join_names(map(effect_in_words, effects))
+    return "something without a name" if tuple(effects) == ("unknown",) else join_names(effects_in_words(effects))
+
+
+def effects_in_words(names: Sequence[str]) -> list[str]:
+    """List effects in words; two of one name, such as two waves, are one item."""
+    counted = Counter(map(effect_in_words, names))
+    return [said if n == 1 else _two(said) for said, n in counted.items()]
+
+
+def _two(said: str) -> str:
+    """Write "a wave in the readings", which is there twice, as "two waves in the readings"."""
+    plural, n = re.subn(r"^an? ((?:periodic )?)(\w+)", r"two \1\2s", said)
+    return plural if n else f"{said} (twice)"
 
 
 def join_names(names: Sequence[str] | map[str]) -> str:
     """Join names as in "A, B and C"."""
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last
+
+
+def join_lists(names: Sequence[str], link: str = "and") -> str:
+    """Join names as in "A, B and C" or, if one of several is itself a list, as in "A and B; C; or D"."""
+    *others, last = names
+    if not others:
+        return last
+    if not any(re.search(r",| and ", name) for name in names):
+        return f"{', '.join(others)} {link} {last}"
+    return f"{'; '.join(others)}; {link} {last}"

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise.diagnosis import ALARM, Diagnosis
-from probewise.effects import UNNAMED
+from probewise.effects import PROPOSAL, UNNAMED
 from probewise.report.covariate import covariate_in_words_and_unit
-from probewise.report.effect_words import effect_in_words, hypothesis_in_words, join_names
+from probewise.report.effect_words import effect_in_words, effects_in_words, hypothesis_in_words, join_lists, join_names
 from probewise.report.words import count_with_noun
 
 MOST_WORDS = 20
@@ -56,7 +56,7 @@ def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:
 
 def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
     sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
-    names = [effect_in_words(name) for name in sorted(diagnosis.combination, key=lambda k: -sizes.get(k, 0.0))]
+    names = effects_in_words(sorted(diagnosis.combination, key=lambda k: -sizes.get(k, 0.0)))
     if len(names) == 1:
         return [f"{opening} {names[0]}.", f"{opening} one effect."]
     return [
@@ -70,10 +70,10 @@ def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
     covariate, _ = covariate_in_words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
-    known = [effect_in_words(e.name) for e in diagnosis.effects if e.probability >= _SURE]
+    known = effects_in_words([e.name for e in diagnosis.effects if e.probability >= _SURE])
     short = "Something is missing that no known effect explains"
     plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short
-    if top in UNNAMED:
+    if top in UNNAMED or top.startswith(PROPOSAL):
         said = [f"{plain}; it looks most like {effect_in_words(top)}."]
     elif top.endswith(", far out"):
         said = [f"Outlying readings cluster in {covariate}: something is missing there that no known effect explains."]
@@ -91,7 +91,7 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
     said = []
     something = "Something is missing"
     if diagnosis.judged.shared:
-        something = f"Beside {join_names(map(effect_in_words, diagnosis.judged.shared))}, something is missing"
+        something = f"Beside {join_names(effects_in_words(diagnosis.judged.shared))}, something is missing"
     if len(rivals) > 1:
         joined = [_join_rival_hypotheses(rivals[:n]) for n in (3, 2)]
         said = [f"{something}: {either}; these readings cannot tell which." for either in joined]
@@ -115,8 +115,7 @@ def _open_beside_shared(diagnosis: Diagnosis) -> list[str]:
 
 def _join_rival_hypotheses(rivals: Sequence[tuple[str, ...]]) -> str:
     """Name hypotheses, given their effects, as in "A, B or C", without the effects that all share."""
-    *others, last = _without_shared(rivals)
-    return f"{', '.join(others)} or {last}" if others else last
+    return join_lists(_without_shared(rivals), "or")
 
 
 def _without_shared(rivals: Sequence[tuple[str, ...]]) -> list[str]:

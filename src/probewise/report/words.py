@@ -101,6 +101,25 @@ def count_with_noun(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
+_LONGER = (("minute", 1.0), ("hour", 60.0), ("day", 1440.0), ("month", 43_830.0), ("year", 525_960.0))
+_LEAST_OF_A_UNIT = 3  # of the next larger unit, from which durations are written in it
+
+
+def duration_text(minutes: float) -> str:
+    """Write a duration in the largest unit, from minutes to years, of which it has three or more; at least a minute."""
+    noun, length = max(
+        (unit for unit in _LONGER if minutes >= _LEAST_OF_A_UNIT * unit[1]),
+        key=lambda unit: unit[1],
+        default=_LONGER[0],
+    )
+    return count_with_noun(max(round(minutes / length), 1), noun)
+
+
+def rounded_count_text(n: float) -> str:
+    """Write a number of two significant digits in full, as in "640,000"."""
+    return f"{float(f'{n:.2g}'):,.0f}"
+
+
 def unit_name(unit: str) -> str:
     """Return a unit as written after a number: "LEGO units" for "LEGO"; all others are unchanged."""
     return "LEGO units" if unit == "LEGO" else unit

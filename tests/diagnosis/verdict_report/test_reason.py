@@ -118,3 +118,10 @@ def test_a_judgement_is_said_in_one_sentence_of_the_apparatus_own_words(judgemen
     said = reason_of(judgement, replace(GROUNDS, **grounds))
     assert said.startswith(sentence)
     assert "sensor" not in said
+
+
+def test_what_a_person_has_named_is_not_capitalised():
+    words = replace(OVEN, own_names=frozenset({"conc"}))
+    assert words.as_sentence("conc is off by 2") == "conc is off by 2"
+    assert words.as_sentence("rv_mps oscillates") == "rv_mps oscillates"
+    assert words.as_sentence("concentration is off") == "Concentration is off"

@@ -17,6 +17,7 @@ from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.system.commands import (
     RunCommand,
+    is_known_duration,
     plan_of_alternatives,
     plan_of_sequence,
     possible_run_commands,
@@ -102,7 +103,13 @@ class SimulatorApparatus:
                 "level": f"predicted {own.reading}",
                 "previous": f"change of {own.reading} since the row before",
             },
+            own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
         )
+
+    @property
+    def tells_duration(self) -> bool:
+        """Whether the table says how long a measurement takes: it has a time, in a known unit."""
+        return is_known_duration(self.about.table, self.system.simulator.time_unit)
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""

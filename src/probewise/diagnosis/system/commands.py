@@ -193,11 +193,15 @@ def _least_and_greatest(values: FloatArray) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
+def is_known_duration(table: RunTable, time_unit: str) -> bool:
+    """Return whether a table tells how long its rows take: it has a time, in a unit that is known."""
+    return table.time is not None and time_unit.strip().rstrip(".").lower() in _MINUTES
+
+
 def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
-    minutes = _MINUTES.get(time_unit.strip().rstrip(".").lower())
-    if table.time is None or minutes is None:
+    if not is_known_duration(table, time_unit):
         return _BREAK + len(table) * _A_READING
-    return _BREAK + float(np.ptp(table.time_s)) * minutes
+    return _BREAK + float(np.ptp(table.time_s)) * _MINUTES[time_unit.strip().rstrip(".").lower()]
 
 
 def _list_in_words(names: Mapping[str, object]) -> str:

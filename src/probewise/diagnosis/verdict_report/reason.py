@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from probewise.diagnosis.apparatus import Words
@@ -157,9 +157,4 @@ def _named_sentence(judged: Judged, grounds: Grounds) -> str:
 def _joined_effect_sentences(names: Sequence[str], grounds: Grounds, *more: str) -> str:
     """Join the sentences of effects, and `more`, without a full stop; "" if there are none."""
     said = "; ".join([*(grounds.sentences[name] for name in names if name in grounds.sentences), *more])
-    return said if not said or _is_users_own_name(said.split()[0], names) else f"{said[0].upper()}{said[1:]}"
-
-
-def _is_users_own_name(word: str, names: Iterable[str]) -> bool:
-    """Return whether a word is a user's own name, which is not capitalised."""
-    return "_" in word or any(word in name.split(":")[1:] for name in names)
+    return grounds.words.as_sentence(said)

@@ -34,6 +34,7 @@ def time_origin(table: RunTable) -> float:
 
 def origin_in_words(name: str | None, origin: float, unit: str = "") -> str:
     """Return a phrase on the origin from which an effect counts the column `name`; "" for 0."""
+    unit = "" if unit == name else unit  # "year counts from 1912 year"
     return f"{name} counts from {origin:.12g} {unit}".rstrip() if origin else ""
 
 

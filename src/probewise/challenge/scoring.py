@@ -81,8 +81,9 @@ def are_names_right(result: Result, names: Sequence[str], *, noise: bool = True)
 
 
 def _most_nats_of_alias(result: Result) -> float:
-    strange = [hidden for hidden in result["hidden"] if not hidden["in_vocabulary"]]
-    return max([HONEST_NATS, *(0.5 * hidden["size_lambda"] ** 2 * (1 - _LIKE**2) for hidden in strange)])
+    """Return the loss, in nats, below which another name explains a case as well as the concealed effects."""
+    sizes = [float(hidden["size_lambda"]) for hidden in result["hidden"] if not hidden["in_vocabulary"]]
+    return max(HONEST_NATS, *(0.5 * size**2 * (1 - _LIKE**2) for size in sizes), 0.0)
 
 
 def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:

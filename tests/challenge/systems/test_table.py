@@ -88,7 +88,9 @@ def test_a_law_on_no_list_whose_change_of_the_readings_is_like_that_of_a_name_co
     """Cosine .9 or more, after a full refit: at lambda 20, a loss of up to (1 - .81) 20^2 / 2 = 38 nats."""
     strange = _hidden("strange_two_settlings", 20.0, on_the_list=False)
     like, unlike = (
-        _case("outside", 20.0, truth=["unknown"], hides=[strange], said=["settling"], alternative_nats={"settling": nats})
+        _case(
+            "outside", 20.0, truth=["unknown"], hides=[strange], said=["settling"], alternative_nats={"settling": nats}
+        )
         for nats in (37.9, 38.1)
     )
     assert [_row([r], "wrong name stated above .9").found.value for r in (like, unlike)] == [0.0, 1.0]

@@ -94,7 +94,8 @@ def _formula_beside(
         fit.found, evidence, prepared.recording, weights=fit.weights, rng=rng, annealed=False
     ).effect_samples(effect.name)
     parts = prepared.apparatus.held_out_parts(prepared.recording)
-    held = held_out_gain(best.fit.found, fit.found, prepared.recording, evidence.likeliest_law, parts)
+    law, law_without = evidence.likeliest_law, best.fit.evidence[best.noise].likeliest_law
+    held = held_out_gain(best.fit.found, fit.found, prepared.recording, law, parts, law_of_null=law_without)
     gained = evidence.log_z - best.fit.evidence[best.noise].log_z
     unit = prepared.recording.plan.instrumentation.unit
     formula = _formula_from_samples(effect, values, unit, gained, held.per_reading)

@@ -359,10 +359,13 @@ def _chain_samples_and_whether_drawn(
     """
     at = {name: k for k, name in enumerate(fitted.names)}
     n, system = len(fitted.samples), chain.system
+    fixed = {f"{form.name}.{name}" for form in chain.effects for name in getattr(form, "fixed", ())}
     out = np.empty((n, len(chain.names)))
     for k, name in enumerate(chain.names):
         if name in at:
             out[:, k] = fitted.samples[:, at[name]]
+        elif name in fixed:  # a file of an earlier version lacks it
+            out[:, k] = 0.0
         elif name in system.marginals:
             # One stratified draw from the prior for each sample.
             out[:, k] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
@@ -372,7 +375,7 @@ def _chain_samples_and_whether_drawn(
             positive = effect == NoisePerRun.name  # positive parameters scatter in the logarithm
             drawn = draw_value_for_new_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
-    return out, any(name not in at for name in chain.names)
+    return out, any(name not in at and name not in fixed for name in chain.names)
 
 
 def draw_value_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
+from probewise._arrays import FloatArray
+from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.forms.readings import modulated_form
+from probewise.systems.table import RunTable
+
+_AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
+_FIXED = 1e-9  # width of its prior
+_FAR = 0.3  # change of a parameter by its own size, as large as the misfit asks for, at which the variants differ
+_MOST_NATS = 50.0  # largest logarithm of a factor
 
 
 def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
@@ -44,7 +53,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
         for column in columns:
             how = modulations.column_proportional_modulation(column, table)
             size = guess / float(np.nanstd(table.covariates[column]))
-            yield from modulated_form(
+            for form in modulated_form(
                 about,
                 f"depends:{name}:{column}",
                 stage=Stage.PARAMETER,
@@ -53,7 +62,52 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
                 guess=size,
                 what=name,
                 unit="",
-            )
+            ):
+                is_scale = isinstance(own.parameters[name], LogUniform)
+                yield _linear_or_by_factor(about, form, name, how) if is_scale else form
+
+
+def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modulation) -> Form:
+    """Return a form of a parameter with two variants: it changes linearly, or by a factor, exponentially.
+
+    A parameter with a log prior has no sign, and what changes it, as the temperature changes a rate, often multiplies
+    it. `a` is the slope where the modulation is 0 (a column's mean) in both. The second variant is offered where the
+    misfit may ask for a change that is not small beside the parameter; otherwise they are the same.
+    """
+
+    def act(value: dict[str, FloatArray], theta: FloatArray, table: RunTable) -> dict[str, FloatArray]:
+        change, before = how.at_rows(theta, table), value[name]
+        if np.all(theta[:, 1] < 0.5):
+            return {**value, name: before + change}
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = np.exp(np.clip(change / before, -_MOST_NATS, _MOST_NATS))
+        return {**value, name: np.where(theta[:, 1:2] > 0.5, before * factor, before + change)}
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        by_factor = ", and in proportion to itself (exponentially)" if mean[1] > 0.5 else ""
+        return form.says(mean, sd) + by_factor
+
+    def variant(as_factor: float) -> Form:
+        which = np.full((*form.entries.shape[:2], 1), as_factor)
+        marginals = {**form.marginals, _AS_FACTOR: Uniform(as_factor - 0.5 * _FIXED, as_factor + 0.5 * _FIXED)}
+        return replace(
+            form,
+            marginals=marginals,
+            units=(*form.units, "1"),
+            act=act,
+            entries=np.concatenate([form.entries, which], axis=2),
+            says=says,
+            fixed=(_AS_FACTOR,),
+        )
+
+    linear = variant(0.5 * _FIXED)
+    there = about.system.parameters(about.theta, about.table)[name]
+    most = float(np.abs(how.at_rows(form.entries[0, :1], about.table)).max()) * max(about.misfit, 1.0)
+    return (
+        linear
+        if most < _FAR * float(np.abs(there).min())
+        else replace(linear, alternatives=(variant(1.0 - 0.5 * _FIXED),))
+    )
 
 
 def _parameter_shifter(name: str, how: Modulation) -> Act:

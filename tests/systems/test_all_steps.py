@@ -1,5 +1,7 @@
 """All steps of a law solved at once, against stepping through them: the same equations, so the same states."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,7 +87,29 @@ def test_near_a_known_trajectory_a_derivative_costs_a_fraction_of_stepping():
     found, cost = case.near(theta)
     slopes, expected = (np.diff(v["phi"], axis=0) / 1e-5 for v in (found, case.stepped(theta)))
     np.testing.assert_allclose(slopes, expected, atol=1e-5)
-    assert cost < 0.2 * len(steps_for_table(case.table, 0.02).gap_of_step)
+    steps = steps_for_table(case.table, 0.02)
+    assert cost < 0.2 * len(steps.gap_of_step) * len(steps.schedule.method.b)
+
+
+@pytest.mark.parametrize("effect", [_plain, _rubbed, _stopped, _forced])
+@pytest.mark.parametrize("max_step", [0.02, 0.2])
+def test_the_cost_is_how_often_the_rates_are_evaluated(effect, max_step):
+    """Exactly where nothing splits a step; friction splits those in which a state comes to rest."""
+    n_calls = 0
+
+    def rates(s, p, u):
+        nonlocal n_calls
+        n_calls += 1
+        return LAW.rates(s, p, u)
+
+    case = _Case(effect, law=replace(LAW, rates=rates))
+    theta = MIDDLE * (1 + 0.1 * np.random.default_rng(2).normal(size=(6, 3)))
+    steps = steps_for_table(case.table, max_step)
+    _, cost = integrate_from_known_trajectories(
+        case.problem(theta), steps, case.memory, effects="effects", theta=theta, n_own=3
+    )
+    n_calls -= 1  # one to see which columns it reads
+    assert cost == pytest.approx(n_calls, rel=0.5 if effect is _rubbed else 0.01)
 
 
 def test_a_sample_that_diverges_is_as_infinite_as_in_steps():

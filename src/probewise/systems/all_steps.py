@@ -23,6 +23,7 @@ from probewise.systems.motion import (
     LawWithEffects,
     RowsInRuns,
     Stepper,
+    evaluations_per_step,
     initial_states,
     integrate_states,
     states_by_step,
@@ -209,12 +210,14 @@ def integrate_from_known_trajectories(
 
     Returns
     -------
-    Every state at every row, by name, (n_samples, n_points); and the cost, in steps of all samples together.
+    Every state at every row, by name, (n_samples, n_points); and the cost, in evaluations of the rates of all samples
+    together.
     """
     n_samples, n_steps = len(theta), len(steps.gap_of_step)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
-        return integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step), n_steps
+        states_by_name = integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step)
+        return states_by_name, n_steps * evaluations_per_step(motion, steps.schedule.method)
     states, left, cost = None, np.arange(n_samples), 0
     known, nearest = memory.known_and_nearest_indices(steps, effects, theta, n_own)
     if known:
@@ -242,7 +245,9 @@ def integrate_from_known_trajectories(
             [KnownTrajectory(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()],
         )
     assert states is not None
-    return dict(zip(law_and_inputs(np.arange(1))[0].law.states, steps.states_at_rows(states), strict=True)), cost
+    motion = law_and_inputs(np.arange(1))[0]
+    cost *= evaluations_per_step(motion, steps.schedule.method)
+    return dict(zip(motion.law.states, steps.states_at_rows(states), strict=True)), cost
 
 
 def solve_all_steps(

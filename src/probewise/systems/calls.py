@@ -26,10 +26,13 @@ _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 
 @dataclass(eq=False)
 class IntegrationTally:
-    """Counts of integration steps and of samples at which a law raises an error; `cut_short` if work was skipped."""
+    """Counts of a law's evaluations and of samples at which it raises an error; `cut_short` if work was skipped.
+
+    An evaluation is one of the rates of all samples and runs together.
+    """
 
     n_failed: int = 0
-    n_steps: int = 0
+    n_evaluations: int = 0
     cut_short: bool = False
 
 

@@ -242,6 +242,18 @@ def states_by_step(
                 yield s
 
 
+def evaluations_per_step(motion: LawWithEffects, method: RungeKutta) -> int:
+    """Return about how often a step of a law evaluates its rates, of all samples together.
+
+    Friction asks for the direction of motion, and splits steps in which a state comes to rest or breaks loose: by half
+    as much again, where samples of a search do so at different times.
+    """
+    if not (motion.limits or motion.friction):
+        return len(method.b)
+    n_stages = len(method.b) if method is FOURTH_ORDER else N_LONGER * len(FOURTH_ORDER.b)
+    return n_stages + n_stages // 2 if motion.friction else n_stages
+
+
 def time_gaps(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
     """Return the time from each position to the next by the time column, (1 or n_samples, n_places - 1, n_runs).
 

@@ -47,7 +47,7 @@ class System:
     first
         Standard-normal coordinates of an earlier fit, (n_params,), from which fits start.
     tally
-        Counts of a law's integration steps, and of samples at which it raises an error.
+        Counts of a law's evaluations, and of samples at which it raises an error.
     trajectories
         Cache of trajectories of the law, from which nearby ones are solved.
     """
@@ -365,7 +365,7 @@ class SystemChain:
                 theta=theta,
                 n_own=system.n_params,
             )
-            system.tally.n_steps += cost
+            system.tally.n_evaluations += cost
             return readings_of_states(law, states, parameters, columns)
         except ProbewiseError:
             raise

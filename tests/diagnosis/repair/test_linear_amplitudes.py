@@ -33,7 +33,7 @@ def drawn(gains, seed):
 
 
 def test_a_value_that_readings_fix_about_zero_is_as_certain_as_the_others():
-    """The density by numbers: the heavy-tailed prior times the normal likelihood of one run; the zero hardly matters."""
+    """By numbers: the heavy-tailed prior times the normal likelihood of one run; the zero hardly matters."""
     found, values, y = drawn([0.6, -0.5, 0.4, 0.0, -0.45, 0.5], seed=1)
     (effect,) = found.model.effects
     prior = effect.prior.marginals["values[3]"]

@@ -52,7 +52,7 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     DriftingNoise,
 )
 CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some 20,000 in a diagnosis
-STEPS_OF_A_SEARCH = 600_000  # of the integration, some 70 microseconds each, of however many samples
+EVALUATIONS_OF_A_SEARCH = 1_000_000  # of a law's rates, some 20 microseconds each, of however many samples
 _N_BLOCKS = 5
 
 # Prior odds of one, two, three effects on the mean. A few lines of physics leave out two things more often than a
@@ -128,10 +128,10 @@ class SimulatorApparatus:
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
     def refit_budget_share_spent(self) -> float:
-        """Return the spent share of the budget of calls or integration steps; 0 if `simulate` takes arrays."""
+        """Return the spent share of the budget of calls or evaluations of a law; 0 if `simulate` takes arrays."""
         caller = self.system.caller
         if caller is None:
-            return self.system.tally.n_steps / STEPS_OF_A_SEARCH
+            return self.system.tally.n_evaluations / EVALUATIONS_OF_A_SEARCH
         return 0.0 if caller.broadcasts else caller.n_calls / CALLS_OF_A_SEARCH
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:

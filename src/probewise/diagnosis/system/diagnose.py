@@ -15,7 +15,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.noise.law import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, STEPS_OF_A_SEARCH, SimulatorApparatus
+from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, EVALUATIONS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
@@ -232,8 +232,9 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _notes_on_integration(tally: IntegrationTally) -> Iterator[str]:
     if tally.cut_short:
         yield (
-            f"integrating the law takes long: in {STEPS_OF_A_SEARCH:,} steps not every combination of effects that "
-            "promised something was fitted; with a larger max_step_s, shorter runs or fewer rows the search is complete"
+            f"integrating the law takes long: in {EVALUATIONS_OF_A_SEARCH:,} evaluations of its rates not every "
+            "combination of effects that promised something was fitted; with a larger max_step_s, shorter runs or fewer "
+            "rows the search is complete"
         )
     if tally.n_failed:
         yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"

@@ -111,9 +111,20 @@ def diagnose_prepared(
     prepared: Prepared, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
 ) -> Diagnosis:
     """Run the pipeline of `diagnose` on the input of any apparatus, with the same returns and errors."""
-    searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
-    searched = search_with_formulas(searched, progress=progress)
-    prepared = searched.prepared
+    searched = search_prepared(prepared, progress=progress)
+    return diagnosis_of_search(searched, thorough=thorough, progress=progress, rng=rng)
+
+
+def search_prepared(prepared: Prepared, *, progress: Progress = silent) -> Searched:
+    """Run the pipeline's first part: search for the combinations of effects, then with formulas."""
+    return search_with_formulas(search(prepared, progress=progress), progress=progress)
+
+
+def diagnosis_of_search(
+    searched: Searched, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
+) -> Diagnosis:
+    """Run the rest of the pipeline on the result of a search, with the arguments and returns of `diagnose`."""
+    prepared, weighings = searched.prepared, tuple[Weighing, ...]()
     if prepared.has_too_little_data:
         searched = searched.with_prior_probabilities()
     elif thorough is not None:

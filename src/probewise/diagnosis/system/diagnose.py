@@ -10,14 +10,15 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_progress, require_rng
-from probewise.diagnosis.engine import Thorough, diagnose_prepared
+from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
 from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.noise.law import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, EVALUATIONS_OF_A_SEARCH, SimulatorApparatus
+from probewise.diagnosis.system.finer_step import STANDS_STILL, finer_step_for_repair, searched_at_step
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
-from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording
@@ -28,8 +29,6 @@ from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
 from probewise.systems.table import median_sd_of_column
 
-_STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
-_N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
 _MOST_COMPARED = 2400
 _STEPS_TRIED = 8  # of the fit of the simulator, from each start
 _BEST_STARTS = 3  # of which it goes on
@@ -79,38 +78,22 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
 
-    def fit_and_diagnose(simulator: Simulator) -> Diagnosis:
+    def fit_and_diagnose(simulator: Simulator) -> tuple[Searched, Diagnosis]:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
-        return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
+        searched = search_prepared(prepared, progress=told)
+        return searched, diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
 
-    diagnosis = fit_and_diagnose(simulator)
-    step = _finer_step_for_repair(diagnosis)
+    searched, diagnosis = fit_and_diagnose(simulator)
+    step = finer_step_for_repair(diagnosis)
     if step is None:
         return diagnosis
     assert simulator.law is not None
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
-    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)))
-
-
-def _finer_step_for_repair(diagnosis: Diagnosis) -> float | None:
-    """Return the finer integration step that the repaired law needs, or the finest within reach.
-
-    None if the step used was fine enough, or the simulator has no law, or the repair no effects. The step was chosen
-    for the larger residuals of the law without effects.
-    """
-    system = cast(SimulatorApparatus, diagnosis.apparatus).system
-    model, table = diagnosis.repaired, cast(RunTable, diagnosis.recording.plan)
-    effects = cast(Sequence[NamedEffect[Any]], model.chain.effects)
-    if system.simulator.law is None or not effects:
-        return None
-    tolerance = _STANDS_STILL * float(np.median(model.noise_sd))
-    try:
-        theta = model.theta[:_N_HALVED]
-        still = system.with_converged_step(table, theta, effects, tolerance=tolerance, or_finest=True)
-    except ParameterError:  # a friction or a bound that no step meets exactly
-        return None
-    return still.max_step if still.max_step < system.max_step else None
+    finer = searched_at_step(searched, step, progress=progress)
+    if finer is not None:
+        return diagnosis_of_search(finer, thorough=thorough, progress=progress, rng=rng)
+    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)))[1]
 
 
 def prepare_system(
@@ -233,8 +216,8 @@ def _notes_on_integration(tally: IntegrationTally) -> Iterator[str]:
     if tally.cut_short:
         yield (
             f"integrating the law takes long: in {EVALUATIONS_OF_A_SEARCH:,} evaluations of its rates not every "
-            "combination of effects that promised something was fitted; with a larger max_step_s, shorter runs or fewer "
-            "rows the search is complete"
+            "combination of effects that promised something was fitted; with a larger max_step_s, shorter runs or "
+            "fewer rows the search is complete"
         )
     if tally.n_failed:
         yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"
@@ -278,7 +261,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     found = _fit_from_best_starts(system, recording, law)
     sd = _noise_sd_of(system.simulator, table, recording, found)
     for _ in range(4):
-        finer = system.with_converged_step(table, system.theta(found.z[None, :]), tolerance=_STANDS_STILL * sd)
+        finer = system.with_converged_step(table, system.theta(found.z[None, :]), tolerance=STANDS_STILL * sd)
         if finer is system:
             break
         system = finer

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.search.search import search
+from probewise.diagnosis.system import finer_step
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.diagnosis.system.finer_step import searched_at_step
 from probewise.systems import Law, RunTable, Simulator
@@ -52,3 +53,16 @@ def test_a_search_that_errors_of_the_integration_may_have_led_is_made_again(prep
     """One step of fourth order between rows 0.1 s apart, in which the drag at first halves the speed."""
     first = search(at_step(prepared, 0.2))
     assert searched_at_step(first, 0.01) is None
+
+
+def test_a_null_without_a_chance_may_move_by_more(prepared, monkeypatch):
+    first = search(at_step(prepared, 0.02))
+    assert first.posterior.marginal_over_noise[()] < 1e-9
+    refitted = finer_step._refitted
+
+    def moved(searched, held, system):
+        return refitted(searched, held, system).with_log_evidence_shifted(0.0 if held.names else -5.0)
+
+    monkeypatch.setattr(finer_step, "_refitted", moved)
+    found = searched_at_step(first, 0.01)
+    assert found.evidences.fits[0, ()].log_z < first.evidences.fits[0, ()].log_z - 4.0

@@ -70,7 +70,8 @@ def searched_at_step(searched: Searched, max_step: float, *, progress: Progress 
     apparatus = cast(SimulatorApparatus, prepared.apparatus)
     finer = replace(cast(System, prepared.null), max_step=max_step)
     fits, unknown = dict(searched.evidences.fits), dict(searched.evidences.unknown)
-    asked = _combinations_with_a_chance(searched)
+    with_a_chance = _combinations_with_a_chance(searched)
+    asked = [*with_a_chance, *([] if () in with_a_chance else [()])]  # the null is part of every report
     for k, names in enumerate(asked):
         progress("refitting at a finer step", k, len(asked))
         for (order, held_names), held in searched.evidences.fits.items():
@@ -81,7 +82,7 @@ def searched_at_step(searched: Searched, max_step: float, *, progress: Progress 
             except NotConvergedError:
                 return None
             moved = {noise: again.evidence[noise].log_z - e.log_z for noise, e in held.evidence.items()}
-            if not abs(again.log_z - held.log_z) < A_NAT:
+            if names in with_a_chance and not abs(again.log_z - held.log_z) < A_NAT:
                 return None
             fits[order, names] = again
             unknown |= {
@@ -103,7 +104,7 @@ def searched_at_step(searched: Searched, max_step: float, *, progress: Progress 
 
 
 def _combinations_with_a_chance(searched: Searched) -> list[Names]:
-    """List the refitted combinations with a probability of 0.01 or more, most probable first, and the null.
+    """List the refitted combinations with a probability of 0.01 or more, most probable first.
 
     With or without an unknown effect beside: if that is probable, so are the fits that it is most probable beside.
     """
@@ -117,8 +118,7 @@ def _combinations_with_a_chance(searched: Searched) -> list[Names]:
         names: max(chance.get(names, 0.0), unknown * math.exp(beside.get(names, -math.inf) - most))
         for names in refitted
     }
-    ranked = sorted((names for names in refitted if own[names] >= _HAS_A_CHANCE), key=lambda names: -own[names])
-    return list(dict.fromkeys([*ranked, ()]))
+    return sorted((names for names in refitted if own[names] >= _HAS_A_CHANCE), key=lambda names: -own[names])
 
 
 def _refitted(searched: Searched, held: WeighedFit, system: System) -> WeighedFit:

@@ -52,7 +52,7 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     DriftingNoise,
 )
 CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some 20,000 in a diagnosis
-EVALUATIONS_OF_A_SEARCH = 1_000_000  # of a law's rates, some 20 microseconds each, of however many samples
+EVALUATIONS_OF_A_SEARCH = 1_500_000  # of a law's rates, 15 to 20 microseconds each, of however many samples
 _N_BLOCKS = 5
 
 # Prior odds of one, two, three effects on the mean. A few lines of physics leave out two things more often than a

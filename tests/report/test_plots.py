@@ -88,6 +88,17 @@ def test_an_ssf_is_drawn_about_its_place_in_the_sensor_frame():
     assert plots.ssf_by_n_gaussians({1: blob(), 2: blob()}, {1: -5.0, 2: -7.0}, {1: 0.1, 2: 0.1}).shape == (1, 2)
 
 
+def test_a_long_label_of_a_bar_is_broken_into_lines_within_the_axes():
+    long = "a cubic term of x in the rate of v, noise that neighbouring readings share and an offset of u_v"
+    ax = plots.hypothesis_probabilities([f"{long} and {long}", "b", f"{long}, {long}"], [0.6, 0.3, 0.1])
+    ax.figure.canvas.draw()
+    frame = ax.figure.bbox
+    texts = [text.get_window_extent() for text in ax.texts]
+    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in texts)
+    bars = [bar.get_window_extent() for bar in ax.patches]
+    assert not any(box.overlaps(bar) for box in texts for bar in bars)
+
+
 @pytest.mark.slow
 def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
     ax = plots.hypothesis_probabilities([str(k) for k in range(20)], np.full(20, 0.05), most=8)

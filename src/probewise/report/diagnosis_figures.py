@@ -36,11 +36,13 @@ from probewise.report.plots import (
     svg,
 )
 from probewise.report.plots.residuals import AFTER, BEFORE
+from probewise.report.plots.verdict import n_further_lines
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
+_FIGURE_IN = 6.8  # width of the first figure
 _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readings' value counts as lost
 
 
@@ -92,7 +94,8 @@ def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names = [hypothesis_in_words(h.effects) for h in listed]
     n_bars = min(len(listed), _MOST_BARS) + (len(diagnosis.hypotheses) > min(len(listed), _MOST_BARS))
-    above, below = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3)])
+    lines = n_further_lines(names[:_MOST_BARS], width_in=_FIGURE_IN)
+    above, below = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3) + 0.16 * lines], width_in=_FIGURE_IN)
     shown = first_figure_content(diagnosis, chance)
     if shown == "readings":
         readings_in_order(diagnosis.recording, ax=above)

@@ -30,7 +30,16 @@ from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PU
 from probewise.report.words import typeset_numbers
 
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
-__all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "axes_or_new", "grid_of_axes"]
+__all__ += [
+    "LETTERS_PER_IN",
+    "OUT_OF_REACH",
+    "PAGE_IN",
+    "SMALL_PT",
+    "AxesGrid",
+    "axes_or_grid",
+    "axes_or_new",
+    "grid_of_axes",
+]
 __all__ += [
     "label_axes",
     "legend_above",
@@ -42,7 +51,6 @@ __all__ += [
     "svg",
 ]
 
-_LETTERS_PER_IN = 16.2  # letters per inch of a legend, about
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _EMPTY_BRACKETS = re.compile(r"\s*\(\)$")
@@ -52,6 +60,9 @@ AxesGrid: TypeAlias = NDArray[Any]
 
 PAGE_IN = 9.6
 """Width of a report's column: a wider drawing is shrunk, and its text with it."""
+
+LETTERS_PER_IN = 16.2
+"""Letters in an inch of the smallest font, about."""
 
 SMALL_PT = 9.0
 """The smallest font size of any drawing: 8.5 pt or more on a page."""
@@ -166,7 +177,7 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
         return 0
-    room = _LETTERS_PER_IN * ax.get_position().width * cast(Figure, ax.figure).get_figwidth()
+    room = LETTERS_PER_IN * ax.get_position().width * cast(Figure, ax.figure).get_figwidth()
     labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
     n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width_letters(labels, n) < room), 1)
     ax.legend(

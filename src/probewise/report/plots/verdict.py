@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -9,9 +10,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from probewise.report.plots.canvas import BLUE, CYCLE, GREY, SMALL_PT, axes_or_new, label_axes, legend_above
+from probewise.report.plots.canvas import (
+    BLUE,
+    CYCLE,
+    GREY,
+    LETTERS_PER_IN,
+    SMALL_PT,
+    axes_or_new,
+    label_axes,
+    legend_above,
+)
 
 _SHOWN = 6  # hypotheses with a colour of their own
+_LINE = 0.42  # height of a further line of a label, in distances of two bars
+_AXES_SHARE = 0.775  # of a figure's width: its axes before the layout, which widens them
 _VISIBLE = 0.02  # probability from which a hypothesis has one
 
 
@@ -34,13 +46,17 @@ def hypothesis_probabilities(
     rest = float(np.sum(np.asarray(probabilities)[order[most:]]))
     if len(order) > most:
         shown.append((f"{len(order) - most} others", rest))
-    ax = axes_or_new(ax, size_in=(6.6, 0.6 + 0.42 * len(shown)))
-    at = -np.arange(len(shown), dtype=np.float64)
+    names_shown = [name for name, _ in shown]
+    ax = axes_or_new(ax, size_in=(6.6, 0.6 + 0.42 * (len(shown) + _LINE * n_further_lines(names_shown, width_in=6.6))))
+    wrapped = _wrapped_labels(names_shown, ax.get_position().width * cast(Figure, ax.figure).get_figwidth())
+    # A bar lies below all lines of its label.
+    lines_before = np.cumsum([len(lines) - 1 for lines in wrapped])
+    at = -np.arange(len(shown), dtype=np.float64) - _LINE * lines_before
     ax.barh(at - 0.22, [p for _, p in shown], color=[BLUE, *[GREY] * (len(shown) - 1)], height=0.34)
     beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": SMALL_PT}
-    for y, (name, p) in zip(at, shown, strict=True):
+    for y, lines, (_, p) in zip(at, wrapped, shown, strict=True):
         ax.annotate(f"{p:.3f}", (p, y - 0.22), xytext=(4, 0), va="center", **beside)
-        ax.annotate(name, (0.0, y + 0.06), xytext=(3, 0), **beside)
+        ax.annotate("\n".join(lines), (0.0, y + 0.06), xytext=(3, 0), **beside)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
     ax.set_xlim(0, 1.08)
@@ -48,6 +64,17 @@ def hypothesis_probabilities(
     # Room for at least three bars, so that a single bar is not too thick.
     ax.set_ylim(min(at[-1], -2.0) - 0.5, 0.5)
     return label_axes(ax, x="probability", y="")
+
+
+def n_further_lines(names: Sequence[str], *, width_in: float) -> int:
+    """Return how many lines more than one each the labels of hypotheses take in a figure of this width."""
+    return sum(len(lines) - 1 for lines in _wrapped_labels(names, _AXES_SHARE * width_in))
+
+
+def _wrapped_labels(names: Sequence[str], width_in: float) -> list[list[str]]:
+    """Return the lines of each label in axes of this width."""
+    room = max(int(LETTERS_PER_IN * width_in), 1)
+    return [textwrap.wrap(name, room) or [""] for name in names]
 
 
 def probabilities_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | None = None) -> Axes:

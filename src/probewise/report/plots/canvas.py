@@ -156,7 +156,10 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
     """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
     ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
     sheet = cast(Figure, ax.figure)
+    labels = _tick_labels(sheet)
     sheet.tight_layout(pad=0.4, h_pad=0.9)
+    if _tick_labels(sheet) != labels:  # finer ticks of axes that have grown have longer labels
+        sheet.tight_layout(pad=0.4, h_pad=0.9)
     buffer, own = io.BytesIO(), sheet.canvas
     canvas: Any = FigureCanvasSVG(sheet)
     with mpl.rc_context({"svg.hashsalt": "probewise"}):
@@ -166,6 +169,10 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
         plt.close(sheet)
     text = buffer.getvalue()
     return text[text.index(b"<svg") :]
+
+
+def _tick_labels(sheet: Figure) -> list[str]:
+    return [label.get_text() for ax in sheet.axes for label in (*ax.get_xticklabels(), *ax.get_yticklabels())]
 
 
 def legend_above(ax: Axes, *, title: str = "") -> int:

@@ -24,6 +24,7 @@ Parts = tuple[IntArray, tuple[str, ...]]
 """Part number of each usable reading, (n_usable,), and the names of the parts."""
 
 _BLOCKS = 5
+_HARDLY_TOLD = 0.5  # variance of a coordinate given the other parts, of 1 before them
 
 
 @dataclass(frozen=True)
@@ -136,8 +137,10 @@ def _refit_log_densities(
     sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
     curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
     miss = recording.readings[recording.usable] - predicted
-    if of_its_own.any() or law.has_memory:
-        covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
+    covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
+    # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
+    hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
+    if (of_its_own | hardly_told).any() or law.has_memory:
         return sequential_log_densities(law, out, miss, slopes, without.z - about, covariance, sigma_2)
     miss, slopes = miss[out], slopes[out]
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)

@@ -15,6 +15,7 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST, GaussianMixtureSen
 from probewise.diagnosis.fitting.null import Null, Predictor
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.effects import NamedEffect
+from probewise.effects.shared_scale_prior import SharedScalePrior
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES, footprint_of
 from probewise.sensor.stages import effects_with_columns
@@ -66,6 +67,14 @@ class Model:
     def n_params(self) -> int:
         """Number of coordinates."""
         return self.sensor.n_params + sum(len(effect.prior.names) for effect in self.effects)
+
+    @cached_property
+    def has_shared_scale(self) -> BoolArray:
+        """Mask of the coordinates of effects whose values have one scale in common, (n_params,)."""
+        out = np.zeros(self.n_params, dtype=np.bool_)
+        for effect in self.effects:
+            out[self.coordinate_slice(effect.name)] = isinstance(effect.prior, SharedScalePrior)
+        return out
 
     def coordinate_slice(self, name: str) -> slice:
         """Return the slice of one effect's coordinates."""

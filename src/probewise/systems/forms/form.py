@@ -12,6 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import name_of_first_copy
+from probewise.effects.shared_scale_prior import SharedScalePrior
 from probewise.effects.vocabulary import VariantMasks, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
@@ -94,6 +95,8 @@ class Form:
     suggested
         Further trial settings, as `entries`, that the readings suggest: refits may start there. A test of the readings
         leaves them out, for other readings would have suggested others.
+    shared_scale
+        Whether its parameters, all with the same prior, are about as large as each other: see `SharedScalePrior`.
     """
 
     name: str
@@ -114,10 +117,13 @@ class Form:
     needs_rising_time: bool = False
     counted_from: str = ""
     suggested: FloatArray | None = None
+    shared_scale: bool = False
 
     @cached_property
-    def prior(self) -> Product:
+    def prior(self) -> Product | SharedScalePrior:
         """Prior of its parameters."""
+        if self.shared_scale:
+            return SharedScalePrior(tuple(self.marginals), next(iter(self.marginals.values())))
         return Product(self.marginals)
 
     @property

@@ -19,6 +19,7 @@ from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_MOMENTS = 512
+_MOST_OF_ONE_SCALE = 24  # values per run: with 36 a vector of typical length has 6 sds, a coordinate's bound, in one
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,7 @@ class Modulation:
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     counted_from: str = ""
     suggested: Callable[[float], FloatArray | None] = lambda size: None
+    shared_scale: bool = False
 
 
 def _single_entry_bank(size: float) -> FloatArray:
@@ -106,7 +108,11 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool
 
 
 def value_per_run_modulation(table: RunTable) -> Modulation:
-    """Return a variation by one value per run: a_run; 0 for runs outside the recording."""
+    """Return a variation by one value per run: a_run; 0 for runs outside the recording.
+
+    The values have one scale in common, unless runs are so many that a single one could not differ much more than the
+    others within the bounds of a coordinate.
+    """
     names = table.scan_names
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
@@ -127,6 +133,7 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
         says=says,
         covariates=("run",),
         amplitudes=tuple(range(len(names))),
+        shared_scale=1 < len(names) <= _MOST_OF_ONE_SCALE,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
@@ -36,7 +37,7 @@ def modulated_form(
     entries = how.entries(guess)
     typical = about.typical_amplitude(stage, act, entries, guess)
     if typical is not None and np.isfinite(typical) and typical > 0:
-        yield Form(
+        form = Form(
             name,
             stage,
             marginals=how.marginals(about.amplitude_prior(typical)),
@@ -50,7 +51,10 @@ def modulated_form(
             joined=how.joined,
             counted_from=how.counted_from,
             suggested=how.suggested(typical),
+            shared_scale=how.shared_scale,
         )
+        # All runs may differ about as much, or one of them alone by far more than the others.
+        yield replace(form, alternatives=(replace(form, shared_scale=False),)) if form.shared_scale else form
 
 
 def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:

@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.light_sensor.covariates import varying_covariates
-from probewise.diagnosis.residuals.bases import bank_of_unknown_effects
+from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named
+from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.recordings import two_way_plan
 
 PLAN = two_way_plan()
@@ -45,3 +49,25 @@ def test_every_basis_is_of_the_rows_and_has_a_family():
     assert len(BASES.widths) == len(BASES.labels)
     assert BASES.columns.shape == (N, BASES.widths.sum())
     assert all(np.isfinite(columns).all() and np.any(columns) for columns in TEMPLATES)
+
+
+def test_what_a_name_describes_is_no_unknown():
+    """One offset per run is a name's; it becomes zero, and its share of the prior is not given to other bases."""
+    rng = np.random.default_rng(3)
+    run, x = np.repeat(np.arange(6), 20), np.tile(np.linspace(0, 1, 20), 6)
+    covariates = [
+        Covariate("x", x, np.arange(len(x))),
+        Covariate("run", run.astype(np.float64), np.arange(len(x)), groups=True),
+    ]
+    signal = x + 0.1 * rng.random(len(x))
+    bases = bank_of_unknown_effects(covariates, signal, np.gradient(signal), run)
+    each = (run[:, None] == np.arange(6)).astype(np.float64)
+    mean = np.ones((len(x), 1)) / np.sqrt(len(x))
+    problem = Linearised(mean, rng.standard_normal(len(x)), white_noise(len(x)), 1.0, len(x))
+    named = TemplateBank.of([each], ["offset_per_run"], len(x))
+    left = bases_unlike_named(bases, named, problem)
+    of_runs = left.indices_by_label["run"]
+    assert len(of_runs) == len(bases.indices_by_label["run"])
+    assert [bool(np.any(left[k])) for k in of_runs] == [False] + [True] * (len(of_runs) - 1)
+    factors = left.log_bayes_factors(problem)[:, 0]
+    assert factors[of_runs[0]] < -40

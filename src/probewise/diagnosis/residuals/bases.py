@@ -10,11 +10,11 @@ ends of scans.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -79,20 +79,44 @@ def bank_of_unknown_effects(
 
 
 def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linearised) -> TemplateBank:
-    """Return the bases without those of one column that are nearly collinear with a template of a named effect.
+    """Return the bases without those that a template of a named effect holds, the fit's parameters projected out.
 
-    With the parameters of the fit `problem` projected out, their cosine is 0.9 or more. A window that extends to the
-    end of the recording, for instance, is the effect of a light switched on.
+    A basis of one column that is in or near a template's span, with a cosine of 0.9 or more, is left out: a window that
+    extends to the end of the recording, for instance, is the effect of a light switched on. A basis of several columns
+    that has a template's span, such as an offset for each run, becomes zero: as an unknown effect it explains nothing,
+    and its share of the prior is not given to the others.
     """
-    single = np.flatnonzero(bases.widths == 1)
-    if single.size == 0 or named.widths.size == 0:
+    if bases.widths.size == 0 or named.widths.size == 0:
         return bases
-    alone = bases.take_templates(single).columns
-    own = OrthonormalBlocks.of(problem, list(alone.T[:, :, None])).u
     blocks = OrthonormalBlocks.of(problem, [named[k] for k in range(len(named.widths))])
-    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own) ** 2, blocks.starts, axis=0))
-    like = single[cosines.max(axis=0, initial=0.0) >= _LIKE]
-    return bases.take_templates(np.setdiff1d(np.arange(len(bases.widths)), like))
+    own = OrthonormalBlocks.of(problem, [bases[k] for k in range(len(bases.widths))])
+    single = np.flatnonzero(bases.widths == 1)
+    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own.u[:, own.starts[single]]) ** 2, blocks.starts, axis=0))
+    kept = np.setdiff1d(np.arange(len(bases.widths)), single[cosines.max(axis=0) >= _LIKE])
+    twins = np.repeat(_have_span_of_some(own, blocks), bases.widths)
+    return replace(bases, columns=np.where(twins, 0.0, bases.columns)).take_templates(kept)
+
+
+def _have_span_of_some(blocks: OrthonormalBlocks, others: OrthonormalBlocks) -> BoolArray:
+    """Return which blocks of two or more directions have nearly the span of one of the others, (n_blocks,).
+
+    Spans have as many directions, and the largest angle between them has a cosine of 0.9 or more.
+    """
+    spans, other_spans = (
+        [u[:, np.any(u, axis=0)] for u in np.split(each.u, each.starts[1:], axis=1)] for each in (blocks, others)
+    )
+    by_rank: dict[int, list[FloatArray]] = {}
+    for span in other_spans:
+        by_rank.setdefault(span.shape[1], []).append(span)
+    return np.array(
+        [
+            span.shape[1] > 1
+            and any(
+                np.linalg.svd(other.T @ span, compute_uv=False)[-1] >= _LIKE for other in by_rank.get(span.shape[1], [])
+            )
+            for span in spans
+        ]
+    )
 
 
 def _basis_family_name(covariate: Covariate, template: FloatArray) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -15,6 +16,7 @@ from probewise.effects import UNNAMED, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import Stage
 
+OF_NO_LAW = SimpleNamespace(about=SimpleNamespace(states_with_rates_by_definition=frozenset()))
 EXTENT = Extent(10.0, 60.0, two_way_plan())
 EFFECTS = {**VOCABULARY, **UNNAMED}
 
@@ -40,7 +42,7 @@ def test_half_of_the_unknown_has_a_name_of_our_own():
 
 def test_two_effects_of_a_simulator_are_no_less_likely_than_one_beside_a_fault_of_the_noise():
     """And all that may be missing from the mean sums to one."""
-    odds = SimulatorApparatus.prior_odds(cast(Any, None), {})
+    odds = SimulatorApparatus.prior_odds(cast(Any, OF_NO_LAW), {})
     assert odds.clean_mean + odds.unknown + sum(odds.by_size) == pytest.approx(1.0)
     one_and_noise = odds.by_size[0] * odds.noise_by_size[0]
     assert odds.by_size[1] * odds.white >= one_and_noise
@@ -61,7 +63,7 @@ def test_of_one_wave_two_are_likelier_than_it_beside_another_effect_and_all_sums
 
 def test_every_noise_sums_to_one_beside_an_effect_and_alone():
     """One departure, of the noise or of the law, is likelier than one of each."""
-    odds = replace(SimulatorApparatus.prior_odds(cast(Any, None), {}), n_noises=5)
+    odds = replace(SimulatorApparatus.prior_odds(cast(Any, OF_NO_LAW), {}), n_noises=5)
     for alone in (False, True):
         sets = (names for k in range(4) for names in combinations("abcde", k))
         assert sum(math.exp(odds.log_prior_on_noise(names, alone=alone)) for names in sets) == pytest.approx(1.0)

@@ -26,6 +26,8 @@ class PriorOdds:
     `unknown_explains_most`: an unknown effect is the verdict only if it has more evidence than each named one alone.
     `named_needs_half`: effects on the mean are `named` only with half the probability, whatever noise is beside them.
     `shared_is_named`: effects that nearly all hypotheses share are `named`, whatever is open beside them.
+    `unlikely` are effects in places where hardly anything can be missing: each has `unlikely_weight` times the prior
+    probability of another one.
     `twofold` are the effects that may occur twice; `twice` is the probability that one does, given that it occurs;
     None: that of any second effect.
     """
@@ -48,6 +50,8 @@ class PriorOdds:
     shared_is_named: bool = False
     twice: float | None = None
     twofold: frozenset[str] = frozenset()
+    unlikely: frozenset[str] = frozenset()
+    unlikely_weight: float = 1.0
 
     @classmethod
     def for_effects(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
@@ -72,14 +76,25 @@ class PriorOdds:
             log_p += n_again * math.log(self.twice) + (len(once) - n_again) * math.log1p(-self.twice)
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
-            log_p += math.log(share * self.out_of_vocabulary / (self.n_unnamed - k))
-        return log_p
+            log_p += math.log(share * self.out_of_vocabulary / (self._n_unnamed_as_likely - k))
+        return log_p + len(self.unlikely.intersection(names)) * math.log(self.unlikely_weight)
 
     def _log_prior_per_combination(self, n: int) -> float:
         if not n:
             return math.log(self.clean_mean)
         # A model of chosen effects may have more of them than a diagnosis would combine.
-        return math.log(self.by_size[min(n, len(self.by_size)) - 1] / math.comb(self.n_named, n))
+        n_unlikely = sum(not is_out_of_vocabulary(name) for name in self.unlikely)
+        # The sum over combinations of the product of their effects' weights.
+        combinations = sum(
+            math.comb(self.n_named - n_unlikely, n - k) * math.comb(n_unlikely, k) * self.unlikely_weight**k
+            for k in range(n + 1)
+        )
+        return math.log(self.by_size[min(n, len(self.by_size)) - 1] / combinations)
+
+    @property
+    def _n_unnamed_as_likely(self) -> float:
+        """Number of effects out of vocabulary, each unlikely one counted by its weight."""
+        return self.n_unnamed - (1 - self.unlikely_weight) * sum(map(is_out_of_vocabulary, self.unlikely))
 
     def log_prior_with_unknown(self, names: Names) -> float:
         """Return the log prior of an unknown effect without a formula, together with effects on the mean."""
@@ -97,9 +112,9 @@ class PriorOdds:
         noise
             Names of the certain noise effects, the same for all.
         """
-        each = self.by_size[0] / max(self.n_named, 1)
+        each = math.exp(self._log_prior_per_combination(1)) if self.n_named else self.by_size[0]
         believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}
-        believed |= {(name,): each for name in names}
+        believed |= {(name,): each * (self.unlikely_weight if name in self.unlikely else 1.0) for name in names}
         total = sum(believed.values())
         return {(mean, noise): p / total for mean, p in believed.items()}
 

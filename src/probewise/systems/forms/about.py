@@ -21,6 +21,7 @@ _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in noise sds
 _NUDGE = 1e-3  # of a state's range
+_N_COMPARED = 64  # states and parameters at which a rate is compared with another state
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
 
 
@@ -61,6 +62,39 @@ class ReferenceFit:
             system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step
         )
         return {state: values[0] for state, values in found.items()}
+
+    @cached_property
+    def states_with_rates_by_definition(self) -> frozenset[str]:
+        """States whose rate is another state whatever the parameters and columns, as that of an angle is the speed.
+
+        Rates are compared at parameters drawn from their priors, states anywhere within twice the fit's range and rows.
+        """
+        law, names = self.system.simulator.law, list(self.states)
+        if law is None or len(names) < 2:
+            return frozenset()
+        rng = np.random.default_rng(0)
+        rows = rng.integers(len(self.table), size=_N_COMPARED)
+        z = rng.standard_normal((_N_COMPARED, self.theta.shape[1]))
+        by_row = self.system.parameters(self.system.theta(z), self.table)
+        at = np.arange(_N_COMPARED)
+        p = {name: np.broadcast_to(v, (_N_COMPARED, len(self.table)))[at, rows][:, None] for name, v in by_row.items()}
+        columns = columns_without_reading(self.system.simulator, self.table)
+        u = {name: values[rows][:, None] for name, values in columns.items()}
+        s = {
+            name: (2 * np.abs(values).max() or 1.0) * rng.uniform(-1, 1, (_N_COMPARED, 1))
+            for name, values in self.states.items()
+        }
+        try:
+            with np.errstate(all="ignore"):
+                rates = law.rates(dict(s), dict(p), dict(u))
+        except Exception:  # a user's function may refuse states that no reading asks for
+            return frozenset()
+        return frozenset(
+            state
+            for state in names
+            for other in names
+            if other != state and np.array_equal(np.broadcast_to(rates[state], s[other].shape), s[other])
+        )
 
     def state_drives_rate(self, state: str, other: str) -> bool:
         """Return whether the rate of the state `other` depends on `state` at some row of the table."""

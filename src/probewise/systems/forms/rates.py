@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects import name_without_copy_suffix
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.sensor import Stage
@@ -94,6 +95,21 @@ def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
                     scale=scale,
                     what=f"a term -a {other}",
                 )
+
+
+def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset[str]:
+    """Return those names of effects and formulas in the rate of a state that is another state by definition.
+
+    A bound is none of them: a position may stop, though its rate is the speed.
+    """
+    places = tuple(
+        begin
+        for state in about.states_with_rates_by_definition
+        for begin in (*(f"{kind}:{state}" for kind in WORDS if kind != "limit"), f"formula:rate:{state}")
+    )
+    return frozenset(
+        name for name in names if f"{name_without_copy_suffix(name)}:".startswith(tuple(f"{p}:" for p in places))
+    )
 
 
 def _rate_term_form(

@@ -64,6 +64,11 @@ class Apparatus(Protocol):
         """Words for sentences about the apparatus."""
         ...
 
+    @property
+    def rows_are_in_order(self) -> bool:
+        """Whether the order of rows is that of recording, as far as readings tell."""
+        ...
+
     def effects(self, recording: Recording, null: Null | None) -> Mapping[str, NamedEffect[Any]]:
         """Return the vocabulary scaled to a recording, by name, without effects that could not be detectable there."""
         ...

@@ -40,6 +40,11 @@ class LightSensorApparatus:
         settles_nothing="no reading that this apparatus can take tells them apart",
     )
 
+    @property
+    def rows_are_in_order(self) -> bool:
+        """True: an arm takes readings in order."""
+        return True
+
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Scale effects to a recording, by name: the vocabulary, effects out of it with a formula, and drifting noise.
 

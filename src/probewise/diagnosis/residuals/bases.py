@@ -42,7 +42,7 @@ class _BasisMultipliers:
 
 
 def bank_of_unknown_effects(
-    covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, scan: IntArray
+    covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, scan: IntArray | None
 ) -> TemplateBank:
     """Build the template bank of unknown effects: basis functions over every covariate.
 
@@ -53,14 +53,16 @@ def bank_of_unknown_effects(
     signal, slope
         Predicted reading above its minimum, and its slope along the motion, (n_usable,) each.
     scan
-        Number of each usable row's scan, (n_usable,); rows of scans may be mixed.
+        Number of each usable row's scan, (n_usable,); rows of scans may be mixed. None: rows are in no order, and
+        nothing depends on the rows before.
 
     Returns
     -------
     Bank of bases, (n_usable, n_columns) each, labelled by family; families have equal prior weight.
     """
-    order = np.argsort(scan, kind="stable")  # those of each scan together
-    starts, back = np.flatnonzero(np.diff(scan[order], prepend=-1)), np.argsort(order)
+    numbers = np.zeros(len(signal), dtype=np.int64) if scan is None else scan
+    order = np.argsort(numbers, kind="stable")  # those of each scan together
+    starts, back = np.flatnonzero(np.diff(numbers[order], prepend=-1)), np.argsort(order)
     sign = np.zeros(len(signal))
     for covariate in covariates:
         if covariate.name == "direction":
@@ -72,8 +74,9 @@ def bank_of_unknown_effects(
         for covariate in covariates
         for template in _bases_of_covariate(covariate, ways)
     ]
-    found += [("what was seen before", template[back]) for template in _memory_bases(signal[order], starts)]
-    found += [("ends of scans", template[back]) for template in _scan_end_bases(len(signal), starts)]
+    if scan is not None:
+        found += [("what was seen before", template[back]) for template in _memory_bases(signal[order], starts)]
+        found += [("ends of scans", template[back]) for template in _scan_end_bases(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
     return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 

@@ -209,7 +209,7 @@ def _unknown_bases_and_covariates(
     null, recording = state.null, prepared.recording
     covariates, slope = prepared.apparatus.covariates_and_predicted_slope(null.found, recording)
     level = null.found.predicted
-    scan = recording.plan.scan[recording.usable]
+    scan = recording.plan.scan[recording.usable] if prepared.apparatus.rows_are_in_order else None
     bases = bank_of_unknown_effects(covariates, level - level.min(), slope, scan)
     problem = Linearised.of(null.found, state.refits.likeliest_law(null))
     return bases_unlike_named(bases, state.templates.coarse_bank(null.found, named), problem), tuple(covariates)

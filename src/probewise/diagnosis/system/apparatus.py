@@ -52,6 +52,7 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     Quantisation,
     DriftingNoise,
 )
+_ALONG_ROWS = (CorrelatedNoise, RandomWalk, DriftingNoise)
 CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some 20,000 in a diagnosis
 EVALUATIONS_OF_A_SEARCH = 1_500_000  # of a law's rates, 15 to 20 microseconds each, of however many samples
 _N_BLOCKS = 5
@@ -90,6 +91,11 @@ class SimulatorApparatus:
         return self.about.system
 
     @property
+    def rows_are_in_order(self) -> bool:
+        """Whether the order of the table's rows may be that of recording."""
+        return self.about.rows_are_in_order
+
+    @property
     def words(self) -> Words:
         """Words for sentences about the simulator."""
         own = self.system.simulator
@@ -118,7 +124,8 @@ class SimulatorApparatus:
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""
         extent = Extent.of(recording)
-        on_noise = [effect for kind in ON_NOISE if (effect := kind.for_extent(extent)) is not None]
+        kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
+        on_noise = [effect for kind in kinds if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
         stops = {} if self.stop is None else {self.stop.name: self.stop}
         return forms | {effect.name: effect for effect in on_noise} | stops
@@ -172,6 +179,9 @@ class SimulatorApparatus:
         usable = np.flatnonzero(recording.usable)
         by_row = self.covariate_values_by_name(found.model.predict(found.z[None, :])[0])
         pooled = {name: values[usable] for name, values in by_row.items() if name != "run"}
+        if not self.rows_are_in_order:
+            pooled["previous"] = np.zeros(len(usable))
+            pooled.pop("row", None)
         out = []
         for name, values in pooled.items():
             there = np.flatnonzero(np.isfinite(values))

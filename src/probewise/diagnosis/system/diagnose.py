@@ -27,6 +27,7 @@ from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
+from probewise.systems.row_order import note_on_row_order, rows_are_in_order
 from probewise.systems.table import median_sd_of_column
 
 _MOST_COMPARED = 2400
@@ -106,7 +107,11 @@ def prepare_system(
     with_effects: bool = True,
 ) -> Prepared:
     """Fit the simulator, and build the engine's input; effects are scaled to the fit, none unless `with_effects`."""
-    recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=tuple(notes))
+    recording = replace(
+        recording_from_table(simulator, table),
+        source=source or simulator.source,
+        notes=(*notes, *note_on_row_order(simulator, table)),
+    )
     system = System.of(simulator, table)
     plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)
     if recording.plan is not plan:
@@ -318,5 +323,5 @@ def _noise_sd_of(simulator: Simulator, table: RunTable, recording: Recording, fo
     known = median_sd_of_column(table, declared) if isinstance(declared, str) else declared
     if known is not None:
         return float(known)
-    rough = rough_sd(recording)
+    rough = rough_sd(recording) if rows_are_in_order(simulator, table) else 0.0  # sorted, successive ones are too alike
     return min(found.sd, rough) if rough > 0 else found.sd

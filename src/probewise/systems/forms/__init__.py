@@ -25,9 +25,14 @@ WORDS: Mapping[str, str] = MappingProxyType(readings.WORDS | inputs.WORDS | para
 """A noun phrase for each form, with places for its targets."""
 
 
+_IN_ORDER = frozenset({"offset_step", "gain_step", "steps", "hysteresis", "backlash", "lag", "delay", "input_delay"})
+
+
 def bind_forms(about: ReferenceFit) -> dict[str, Form]:
     """Return every form that could be detectable near this fit, by name; each wave twice, as two may act."""
     named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
+    if not about.rows_are_in_order:
+        named = [form for form in named if form.name.split(":")[0] not in _IN_ORDER]
     found = [*named, *forms_of_extras(about)]
     waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]
     return {form.name: form for form in [*found, *waves]}

@@ -13,6 +13,7 @@ from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.motion import RowsInRuns, integrate_states
+from probewise.systems.row_order import rows_are_in_order
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
@@ -38,6 +39,11 @@ class ReferenceFit:
     z: FloatArray
     sd: float
     misfit: float = field(default=1.0, kw_only=True)
+
+    @cached_property
+    def rows_are_in_order(self) -> bool:
+        """Whether the order of the table's rows may be that of recording."""
+        return rows_are_in_order(self.system.simulator, self.table)
 
     @cached_property
     def theta(self) -> FloatArray:

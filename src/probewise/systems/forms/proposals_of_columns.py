@@ -79,6 +79,8 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
     if values.min() >= 0 or values.max() <= 0:
         each[f"|{name}|"] = np.abs
     in_time = table.has_varying_time
+    if not in_time and not about.rows_are_in_order:
+        return
     summed = f"integral over {table.time}" if in_time else "sum over rows"
     for what, rate in each.items():
 

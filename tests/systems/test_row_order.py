@@ -1,0 +1,66 @@
+"""Rows sorted by the readings themselves are in no order of recording, and nothing is asked that needs one."""
+
+import math
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import diagnose_system
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.systems import Simulator, table_for
+from probewise.systems.forms.proposals import formula_forms
+from probewise.systems.row_order import chance_of_sorted_readings, note_on_row_order
+
+_SPEED = np.repeat(np.arange(4.0, 16.0), 4)
+
+
+def _simulator(**more):
+    return Simulator("way", "m", {"a": (0, 5)}, simulate=lambda p, u: p["a"] * u["speed"], **more)
+
+
+def _sorted_within(speed, seed=0, scatter=3.0):
+    way = 2 * speed + scatter * np.random.default_rng(seed).standard_normal(len(speed))
+    return way[np.lexsort((way, speed))]
+
+
+def _chance(way, speed=_SPEED, **more):
+    simulator = _simulator(**{key: value for key, value in more.items() if key == "time"})
+    columns = {key: value for key, value in more.items() if key != "time"}
+    return chance_of_sorted_readings(simulator, table_for(simulator, {"speed": speed, "way": way, **columns}))
+
+
+def test_the_chance_is_that_of_one_arrangement_of_each_group_or_its_reverse():
+    way = _sorted_within(_SPEED)
+    assert _chance(way) == pytest.approx(2 / math.factorial(4) ** 12)
+    assert _chance(way[::-1], _SPEED[::-1]) == pytest.approx(2 / math.factorial(4) ** 12)
+    tied = np.repeat([[1.0, 1.0, 2.0, 3.0]], 12, axis=0).ravel()
+    assert _chance(tied) == pytest.approx(2 / (math.factorial(4) / 2) ** 12)
+
+
+def test_rows_with_a_time_unsorted_ones_and_a_drift_keep_their_order():
+    way = _sorted_within(_SPEED)
+    assert _chance(way, t=np.arange(48.0), time="t") == 1.0
+    swapped = way.copy()
+    swapped[[5, 6]] = swapped[[6, 5]]
+    assert _chance(swapped) == 1.0
+    assert _chance(np.arange(48.0)) == 1.0
+    assert _chance(way, number=np.arange(48.0)) == 1.0
+
+
+def test_nothing_is_asked_that_needs_an_order():
+    simulator = _simulator()
+    prepared = prepare_system(simulator, table_for(simulator, {"speed": _SPEED, "way": _sorted_within(_SPEED)}))
+    families = {name.split(":")[0] for name in prepared.effects}
+    assert not families & {"offset_step", "steps", "hysteresis", "backlash", "correlated_noise", "random_walk"}
+    assert {"nonlinearity", "sensitivity", "signal_dependent_noise"} <= families
+    assert not any("sum over rows" in form.name for form in formula_forms(prepared.apparatus.about))
+    (note,) = note_on_row_order(simulator, prepared.recording.plan)
+    assert note in prepared.recording.notes
+
+
+@pytest.mark.slow
+def test_a_sorted_table_of_a_right_law_is_clean():
+    """Before, "the change since the row before" was unknown beyond doubt."""
+    simulator = _simulator()
+    table = {"speed": _SPEED, "way": _sorted_within(_SPEED, seed=4)}
+    assert diagnose_system(simulator, table, rng=np.random.default_rng(1)).verdict in ("clean", "noise")

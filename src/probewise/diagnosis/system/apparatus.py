@@ -39,6 +39,7 @@ from probewise.systems import RunTable, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.proposals import formula_forms
 from probewise.systems.forms.rates import names_in_definitions
+from probewise.systems.forms.sorted_rows import names_of_jumps_in_sorted_rows
 from probewise.systems.forms.stop import MeterStop
 from probewise.systems.table import covariate_of_column
 
@@ -65,9 +66,10 @@ _BY_SIZE = (0.318, 0.02, 0.002)
 # noise, is more likely than one of each.
 _NOT_WHITE_ALONE = 0.2
 _TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
-# Of a term in a rate that is another state by definition, such as that of a position. A sensor that reads the two apart
-# or a slip may look like one: so it stays possible, and its handicap is below the three nats that tell aliases apart.
-_IN_A_DEFINITION = 0.1
+# Of a term in a rate that is another state by definition, such as that of a position, and of a jump at a row of a table
+# that an input sorts. A slip may look like the one, a ramp may be recorded in order: so both stay possible, and their
+# handicap is below the three nats that tell aliases apart.
+_UNLIKELY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +164,8 @@ class SimulatorApparatus:
             unknown_explains_most=True,
             named_needs_half=True,
             shared_is_named=True,
-            unlikely=names_in_definitions(self.about, effects),
-            unlikely_weight=_IN_A_DEFINITION,
+            unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects),
+            unlikely_weight=_UNLIKELY,
         )
 
     def null_forms(self, recording: Recording) -> Any:

@@ -26,6 +26,7 @@ from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Sim
 from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.readings import time_since_start_of_run
+from probewise.systems.forms.sorted_rows import sorting_column
 from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
 from probewise.systems.row_order import note_on_row_order, rows_are_in_order
 from probewise.systems.table import median_sd_of_column
@@ -122,6 +123,10 @@ def prepare_system(
     system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop)
+    sorting = sorting_column(apparatus.about)
+    if sorting is not None:
+        note = f"rows are sorted by {sorting}: what jumps or wanders from row to row may change with {sorting} instead"
+        recording = replace(recording, notes=(*recording.notes, note))
     begun = replace(system, first=found.z)
     told("building the effects")
     effects = apparatus.effects(recording, begun) if with_effects else {}

@@ -31,7 +31,6 @@ from probewise.report.covariate_view import ResidualNoise, ranked_places_with_vi
 from probewise.report.diagnosis_figures import encoded_figures, first_figure_content, noun_of_held_out_part
 from probewise.report.effect_words import (
     EFFECTS_IN_WORDS,
-    FORMS_IN_WORDS,
     effect_has_words,
     effect_in_words,
     effects_in_words,
@@ -211,7 +210,7 @@ def _reason_in_words(diagnosis: Diagnosis) -> str:
     """Return the verdict's reason without its sentence on the next plan, hypotheses and effects in words for names."""
     said = diagnosis.reason.partition(TO_SEPARATE)[0]
     for hypothesis in (*diagnosis.hypotheses, *diagnosis.judged.beside_shared):
-        if len(hypothesis.effects) > 1 or ":" in hypothesis.label or hypothesis.label in FORMS_IN_WORDS:
+        if hypothesis.effects and all(map(effect_has_words, hypothesis.effects)):
             said = _with_words_for(said, hypothesis.label, hypothesis_in_words(hypothesis.effects), before=r" \(")
     for name in {name for hypothesis in diagnosis.hypotheses for name in hypothesis.effects if ":" in name}:
         said = _with_words_for(said, name_without_copy_suffix(name), effect_in_words(name), before="")

@@ -155,6 +155,11 @@ def test_what_is_missing_after_the_repair_is_said():
     assert headline(found("named", ("lag",), after=1e-5)).endswith("Something more is missing.")
 
 
+def test_the_largest_effect_is_named_rather_than_that_more_is_missing():
+    said = headline(found("named", ("cubic:velocity:angle", "lag", "outliers"), after=1e-5))
+    assert said == "The model leaves out 3 effects, the largest of them a cubic term of angle in the rate of velocity."
+
+
 def test_equal_readings_are_no_signal():
     diagnosis = found("cannot_tell", few=True)
     diagnosis.recording.readings[:] = 7.0

@@ -44,7 +44,8 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
             more = ["Something more is missing."] if diagnosis.improvement.p_value_after < ALARM else []
             said = _left_out_versions(diagnosis, "The model leaves out")
             beside = [f"{one[:-1]}; besides, {either}" for one in said[:1] for either in _open_beside_shared(diagnosis)]
-            return beside + [" ".join([one, *more]) for one in said] + said
+            complete = [" ".join([one, *more]) for one in said]
+            return [*beside, *complete[:-1], *said[:-1], complete[-1], said[-1]]  # a name before that more is missing
 
 
 def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:

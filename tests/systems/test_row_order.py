@@ -45,6 +45,8 @@ def test_rows_with_a_time_unsorted_ones_and_a_drift_keep_their_order():
     assert _chance(swapped) == 1.0
     assert _chance(np.arange(48.0)) == 1.0
     assert _chance(way, number=np.arange(48.0)) == 1.0
+    apart = np.tile(np.arange(4.0, 16.0), 4)  # equal rows whose readings rise as a jump or a drift makes them
+    assert _chance(2 * apart + np.repeat(np.arange(4.0), 12), apart) == 1.0
 
 
 def test_nothing_is_asked_that_needs_an_order():

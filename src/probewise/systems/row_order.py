@@ -16,7 +16,7 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
 
     Rows are equal where all columns but the reading and its sd are. Readings must rise in all groups of equal rows, or
     fall in all: by chance once in the product of the numbers of their arrangements. It is 1 where a time was recorded,
-    and for readings that rise or fall along the whole table, as those of a drift do.
+    where equal rows are apart, and for readings that rise or fall along the whole table, as those of a drift do.
     """
     own, readings = simulator, table.columns.get(simulator.reading)
     if table.has_varying_time or readings is None or readings.dtype != np.float64:
@@ -25,6 +25,10 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
     codes = [np.unique(values, return_inverse=True)[1] for values in inputs]
     group = np.unique(np.stack([*codes, np.zeros(len(table), dtype=np.int64)]), axis=1, return_inverse=True)[1].ravel()
     there = np.flatnonzero(np.isfinite(readings))
+    if (
+        np.count_nonzero(np.diff(group[there])) >= np.unique(group[there]).size
+    ):  # equal rows apart: by a jump or a drift
+        return 1.0
     log_chance, changes = np.log(2.0), [np.zeros(0)]
     for k in np.unique(group[there]):
         values = readings[there[group[there] == k]]

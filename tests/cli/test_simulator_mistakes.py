@@ -128,7 +128,7 @@ def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():
     prepared = prepare_system(
         simulator, _table(np.where(x == 3, np.nan, x), 2 * x + 0.1 * np.sin(9 * x)), with_effects=False
     )
-    assert prepared.recording.notes == ("1 readings left out: a column that the simulator reads is missing there",)
+    assert "1 readings left out: a column that the simulator reads is missing there" in prepared.recording.notes
     assert 3 not in prepared.usable_rows
 
 

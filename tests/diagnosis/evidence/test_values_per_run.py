@@ -90,7 +90,7 @@ def test_a_run_held_out_is_expected_to_differ_as_much_as_the_others():
     readings = _readings(rng.standard_normal(N_RUNS), 8)
     recording, null, (shared, own) = _fitted(readings)
     law, parts = white_noise_of_recording(recording), (_RUN, tuple(map(str, range(N_RUNS))))
-    found, apart = (held_out_gain(null, each, recording, law, parts) for each in (shared, own))
+    found, apart = (held_out_gain(null, each, recording, law, parts, law_of_null=law) for each in (shared, own))
     means = np.array([readings[k == _RUN].mean() for k in range(N_RUNS)])
     exact = []
     for name, _ in found.by_scan:

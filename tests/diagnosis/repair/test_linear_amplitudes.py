@@ -24,7 +24,8 @@ def drawn(gains, seed):
     table = RunTable({"run": RUN, "drive": DRIVE, "y": y}, run="run")
     simulator = Simulator("y", "V", {"zero": (-1, 1)}, simulate=lambda p, u: p["zero"] + 2.0 * u["drive"], run="run")
     prepared = prepare_system(simulator, table)
-    model = Model(prepared.null, (prepared.effects["gain_per_run"],), prepared.recording.plan)
+    (each_its_own,) = prepared.effects["gain_per_run"].alternatives
+    model = Model(prepared.null, (each_its_own,), prepared.recording.plan)
     found = fit(model, prepared.recording, np.zeros(model.n_params), white_noise(N))
     evidence = laplace_evidence(found, NoiseModel((), prepared.recording, least_sd=1e-3))
     weights = {"gain_per_run": np.ones(1)}

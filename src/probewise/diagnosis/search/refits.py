@@ -25,6 +25,7 @@ from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.twins import TwinSwap, are_proportional
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
+from probewise.effects.shared_scale_prior import SharedScalePrior
 
 Extended: TypeAlias = tuple[WeighedFit, dict[Names, float]]
 """A candidate with one more effect, and the closed-form scores of the effect by noise model."""
@@ -191,7 +192,7 @@ class Refits:
         refitted = [self._refit_variant(parent, effect, templates, k, seen) for k in tried]
         # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
-        best = int(np.argmax(log_z))
+        best = _variant_to_show(log_z, [templates.variants[k] for k in tried])
         if np.isfinite(log_z[best]):  # otherwise no variant could be fitted, and weights are unchanged
             weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
             weights[tried] = np.exp(log_z - log_z[best])
@@ -292,6 +293,19 @@ def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
         return float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0])
 
     return 2 * (minus_log_likelihood(beyond) - minus_log_likelihood(found)) > 3.0
+
+
+def _variant_to_show(log_z: FloatArray, variants: Sequence[NamedEffect[Any]]) -> int:
+    """Return the index of the refitted variant that stands for all of them: the best, or one with a scale in common.
+
+    Values per run that are each of their own size are pulled to zero where readings leave their sum open, so that few
+    differ. If values of one size explain about as much, these stand for both: their intervals leave it open too.
+    """
+    best = int(np.argmax(log_z))
+    for k, variant in enumerate(variants):
+        if isinstance(variant.prior, SharedScalePrior) and log_z[k] > log_z[best] - ALIASED_NATS:
+            return k
+    return best
 
 
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:

@@ -38,6 +38,16 @@ class SharedScalePrior:
     names: tuple[str, ...]
     each: HeavyTailedPrior
 
+    @property
+    def typical(self) -> float:
+        """Typical size of a value."""
+        return self.each.typical
+
+    @cached_property
+    def component_sds(self) -> FloatArray:
+        """Sds of the normal distributions of equal weight that it mixes, (n_components,)."""
+        return self.typical * _sds(len(self.names), self.each.smallest, self.each.largest)
+
     @cached_property
     def _radii(self) -> _Radii:
         return _tabulated_radii(len(self.names), self.each.smallest, self.each.largest)
@@ -46,18 +56,18 @@ class SharedScalePrior:
         """Map the unit cube to values, (n_samples, n_values) -> same shape."""
         z = ndtri(np.clip(checked_columns(u, self.names), _FARTHEST_SD, 1 - _FARTHEST_SD))
         length = np.linalg.norm(z, axis=1, keepdims=True)
-        return np.asarray(self.each.typical * z * self._radii.ratio(length))
+        return np.asarray(self.typical * z * self._radii.ratio(length))
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map values to the unit cube, (n_samples, n_values) -> same shape."""
-        values = checked_columns(theta, self.names) / self.each.typical
+        values = checked_columns(theta, self.names) / self.typical
         size = np.linalg.norm(values, axis=1, keepdims=True)
         return np.asarray(ndtr(values / self._radii.ratio_at_size(size)))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the log density of values, (n_samples, n_values) -> (n_samples,)."""
         values = checked_columns(theta, self.names)
-        n, sds = len(self.names), self.each.typical * _sds(len(self.names), self.each.smallest, self.each.largest)
+        n, sds = len(self.names), self.component_sds
         squares = np.sum(values**2, axis=1)[:, None]
         terms = -0.5 * squares / sds**2 - n * np.log(sds)
         return np.asarray(logsumexp(terms, axis=1) - math.log(len(sds)) - 0.5 * n * math.log(2 * math.pi))

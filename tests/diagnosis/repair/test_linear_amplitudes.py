@@ -1,5 +1,7 @@
 """Values of amplitudes about 0, where the coordinate of a heavy-tailed prior is far from linear in them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,10 +55,39 @@ def test_a_value_that_readings_fix_about_zero_is_as_certain_as_the_others():
 
 def test_amplitudes_that_are_well_known_are_left_to_their_coordinates():
     found, _, _ = drawn([0.6, -0.5, 0.4, 0.7, -0.45, 0.5], seed=2)
-    assert LinearAmplitudes.of(found, np.full(len(found.z), 0.1)) is None
-    some = LinearAmplitudes.of(found, np.where(np.arange(len(found.z)) == 4, 0.5, 0.1))
-    assert some.at == (4,)
-    step = 1e-6
-    there = found.model.theta(np.stack([found.z, found.z + step * (np.arange(len(found.z)) == 4)]))[:, 4]
-    assert some.values[0] == pytest.approx(there[0])
-    assert some.per_z[0] == pytest.approx((there[1] - there[0]) / step, rel=1e-4)
+    slopes, residuals = found.slopes / found.sd, found.residuals / found.sd
+    assert LinearAmplitudes.of(found, 1000 * slopes, residuals) is None
+
+
+@pytest.mark.parametrize("annealed", [True, False])
+def test_values_of_one_size_leave_open_what_they_have_in_common(annealed):
+    """By numbers: a mean with a wide prior and values of one sd; given the sd, all are jointly normal."""
+    rng = np.random.default_rng(4)
+    y = np.array([0.4, -0.5, 0.05, 0.1, -0.3, 0.6])[RUN.astype(int)] + SD * rng.normal(size=N)
+    table = RunTable({"run": RUN, "drive": DRIVE, "y": y}, run="run")
+    simulator = Simulator("y", "V", {"mean": (-50, 50)}, simulate=lambda p, u: p["mean"] + 0 * u["drive"], run="run")
+    prepared = prepare_system(simulator, table)
+    effect = replace(prepared.effects["offset_per_run"], alternatives=())
+    model = Model(prepared.null, (effect,), prepared.recording.plan)
+    found = fit(model, prepared.recording, np.zeros(model.n_params), white_noise(N))
+    evidence = laplace_evidence(found, NoiseModel((), prepared.recording, least_sd=1e-3))
+    samples = sample_model(
+        found, evidence, prepared.recording, weights={"offset_per_run": np.ones(1)}, rng=rng, annealed=annealed
+    ).effect_samples("offset_per_run")
+    design = np.concatenate([np.ones((N, 1)), RUN[:, None] == np.arange(6)], axis=1) / found.sd
+    each = []
+    for sd in effect.prior.component_sds:
+        precision = np.diag([0.0] + [sd**-2] * 6)  # the mean's prior is flat
+        covariance = np.linalg.inv(design.T @ design + precision)
+        mean = covariance @ design.T @ y / found.sd
+        log_weight = 0.5 * np.linalg.slogdet(covariance)[1] - 6 * np.log(sd)
+        log_weight += 0.5 * mean @ np.linalg.solve(covariance, mean)
+        each.append((log_weight, mean[1:], covariance[1:, 1:]))
+    weights = np.exp([w for w, _, _ in each] - max(w for w, _, _ in each))
+    weights /= weights.sum()
+    mean = sum(w * m for w, (_, m, _) in zip(weights, each, strict=True))
+    spread = sum(w * (c + np.outer(m - mean, m - mean)) for w, (_, m, c) in zip(weights, each, strict=True))
+    np.testing.assert_allclose(samples.mean(axis=0), mean, atol=0.2 * np.sqrt(spread[0, 0]))
+    common = np.sqrt(spread.mean())
+    assert common > 4 * SD / np.sqrt(N)  # far more than the readings would leave open without the values
+    assert samples.mean(axis=1).std() == pytest.approx(common, rel=0.2)

@@ -1,13 +1,15 @@
 """Draws from the linearised posterior of a fit, in which amplitudes are linear in their value.
 
 Readings are linear in an amplitude, but the coordinate of an amplitude with a heavy-tailed prior is a steep function of
-its value about 0: a normal distribution of the coordinate there becomes one of values that is far too wide. The prior
-is a mixture of normal distributions. Given the component of each amplitude, the values are jointly normal; given the
-values, the components are independent. They are drawn in turn (Gibbs sampling).
+its value about 0: a normal distribution of the coordinate there becomes one of values that is far too wide. Values with
+one scale in common lie on arcs in their coordinates. Both priors are mixtures of normal distributions. Given the
+components, the values are jointly normal; given the values, the components are independent. They are drawn in turn
+(Gibbs sampling).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -15,48 +17,74 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray
+from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.effects import HeavyTailedPrior, NamedEffect
+from probewise.effects.shared_scale_prior import SharedScalePrior
 from probewise.sensor.stages import effects_with_columns
 
 _STRAIGHT = 0.2  # sd of a coordinate within which its value is as good as linear in it
 _SWEEPS = 10
+_STEP = 1e-6
 _ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly may fail to be positive
 
 
 @dataclass(frozen=True, eq=False)
-class LinearAmplitudes:
-    """Amplitudes of a fit whose posterior is wide in their coordinate.
+class _Group:
+    """Amplitudes with one component of the mixture in common: one alone, or values with one scale.
 
-    `at` (n,): numbers of their coordinates; `priors`: their heavy-tailed priors; `values` (n,): the fit's; `per_z`
-    (n,): derivatives of their values by their coordinates there.
+    `at` (n,): numbers of their coordinates; `prior`: theirs; `typical`: the unit of their values here.
     """
 
     at: tuple[int, ...]
-    priors: tuple[HeavyTailedPrior, ...]
-    values: FloatArray
-    per_z: FloatArray
+    prior: HeavyTailedPrior | SharedScalePrior
+
+    @property
+    def typical(self) -> float:
+        return self.prior.typical
+
+    @property
+    def sds(self) -> FloatArray:
+        """Sds of the components, (n_components,), in typical sizes."""
+        return self.prior.component_sds / self.typical
+
+    def values(self, z: FloatArray) -> FloatArray:
+        """Return the values, in typical sizes, from coordinates, (n_samples, n) both."""
+        if isinstance(self.prior, SharedScalePrior):
+            return self.prior.from_unit_cube(ndtr(z)) / self.typical
+        return self.prior.from_unit(ndtr(z)) / self.typical
+
+    def coordinates(self, values: FloatArray) -> FloatArray:
+        """Return the coordinates of values in typical sizes, (n_samples, n) both."""
+        if isinstance(self.prior, SharedScalePrior):
+            unit = self.prior.to_unit_cube(values * self.typical)
+        else:
+            unit = self.prior.to_unit(values * self.typical)
+        return np.asarray(np.clip(ndtri(unit), -FARTHEST, FARTHEST))
+
+    def values_by_coordinates(self, z: FloatArray) -> FloatArray:
+        """Return the derivatives of the values by the coordinates at z (n,), (n, n)."""
+        steps = _STEP * np.eye(len(z))
+        return np.asarray((self.values(z + steps) - self.values(z - steps)).T / (2 * _STEP))
+
+
+@dataclass(frozen=True, eq=False)
+class LinearAmplitudes:
+    """The linearised posterior of a fit of whose amplitudes some are wide in their coordinate.
+
+    The unknowns x (n_params,) are the values of these amplitudes, in typical sizes, and the coordinates of all else.
+    `x`: those of the fit; `curvature` (n_params, n_params) and `downhill` (n_params,) are those of minus the log
+    likelihood by x, the latter at x = 0.
+    """
+
+    groups: tuple[_Group, ...]
+    x: FloatArray
+    curvature: FloatArray
+    downhill: FloatArray
 
     @classmethod
-    def of(cls, found: Fit, coordinate_sd: FloatArray) -> Self | None:
-        """Find those of a fit, whose coordinates have these posterior sds (n_params,); None if there is none."""
-        priors: dict[int, HeavyTailedPrior] = {}
-        for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
-            for k, prior in _two_sided_amplitude_priors(effect).items():
-                if coordinate_sd[columns.start + k] > _STRAIGHT:
-                    priors[columns.start + k] = prior
-        if not priors:
-            return None
-        z = found.z[list(priors)]
-        values = np.array([prior.from_unit(ndtr(one)) for prior, one in zip(priors.values(), z, strict=True)])
-        log_density = np.array([prior.log_prob(one) for prior, one in zip(priors.values(), values, strict=True)])
-        per_z = np.exp(-0.5 * z**2 - log_density) / np.sqrt(2 * np.pi)
-        return cls(tuple(priors), tuple(priors.values()), values, per_z)
-
-    def draw(
-        self, found: Fit, slopes: FloatArray, residual: FloatArray, n_samples: int, *, rng: np.random.Generator
-    ) -> FloatArray:
-        """Draw coordinates, (n_samples, n_params), from the posterior of the linearised problem.
+    def of(cls, found: Fit, slopes: FloatArray, residual: FloatArray) -> Self | None:
+        """Find the amplitudes of a fit that are wide in their coordinate; None if there is none.
 
         Parameters
         ----------
@@ -64,33 +92,55 @@ class LinearAmplitudes:
             The fit.
         slopes, residual
             Whitened slopes (n_points, n_params) and residuals (n_points,), in noise sds.
-        n_samples
-            Number of draws, each the end of a chain of its own.
-        rng
-            Source of randomness.
         """
-        at, typical = list(self.at), np.array([prior.typical for prior in self.priors])
-        # The unknowns are the values of the amplitudes, in typical sizes, and the coordinates of all else.
+        z_sd = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes + np.eye(len(found.z)))))
+        groups = tuple(group for group in _groups_of_amplitudes(found) if np.any(z_sd[list(group.at)] > _STRAIGHT))
+        if not groups:
+            return None
         x, by_x = found.z.copy(), slopes.copy()
-        x[at] = self.values / typical
-        by_x[:, at] *= typical / self.per_z
-        curvature, downhill = by_x.T @ by_x, by_x.T @ (residual + by_x @ x)
-        sds = np.stack([prior.component_sds / prior.typical for prior in self.priors])  # (n_amplitudes, n_components)
-        drawn, precision = np.tile(x, (n_samples, 1)), np.ones((n_samples, len(x)))
-        own = np.arange(len(x))
+        for group in groups:
+            at = list(group.at)
+            x[at] = group.values(found.z[None, at])[0]
+            by_x[:, at] = np.linalg.solve(group.values_by_coordinates(found.z[at]).T, slopes[:, at].T).T
+        return cls(groups, x, by_x.T @ by_x, by_x.T @ (residual + by_x @ x))
+
+    def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw coordinates, (n_samples, n_params), each the end of a chain of its own."""
+        drawn, precision = np.tile(self.x, (n_samples, 1)), np.ones((n_samples, len(self.x)))
+        own = np.arange(len(self.x))
         for _ in range(_SWEEPS):
-            log_weight = -0.5 * (drawn[:, at, None] / sds) ** 2 - np.log(sds)
-            component = np.argmax(log_weight + rng.gumbel(size=log_weight.shape), axis=2)
-            precision[:, at] = sds[np.arange(len(at)), component] ** -2
-            every = np.repeat(curvature[None], n_samples, axis=0)
-            every[:, own, own] += precision + _ROUNDING * np.diag(curvature)
+            for group in self.groups:
+                at, sds = list(group.at), group.sds
+                squares = np.sum(drawn[:, at] ** 2, axis=1)
+                log_weight = -0.5 * squares[:, None] / sds**2 - len(at) * np.log(sds)
+                component = np.argmax(log_weight + rng.gumbel(size=log_weight.shape), axis=1)
+                precision[:, at] = sds[component, None] ** -2
+            every = np.repeat(self.curvature[None], n_samples, axis=0)
+            every[:, own, own] += precision + _ROUNDING * np.diag(self.curvature)
             # Of the mean plus a draw of covariance 1 / every: one solution with a right side of covariance `every`.
             root = np.linalg.cholesky(every)
             noise = np.einsum("nij,nj->ni", root, rng.standard_normal(drawn.shape))
-            drawn = np.linalg.solve(every, (downhill + noise)[:, :, None])[:, :, 0]
-        for k, prior in zip(at, self.priors, strict=True):
-            drawn[:, k] = ndtri(prior.to_unit(drawn[:, k] * prior.typical))
+            drawn = np.linalg.solve(every, (self.downhill + noise)[:, :, None])[:, :, 0]
+        for group in self.groups:
+            drawn[:, list(group.at)] = group.coordinates(drawn[:, list(group.at)])
         return drawn
+
+    def log_density(self, z: FloatArray) -> FloatArray:
+        """Return the log density of coordinates, unnormalised, (n_samples, n_params) -> (n_samples,)."""
+        x = z.copy()
+        for group in self.groups:
+            x[:, list(group.at)] = group.values(z[:, list(group.at)])
+        likelihood = x @ self.downhill - 0.5 * np.einsum("ni,ij,nj->n", x, self.curvature, x)
+        return np.asarray(likelihood - 0.5 * np.sum(z**2, axis=1))
+
+
+def _groups_of_amplitudes(found: Fit) -> Iterator[_Group]:
+    """List the amplitudes of a fit's effects that may have either sign, values with one scale together."""
+    for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
+        if isinstance(effect.prior, SharedScalePrior):
+            yield _Group(tuple(range(columns.start, columns.stop)), effect.prior)
+        for k, prior in _two_sided_amplitude_priors(effect).items():
+            yield _Group((columns.start + k,), prior)
 
 
 def _two_sided_amplitude_priors(effect: NamedEffect[Any]) -> dict[int, HeavyTailedPrior]:

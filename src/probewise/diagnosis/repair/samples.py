@@ -129,8 +129,8 @@ def sample_model(
 
     Samples of the Laplace approximation are moved to the posterior in two stages, the first through a quadratic
     surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse.
-    Where many samples cost little more than one, and an effect has a nonlinear coordinate, they are drawn from a
-    `ProfiledDensity` by importance instead.
+    Where many samples cost little more than one, they are drawn by importance instead: from a `ProfiledDensity` if an
+    effect has a nonlinear coordinate, or else from `LinearAmplitudes`.
 
     Parameters
     ----------
@@ -218,10 +218,11 @@ def _posterior_draws(
     center = np.clip(center, -FARTHEST, FARTHEST)
     if not np.isfinite(model.predict(center[None, :])[0, recording.usable]).all():
         center = found.z  # the step left the domain of the formula
-    if not annealed:
-        linear = LinearAmplitudes.of(found, np.sqrt(np.diag(np.linalg.inv(curvature))))
-        if linear is not None:
-            return linear.draw(found, turned / sd, normal / sd, N_SAMPLES, rng=rng)
+    linear = None
+    if not annealed or model.sensor.predicts_in_bulk:
+        linear = LinearAmplitudes.of(found, turned / sd, normal / sd)
+    if not annealed and linear is not None:
+        return linear.draw(N_SAMPLES, rng=rng)
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)
@@ -234,6 +235,11 @@ def _posterior_draws(
     profiled = ProfiledDensity.of(found, law, recording) if model.sensor.predicts_in_bulk else None
     if profiled is not None:
         weighed = profiled.importance_resample(log_posterior, n_first=_N_PROFILED, n_wanted=N_SAMPLES, rng=rng)
+        if weighed is not None:
+            return weighed
+    if linear is not None:
+        first = linear.draw(_N_PROFILED, rng=rng)
+        weighed = importance_resample(first, linear.log_density, log_posterior, n_wanted=N_SAMPLES, rng=rng)
         if weighed is not None:
             return weighed
     quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)

@@ -145,6 +145,7 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
     if (
         verdict == "unknown"
         and searched.prior.unknown_explains_most
+        and credible_labels(hypotheses) != ("unknown",)  # otherwise nothing named is left to lead instead
         and searched.evidences.one_name_outweighs_unnamed()
     ):
         # It leads by what was believed before alone. For a light sensor it stays the verdict: of 431 in 5,988 concealed

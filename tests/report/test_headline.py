@@ -50,6 +50,7 @@ def found(
             withdrawn=withdrawn,
             shared=shared,
             leader=leader,
+            stated=shared if leader else tuple(combination),
             beside_shared=tuple(Hypothesis(tuple(names), p) for names, p in open_beside),
         ),
     )

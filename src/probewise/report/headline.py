@@ -57,7 +57,7 @@ def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:
 
 def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
     sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
-    names = effects_in_words(sorted(diagnosis.combination, key=lambda k: -sizes.get(k, 0.0)))
+    names = effects_in_words(sorted(diagnosis.judged.stated, key=lambda k: -sizes.get(k, 0.0)))
     if len(names) == 1:
         return [f"{opening} {names[0]}.", f"{opening} one effect."]
     return [

@@ -10,6 +10,7 @@ from probewise.diagnosis.judgement.judged import (
     verdict_and_combination,
     with_shared_effects,
 )
+from probewise.diagnosis.judgement.shared_effects import shared_effects
 
 NOISE = frozenset({"outliers"})
 
@@ -94,11 +95,19 @@ def test_an_effect_that_nearly_all_hypotheses_share_is_named_whatever_is_open_be
     assert doubtful[0] == "cannot_tell"
 
 
+def test_a_likely_partner_of_a_shared_effect_is_in_the_combination_but_not_stated():
+    probabilities = {("delay", "drag"): 0.67, ("cubic", "delay"): 0.25, ("delay",): 0.08}
+    hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
+    judged = with_shared_effects(Judged("cannot_tell", ("delay", "drag"), 1e-6, hypotheses), NOISE)
+    assert (judged.verdict, judged.combination, judged.stated) == ("named", ("delay", "drag"), ("delay",))
+
+
 def test_an_effect_with_a_credible_alias_is_not_shared():
     """Half of the probability is not enough: of 0.52 and 0.48, the prior alone decides."""
     assert by_what_is_shared("cannot_tell", ("lag",), {("lag",): 0.52, ("drift",): 0.48})[0] == "cannot_tell"
     joint = {("drift", "lag"): 0.8, ("lag",): 0.1, ("drift",): 0.1}  # each is in nine tenths, both in eight
-    assert by_what_is_shared("cannot_tell", ("drift", "lag"), joint)[1] in (("drift",), ("lag",))
+    assert by_what_is_shared("cannot_tell", ("drift", "lag"), joint)[1] == ("drift", "lag")
+    assert len(shared_effects(joint)) == 1
 
 
 def test_a_shared_fault_of_the_noise_names_no_physics():

@@ -43,7 +43,7 @@ class Judged:
         "clean", "named", "noise" (named, but all effects are on the noise), "unknown" or "cannot_tell".
     combination
         Most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown. Of a simulator,
-        the `shared` effects if only these can be named.
+        if only the `shared` effects can be named, these and others of the `leader` with more than half the probability.
     p_value
         p-value of the global test of the mean, under the noise model found.
     hypotheses
@@ -86,6 +86,11 @@ class Judged:
     def repaired_by(self) -> Names:
         """The set of effects by which the model is repaired: the `combination`, or the larger set that leads."""
         return self.leader or self.combination
+
+    @property
+    def stated(self) -> Names:
+        """The effects that the verdict states without reserve: the `combination`, or of that the `shared` effects."""
+        return self.shared if self.leader else self.combination
 
     @property
     def beside_shared(self) -> tuple[Hypothesis, ...]:
@@ -175,7 +180,8 @@ def with_shared_effects(
     - `noise` needs half of the probability for nothing on the mean. With less the verdict is `cannot_tell`, with the
       most probable combination that has an effect on the mean, by classes of aliases.
     - Instead of `cannot_tell` the shared effects are `named` if one of them is on the mean: they act whatever is left
-      open beside them. As for any other name, the p-value must be .01 or less.
+      open beside them. As for any other name, the p-value must be .01 or less. Beside them the combination has those
+      effects of the leading set that have more than half of the probability: the best answer, though not certain.
 
     Parameters
     ----------
@@ -194,7 +200,8 @@ def with_shared_effects(
     if judged.verdict != "cannot_tell" or not physics or (judged.p_value > ALARM and not physics <= certain):
         return judged
     leader = max((names for names in probability if {*shared} <= {*names}), key=lambda names: probability[names])
-    return replace(judged, verdict="named", combination=shared, leader=leader)
+    likely = [name for name in leader if sum(p for names, p in probability.items() if name in names) > 0.5]
+    return replace(judged, verdict="named", combination=tuple(sorted({*shared, *likely})), leader=leader)
 
 
 def _leader_on_mean(

@@ -146,9 +146,7 @@ def _noise_sentence(judged: Judged, grounds: Grounds) -> str:
 
 def _named_sentence(judged: Judged, grounds: Grounds) -> str:
     after = grounds.p_value_after
-    named = (
-        f"{_joined_effect_sentences(judged.combination, grounds, *grounds.nuisances)} ({p_in_words(judged.p_value)})."
-    )
+    named = f"{_joined_effect_sentences(judged.stated, grounds, *grounds.nuisances)} ({p_in_words(judged.p_value)})."
     beside = f" {_open_beside_shared(judged, grounds)}." if len(judged.beside_shared) > 1 and judged.leader else ""
     more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
     return f"{named}{beside}{more}"

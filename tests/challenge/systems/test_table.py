@@ -173,6 +173,14 @@ def test_intervals_are_counted_one_by_one():
     assert _row([case], "95 % intervals of effect parameters cover").found.value == 0.5
 
 
+def test_intervals_of_values_per_run_have_a_row_of_their_own():
+    """One effect has one for each run: they would outnumber all others."""
+    case = _single(parameters={"offset_per_run": {"values[1]": [1.0, 0.9, 1.1], "values[2]": [1.0, 1.05, 1.1]}})
+    drift = _single(parameters={"offset_drift": {"a": [1.0, 0.9, 1.1]}})
+    assert _row([case, drift], "of values per run").found.value == 0.5
+    assert _row([case, drift], "95 % intervals of effect parameters cover").found.value == 1.0
+
+
 def test_a_case_that_failed_counts_in_the_last_row_alone():
     failed = {"kind": "single", "size": 12.0, "other_noise": False, "failed": "ParameterError: no", "at": "diagnosis"}
     assert _row([_single(), failed], "cases that failed").found.value == 0.5

@@ -110,11 +110,17 @@ def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
         **(said := statements_to_score(diagnosis)),
         "alternative_nats": nats_of_alternatives(case, said),
         "where": [place.covariate for place in diagnosis.where],
-        "parameters": {e.name: effect_truths_and_intervals(e.parameters, found[e.name]) for e in named},
+        "parameters": {e.name: effect_truths_and_intervals(_truths(e, case), found[e.name]) for e in named},
         "formula": _has_formula(diagnosis),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, rng=later),
         "cpu_s": cpu_s,
     }
+
+
+def _truths(effect: SystemEffect, case: SystemCase) -> dict[str, Any]:
+    """Return the parameters of an effect, values per run by the names of the runs, as in a diagnosis."""
+    values: list[float] = effect.parameters.get("values", [])
+    return {**effect.parameters, **{f"values[{run}]": v for run, v in zip(case.labels, values, strict=False)}}
 
 
 def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any]) -> dict[str, float]:

@@ -130,8 +130,12 @@ def _is_confidently_wrong(result: Result) -> bool:
 
 
 def _rows_on_intervals(done: list[Result]) -> list[ScoreRow]:
-    stated = [interval for r in done for own in r["parameters"].values() for interval in own.values()]
-    return [ScoreRow("95 % intervals of effect parameters cover", share_of_intervals_with_truth(stated), 0.92, 0.98)]
+    stated = [item for r in done for own in r["parameters"].values() for item in own.items()]
+    others, per_run = ([i for name, i in stated if name.startswith("values[") is of_runs] for of_runs in (False, True))
+    return [
+        ScoreRow("95 % intervals of effect parameters cover", share_of_intervals_with_truth(others), 0.92, 0.98),
+        *([ScoreRow("  of values per run", share_of_intervals_with_truth(per_run))] if per_run else []),
+    ]
 
 
 def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | None:

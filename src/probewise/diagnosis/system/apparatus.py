@@ -55,7 +55,10 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
 )
 _ALONG_ROWS = (CorrelatedNoise, RandomWalk, DriftingNoise)
 CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some 20,000 in a diagnosis
-EVALUATIONS_OF_A_SEARCH = 1_500_000  # of a law's rates, 15 to 20 microseconds each, of however many samples
+# Of a law's rates, 15 to 20 microseconds each, of however many samples: about the same number of predictions of a long
+# table as of a short one.
+_EVALUATIONS_PER_ROW = 6_000
+_LEAST_EVALUATIONS = 1_500_000
 _N_BLOCKS = 5
 
 # Prior odds of one, two, three effects on the mean. A few lines of physics leave out two things more often than a
@@ -140,11 +143,16 @@ class SimulatorApparatus:
         """Return the names of the effects that the user's simulator file adds."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
+    @property
+    def evaluations_of_a_search(self) -> int:
+        """Limit on the evaluations of a law's rates, of all samples and runs at once, in a search."""
+        return max(_EVALUATIONS_PER_ROW * len(self.about.table), _LEAST_EVALUATIONS)
+
     def refit_budget_share_spent(self) -> float:
         """Return the spent share of the budget of calls or evaluations of a law; 0 if `simulate` takes arrays."""
         caller = self.system.caller
         if caller is None:
-            return self.system.tally.n_evaluations / EVALUATIONS_OF_A_SEARCH
+            return self.system.tally.n_evaluations / self.evaluations_of_a_search
         return 0.0 if caller.broadcasts else caller.n_calls / CALLS_OF_A_SEARCH
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:

@@ -16,7 +16,7 @@ from probewise.diagnosis.noise.law import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, EVALUATIONS_OF_A_SEARCH, SimulatorApparatus
+from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.system.finer_step import STANDS_STILL, finer_step_for_repair, searched_at_step
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
@@ -207,7 +207,7 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         return ()
     caller, tally = apparatus.system.caller, apparatus.system.tally
     if caller is None:
-        return tuple(_notes_on_integration(tally))
+        return tuple(_notes_on_integration(tally, apparatus.evaluations_of_a_search))
     out = []
     if caller.cut_short:
         out.append(
@@ -222,10 +222,10 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _notes_on_integration(tally: IntegrationTally) -> Iterator[str]:
+def _notes_on_integration(tally: IntegrationTally, most: int) -> Iterator[str]:
     if tally.cut_short:
         yield (
-            f"integrating the law takes long: in {EVALUATIONS_OF_A_SEARCH:,} evaluations of its rates not every "
+            f"integrating the law takes long: in {most:,} evaluations of its rates not every "
             "combination of effects that promised something was fitted; with a larger max_step_s, shorter runs or "
             "fewer rows the search is complete"
         )

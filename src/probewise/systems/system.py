@@ -390,9 +390,10 @@ class SystemChain:
 
     def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
-        for effect, columns in self._effects_with_theta_columns:
-            if Stage.SEEN <= effect.stage <= Stage.SATURATION:
-                view = effect.apply(view, theta[:, columns], plan)
+        with np.errstate(all="ignore"):  # of readings that ran away: not finite, as they were
+            for effect, columns in self._effects_with_theta_columns:
+                if Stage.SEEN <= effect.stage <= Stage.SATURATION:
+                    view = effect.apply(view, theta[:, columns], plan)
         return view
 
     look, read = simulated_view, readings_from_simulated_view  # their earlier names

@@ -97,3 +97,21 @@ def test_a_fit_whose_steps_leave_the_domain_warns_of_nothing(noise):
     for radius in (0.35, 0.5, 0.9):  # shares of the prior; the first is close to the domain's edge
         start = np.append([height, ndtri(radius)], offset)
         assert np.isfinite(fit(model, prepared.recording, start, replace(white_noise(N), **noise)).objective)
+
+
+def test_a_late_reading_of_an_impossible_one_is_impossible_without_a_warning():
+    """Between two infinite readings there is none: pytest makes an error of numpy's warning."""
+    t = np.arange(30.0)
+    simulator = Simulator(
+        "y",
+        "V",
+        {"a": (0, 2)},
+        simulate=lambda p, u: np.where(p["a"] > 1, np.inf, p["a"] * u["t"]),
+        time="t",
+        vectorized=True,
+    )
+    prepared = prepare_system(simulator, table_for(simulator, {"t": t, "y": 0.5 * t + 0.01 * np.sin(9 * t)}))
+    model = Model(prepared.null, (prepared.effects["delay"],), prepared.recording.plan)
+    at_a_half, beyond = model.predict(np.array([[-0.67, 0.5], [1.0, 0.5]]))
+    assert np.isfinite(at_a_half).all()
+    assert not np.isfinite(beyond).all()

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.special import gammainc, gammaincc, gammainccinv, gammaincinv, logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.priors import checked_columns
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 _N_SIZES = 1500  # in the table of quantiles
 _LEAST_TAIL = 1e-250  # of both tails of the table
@@ -85,11 +88,11 @@ class _Radii:
 
     @cached_property
     def _at_log_normal(self) -> CubicSpline:
-        return CubicSpline(np.log(self.normal), np.log(self.values))
+        return _spline(np.log(self.normal), np.log(self.values))
 
     @cached_property
     def _at_log_values(self) -> CubicSpline:
-        return CubicSpline(np.log(self.values), np.log(self.normal))
+        return _spline(np.log(self.values), np.log(self.normal))
 
     def ratio(self, length: FloatArray) -> FloatArray:
         """Return values per standard-normal coordinate at a length of the latter, in its shape."""
@@ -100,6 +103,12 @@ class _Radii:
         """Return values per standard-normal coordinate at a length of the values, in its shape."""
         at = np.log(np.clip(size, self.values[0], self.values[-1]))
         return np.asarray(np.exp(at - self._at_log_values(at)))
+
+
+def _spline(x: FloatArray, y: FloatArray) -> CubicSpline:
+    from scipy.interpolate import CubicSpline  # a third of a second, which few diagnoses need
+
+    return CubicSpline(x, y)
 
 
 def _sds(n_values: int, smallest: float, largest: float) -> FloatArray:

@@ -61,10 +61,11 @@ _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
 _N_BLOCKS = 5
 
-# Prior odds of one, two, three effects on the mean. A few lines of physics leave out two things more often than a
-# calibrated sensor does: no less likely than one beside a fault of the noise, of which a walk takes up much of what a
-# second effect does.
-_BY_SIZE = (0.318, 0.02, 0.002)
+# Prior odds of one, two, three effects on the mean, and of white noise beside them. A second effect is as likely as a
+# fault of the noise, of which a walk takes up much of what a second effect does. Both are so rare that one effect holds
+# the credible set alone where the readings are clear; what is there and visible has far more evidence than that costs.
+_BY_SIZE = (0.329, 0.01, 0.001)
+_WHITE = 0.97
 # Probability that the noise is not white where the law is complete: one departure of a recording, of its law or of its
 # noise, is more likely than one of each.
 _NOT_WHITE_ALONE = 0.2
@@ -164,9 +165,12 @@ class SimulatorApparatus:
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
+        usual = PriorOdds.for_effects(effects)
         return replace(
-            PriorOdds.for_effects(effects),
+            usual,
             by_size=_BY_SIZE,
+            white=_WHITE,
+            noise_by_size=tuple((1 - _WHITE) / (1 - usual.white) * share for share in usual.noise_by_size),
             not_white_alone=_NOT_WHITE_ALONE,
             twice=_TWICE,
             unknown_explains_most=True,

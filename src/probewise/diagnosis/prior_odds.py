@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 from probewise.diagnosis.names import Names
@@ -83,7 +84,7 @@ class PriorOdds:
         if not n:
             return math.log(self.clean_mean)
         # A model of chosen effects may have more of them than a diagnosis would combine.
-        n_unlikely = sum(not is_out_of_vocabulary(name) for name in self.unlikely)
+        n_unlikely = len(self.unlikely) - self._n_unlikely_unnamed
         # The sum over combinations of the product of their effects' weights.
         combinations = sum(
             math.comb(self.n_named - n_unlikely, n - k) * math.comb(n_unlikely, k) * self.unlikely_weight**k
@@ -91,10 +92,14 @@ class PriorOdds:
         )
         return math.log(self.by_size[min(n, len(self.by_size)) - 1] / combinations)
 
+    @cached_property
+    def _n_unlikely_unnamed(self) -> int:
+        return sum(map(is_out_of_vocabulary, self.unlikely))
+
     @property
     def _n_unnamed_as_likely(self) -> float:
         """Number of effects out of vocabulary, each unlikely one counted by its weight."""
-        return self.n_unnamed - (1 - self.unlikely_weight) * sum(map(is_out_of_vocabulary, self.unlikely))
+        return self.n_unnamed - (1 - self.unlikely_weight) * self._n_unlikely_unnamed
 
     def log_prior_with_unknown(self, names: Names) -> float:
         """Return the log prior of an unknown effect without a formula, together with effects on the mean."""

@@ -29,13 +29,11 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
         np.count_nonzero(np.diff(group[there])) >= np.unique(group[there]).size
     ):  # equal rows apart: by a jump or a drift
         return 1.0
-    log_chance, changes = np.log(2.0), [np.zeros(0)]
-    for k in np.unique(group[there]):
-        values = readings[there[group[there] == k]]
-        changes.append(np.diff(values))
-        ties = np.unique(values, return_counts=True)[1]
-        log_chance -= gammaln(len(values) + 1) - np.sum(gammaln(ties + 1))
-    along, whole = np.concatenate(changes), np.diff(readings[there])
+    sizes = np.bincount(group[there])
+    ties = np.unique(np.stack([group[there], readings[there]]), axis=1, return_counts=True)[1]
+    log_chance = np.log(2.0) - np.sum(gammaln(sizes + 1)) + np.sum(gammaln(ties + 1))
+    whole = np.diff(readings[there])
+    along = whole[np.diff(group[there]) == 0]  # equal rows are beside each other
     for sign in (1.0, -1.0):
         if np.all(sign * along >= 0) and not np.all(sign * whole >= 0):
             return float(min(np.exp(log_chance), 1.0))

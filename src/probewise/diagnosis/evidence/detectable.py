@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 from scipy.special import log_ndtr
 
@@ -27,25 +29,19 @@ def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArr
     usable
         Row numbers of the usable readings, (n_usable,).
     """
-    return sum(float(log_ndtr(linearised_size(found, law, name, usable) - LEAST_VISIBLE)) for name in found.model.names)
+    sizes = linearised_sizes(found, law, usable, found.model.names)
+    return float(sum(log_ndtr(size - LEAST_VISIBLE) for size in sizes))
 
 
-def linearised_size(found: Fit, law: NoiseLaw, name: str, usable: IntArray) -> float:
-    """Return an effect's lambda: the norm, in noise sds, of its change after a linearised refit of all else.
+def linearised_sizes(found: Fit, law: NoiseLaw, usable: IntArray, names: Sequence[str]) -> Iterator[float]:
+    """Iterate over the lambdas of some effects of a fit: norm, in noise sds, of the change after a linearised refit.
 
-    Parameters
-    ----------
-    found
-        The fit.
-    law
-        Its noise model.
-    name
-        The effect, one of the fit.
-    usable
-        Row numbers of the usable readings, (n_usable,).
+    Arguments as of `log_probability_effects_detectable`; `names` are those of the effects.
     """
     sd = found.sd / np.sqrt(law.fisher_information)
-    rest = np.delete(law(found.slopes) / sd, found.model.coordinate_slice(name), axis=1)
-    change = law(found.change_by_effect(name, usable)[:, None])[:, 0] / sd
-    taken = np.linalg.solve(rest.T @ rest + np.eye(rest.shape[1]), rest.T @ change)
-    return float(np.linalg.norm(np.append(change - rest @ taken, taken)))
+    slopes = law(found.slopes) / sd
+    for name in names:
+        rest = np.delete(slopes, found.model.coordinate_slice(name), axis=1)
+        change = law(found.change_by_effect(name, usable)[:, None])[:, 0] / sd
+        taken = np.linalg.solve(rest.T @ rest + np.eye(rest.shape[1]), rest.T @ change)
+        yield float(np.linalg.norm(np.append(change - rest @ taken, taken)))

@@ -125,7 +125,7 @@ def _refit_log_densities(
     add the same to every model of the mean.
     """
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
-    rest, own = law.take_readings(~out), law.take_readings(out)
+    rest = law.take_readings(~out)
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     of_its_own = ~np.any(found.slopes[~out], axis=0) & np.any(found.slopes[out], axis=0)
     turned = np.where(of_its_own, 0.0, rest(without.slopes))
@@ -142,7 +142,7 @@ def _refit_log_densities(
     hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
     if (of_its_own | hardly_told).any() or law.has_memory:
         return sequential_log_densities(law, out, miss, slopes, without.z - about, covariance, sigma_2)
-    miss, slopes = miss[out], slopes[out]
+    miss, slopes, own = miss[out], slopes[out], law.take_readings(out)
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     narrow, wide = (
         _log_normal_density(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))

@@ -21,6 +21,7 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.effects import HeavyTailedPrior, NamedEffect
 from probewise.effects.shared_scale_prior import SharedScalePrior
+from probewise.priors import Prior, Product
 from probewise.sensor.stages import effects_with_columns
 
 _STRAIGHT = 0.2  # sd of a coordinate within which its value is as good as linear in it
@@ -33,33 +34,22 @@ _ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly 
 class _Group:
     """Amplitudes with one component of the mixture in common: one alone, or values with one scale.
 
-    `at` (n,): numbers of their coordinates; `prior`: theirs; `typical`: the unit of their values here.
+    `at` (n,): numbers of their coordinates; `prior`: theirs; `typical`: the unit of their values here; `sds`
+    (n_components,): sds of the components, in typical sizes.
     """
 
     at: tuple[int, ...]
-    prior: HeavyTailedPrior | SharedScalePrior
-
-    @property
-    def typical(self) -> float:
-        return self.prior.typical
-
-    @property
-    def sds(self) -> FloatArray:
-        """Sds of the components, (n_components,), in typical sizes."""
-        return self.prior.component_sds / self.typical
+    prior: Prior
+    typical: float
+    sds: FloatArray
 
     def values(self, z: FloatArray) -> FloatArray:
         """Return the values, in typical sizes, from coordinates, (n_samples, n) both."""
-        if isinstance(self.prior, SharedScalePrior):
-            return self.prior.from_unit_cube(ndtr(z)) / self.typical
-        return self.prior.from_unit(ndtr(z)) / self.typical
+        return self.prior.from_unit_cube(ndtr(z)) / self.typical
 
     def coordinates(self, values: FloatArray) -> FloatArray:
         """Return the coordinates of values in typical sizes, (n_samples, n) both."""
-        if isinstance(self.prior, SharedScalePrior):
-            unit = self.prior.to_unit_cube(values * self.typical)
-        else:
-            unit = self.prior.to_unit(values * self.typical)
+        unit = self.prior.to_unit_cube(values * self.typical)
         return np.asarray(np.clip(ndtri(unit), -FARTHEST, FARTHEST))
 
     def values_by_coordinates(self, z: FloatArray) -> FloatArray:
@@ -137,10 +127,13 @@ class LinearAmplitudes:
 def _groups_of_amplitudes(found: Fit) -> Iterator[_Group]:
     """List the amplitudes of a fit's effects that may have either sign, values with one scale together."""
     for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
-        if isinstance(effect.prior, SharedScalePrior):
-            yield _Group(tuple(range(columns.start, columns.stop)), effect.prior)
-        for k, prior in _two_sided_amplitude_priors(effect).items():
-            yield _Group((columns.start + k,), prior)
+        own = effect.prior
+        if isinstance(own, SharedScalePrior):
+            every = tuple(range(columns.start, columns.stop))
+            yield _Group(every, own, own.typical, own.component_sds / own.typical)
+        for k, one in _two_sided_amplitude_priors(effect).items():
+            alone = Product({own.names[k]: one})
+            yield _Group((columns.start + k,), alone, one.typical, one.component_sds / one.typical)
 
 
 def _two_sided_amplitude_priors(effect: NamedEffect[Any]) -> dict[int, HeavyTailedPrior]:

@@ -132,10 +132,9 @@ def repair_of(prepared: Prepared, best: BestRepair, drawn: NullBestAndRepairedSa
         model = replace(found.model, plan=everything.plan) if prepared.is_thinned else found.model
         predicted = np.asarray(model.predict(found.z[None, :])[0] + added)
         left = found.residuals - added[used]
-        walk = np.zeros(len(everything))
-        if law.walk.size:  # between readings, the expected walk is straight; it begins at 0 before the first row
-            known = walk_given_readings(law, left)
-            walk = np.interp(np.arange(len(everything)), np.append(-1, used), np.append(0.0, known))
+        # Between readings, the expected walk is straight; it begins at 0 before the first row.
+        known = walk_given_readings(law, left)
+        walk = np.interp(np.arange(len(everything)), np.append(-1, used), np.append(0.0, known))
         if prepared.is_thinned:
             return PredictionAndResiduals(predicted, readings - predicted - walk, walk)
         return PredictionAndResiduals(predicted, prepared.expand_usable_to_all_rows(left - walk[used]), walk)

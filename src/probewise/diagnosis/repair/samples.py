@@ -42,7 +42,7 @@ from probewise.sensor import ACCURATE_NODES, Chain
 N_SAMPLES = 500
 N_WALKERS = 250
 _MOVES = 6  # moves of posterior samples after a step
-_N_PROFILED = 1000  # draws of which posterior samples are chosen by weight
+_N_FIRST = 1000  # draws of which posterior samples are chosen by weight
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
@@ -214,15 +214,14 @@ def _posterior_draws(
     at, steps = np.ix_(order, order), np.empty_like(curvature)
     steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
     normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, 1e-150))[:, 0]
+    if not annealed:
+        linear = LinearAmplitudes.of(found, turned / sd, normal / sd)
+        if linear is not None:
+            return linear.draw(N_SAMPLES, rng=rng)
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
     center = np.clip(center, -FARTHEST, FARTHEST)
     if not np.isfinite(model.predict(center[None, :])[0, recording.usable]).all():
         center = found.z  # the step left the domain of the formula
-    linear = None
-    if not annealed or model.sensor.predicts_in_bulk:
-        linear = LinearAmplitudes.of(found, turned / sd, normal / sd)
-    if not annealed and linear is not None:
-        return linear.draw(N_SAMPLES, rng=rng)
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)
@@ -232,16 +231,18 @@ def _posterior_draws(
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
-    profiled = ProfiledDensity.of(found, law, recording) if model.sensor.predicts_in_bulk else None
-    if profiled is not None:
-        weighed = profiled.importance_resample(log_posterior, n_first=_N_PROFILED, n_wanted=N_SAMPLES, rng=rng)
-        if weighed is not None:
-            return weighed
-    if linear is not None:
-        first = linear.draw(_N_PROFILED, rng=rng)
-        weighed = importance_resample(first, linear.log_density, log_posterior, n_wanted=N_SAMPLES, rng=rng)
-        if weighed is not None:
-            return weighed
+    if model.sensor.predicts_in_bulk:
+        profiled = ProfiledDensity.of(found, law, recording)
+        if profiled is not None:
+            weighed = profiled.importance_resample(log_posterior, n_first=_N_FIRST, n_wanted=N_SAMPLES, rng=rng)
+            if weighed is not None:
+                return weighed
+        linear = LinearAmplitudes.of(found, turned / sd, normal / sd)
+        if linear is not None:
+            first = linear.draw(_N_FIRST, rng=rng)
+            weighed = importance_resample(first, linear.log_density, log_posterior, n_wanted=N_SAMPLES, rng=rng)
+            if weighed is not None:
+                return weighed
     quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
     near = SurrogatePosterior.of(quadratic, center, steps, recording.readings[usable], law)
 

@@ -32,4 +32,4 @@ def fit_under_noise(candidate: WeighedFit, law: NoiseLaw, recording: Recording) 
 
 def residuals_beside_walk(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
     """Return residuals without the random walk that they all together show, if the noise has one, (n_usable,)."""
-    return residuals - walk_given_readings(law, residuals) if law.walk.size else residuals
+    return residuals - walk_given_readings(law, residuals)

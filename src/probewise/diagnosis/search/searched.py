@@ -25,6 +25,7 @@ from probewise.diagnosis.search.weighed_fit import (
     effects_out_of_vocabulary,
     expected_log_bayes_factor,
     noise_effects_in_vocabulary,
+    or_impossible,
 )
 from probewise.effects import PROPOSAL, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
@@ -182,17 +183,15 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
     log_z: dict[tuple[Names, Names], float] = {}
     for (_, names), fit in evidences.fits.items():
         for noise, evidence in fit.evidence.items():
-            log_z[names, noise] = float(
-                np.logaddexp(log_z.get((names, noise), -np.inf), _or_impossible(evidence.log_z))
-            )
+            log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), or_impossible(evidence.log_z)))
     log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
         # A named effect remains named if a smaller unknown one is left.
         key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
-        value = _or_impossible(value) + prior.log_prior_with_unknown(names)
+        value = or_impossible(value) + prior.log_prior_with_unknown(names)
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
     for (names, noise), value in evidences.screened.items():
-        log_p[names, noise] = _or_impossible(value) + prior.log_prior_on_mean(names)
+        log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
     for names, noise in log_p:
         uncertain = tuple(n for n in noise if n not in certain)
         log_p[names, noise] += -math.log(n_forms) + prior.log_prior_on_noise(uncertain, alone=not names)
@@ -204,11 +203,6 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         {key: math.exp(value - total) for key, value in log_p.items()},
         {n: math.exp(v - norm) for n, v in clean_by_order.items()},
     )
-
-
-def _or_impossible(log_z: float) -> float:
-    """Return a log evidence, minus infinity for one that is no number: all probabilities would be none."""
-    return -math.inf if math.isnan(log_z) else log_z
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,11 @@ from probewise.diagnosis.search.constants import STEERING
 from probewise.effects import NUISANCES, is_out_of_vocabulary
 
 
+def or_impossible(log_z: float) -> float:
+    """Return a log evidence, minus infinity for one that is no number: all probabilities would be none."""
+    return -math.inf if math.isnan(log_z) else log_z
+
+
 @dataclass(frozen=True, eq=False)
 class WeighedFit:
     """A candidate: effects on the mean refitted with an SSF of some number of Gaussians; evidence by noise effects."""
@@ -58,10 +63,7 @@ class WeighedFit:
         """
         return replace(
             self,
-            evidence={
-                noise: replace(e, log_z=-math.inf if math.isnan(e.log_z + by) else e.log_z + by)
-                for noise, e in self.evidence.items()
-            },
+            evidence={noise: replace(e, log_z=or_impossible(e.log_z + by)) for noise, e in self.evidence.items()},
         )
 
     @property

@@ -195,13 +195,19 @@ def _least_and_greatest(values: FloatArray) -> tuple[float, float]:
 
 def is_known_duration(table: RunTable, time_unit: str) -> bool:
     """Return whether a table tells how long its rows take: it has a time, in a unit that is known."""
-    return table.time is not None and time_unit.strip().rstrip(".").lower() in _MINUTES
+    return _minutes_of_time_unit(table, time_unit) is not None
 
 
 def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
-    if not is_known_duration(table, time_unit):
+    minutes = _minutes_of_time_unit(table, time_unit)
+    if minutes is None:
         return _BREAK + len(table) * _A_READING
-    return _BREAK + float(np.ptp(table.time_s)) * _MINUTES[time_unit.strip().rstrip(".").lower()]
+    return _BREAK + float(np.ptp(table.time_s)) * minutes
+
+
+def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
+    """Return how many minutes a unit of a table's time has; None without a time, or in an unknown unit."""
+    return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
 
 
 def _list_in_words(names: Mapping[str, object]) -> str:

@@ -72,24 +72,23 @@ def searched_at_step(searched: Searched, max_step: float, *, progress: Progress 
     fits, unknown = dict(searched.evidences.fits), dict(searched.evidences.unknown)
     with_a_chance = _combinations_with_a_chance(searched)
     asked = [*with_a_chance, *([] if () in with_a_chance else [()])]  # the null is part of every report
-    for k, names in enumerate(asked):
-        progress("refitting at a finer step", k, len(asked))
-        for (order, held_names), held in searched.evidences.fits.items():
-            if held_names != names:
-                continue
-            try:
-                again = _refitted(searched, held, finer)
-            except NotConvergedError:
-                return None
-            moved = {noise: again.evidence[noise].log_z - e.log_z for noise, e in held.evidence.items()}
-            if names in with_a_chance and not abs(again.log_z - held.log_z) < A_NAT:
-                return None
-            fits[order, names] = again
-            unknown |= {
-                (n, own, noise): value + moved[noise]
-                for (n, own, noise), value in unknown.items()
-                if (n, own) == (order, names) and math.isfinite(moved[noise])
-            }
+    keys = [key for names in asked for key in searched.evidences.fits if key[1] == names]
+    for k, key in enumerate(keys):
+        progress("refitting at a finer step", k, len(keys))
+        held = searched.evidences.fits[key]
+        try:
+            again = _refitted(searched, held, finer)
+        except NotConvergedError:
+            return None
+        moved = {noise: again.evidence[noise].log_z - e.log_z for noise, e in held.evidence.items()}
+        if key[1] in with_a_chance and not abs(again.log_z - held.log_z) < A_NAT:
+            return None
+        fits[key] = again
+        unknown |= {
+            (n, names, noise): value + moved[noise]
+            for (n, names, noise), value in unknown.items()
+            if (n, names) == key and math.isfinite(moved[noise])
+        }
     return replace(
         searched,
         prepared=replace(

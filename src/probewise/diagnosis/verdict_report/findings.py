@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.detectable import linearised_size
+from probewise.diagnosis.evidence.detectable import linearised_sizes
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.fitting.fit import fit, fit_each_start
 from probewise.diagnosis.judgement.judged import Hypothesis
@@ -207,7 +207,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
         again = fit_each_start(model, noise_free, starts, law.with_least_sigma(sigma), tolerance=0.02)
         refit = min(again, key=lambda one: one.objective)
     if not math.isfinite(refit.objective):
-        return linearised_size(found, law, name, prepared.usable_rows)
+        return next(linearised_sizes(found, law, prepared.usable_rows, [name]))
     return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.fisher_information)
 
 

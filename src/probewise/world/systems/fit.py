@@ -145,7 +145,7 @@ class ModelWithForms:
     def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> LeastSquaresFit:
         """Fit readings (n_points,) by least squares from start coordinates, with at most `max_calls` evaluations.
 
-        Raises NotConvergedError if the fit leaves the finite numbers.
+        Raises NotConvergedError if the fit leaves the finite numbers or the law diverges where it ends.
         """
         last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
         sd = self.kind.sd
@@ -178,6 +178,8 @@ class ModelWithForms:
                 f, slopes = readings_and_slopes(np.asarray(found.x))
         except (ValueError, np.linalg.LinAlgError) as error:
             raise NotConvergedError(f"a fit of the {self.kind.name} left the finite numbers") from error
+        if not slopes.any():
+            raise NotConvergedError(f"a fit of the {self.kind.name} ended where its law diverges")
         return LeastSquaresFit(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))
 
 

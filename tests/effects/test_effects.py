@@ -137,6 +137,22 @@ def test_a_prior_maps_the_unit_cube_to_its_own_density(name):
     np.testing.assert_allclose(np.exp(prior.log_prob(theta)), np.abs(np.linalg.det(slopes)), rtol=2e-4)
 
 
+@pytest.mark.parametrize("name", EFFECTS)
+def test_every_mode_is_counted_as_often_as_the_prior_holds_it(name):
+    """A phase has a prior over two turns: a whole turn on, within the prior, the readings are the same."""
+    effect = EFFECTS[name].for_extent(EXTENT)
+    names = effect.prior.names
+    phase = next((k for k, own in enumerate(names) if own == "phase"), None)
+    assert effect.n_peaks == (1 if phase is None else 2)
+    if phase is not None:
+        theta = effect.prior.from_unit_cube(np.full((1, len(names)), 0.3))
+        turned = theta.copy()
+        turned[:, phase] = effect.prior.from_unit_cube(np.full((1, len(names)), 0.8))[:, phase]  # half the prior on
+        chain = base().with_effects(effect)
+        np.testing.assert_allclose(chain.predict(turned, PLAN), chain.predict(theta, PLAN), atol=1e-9)
+        assert effect.prior.log_prob(turned) == pytest.approx(effect.prior.log_prob(theta))
+
+
 def test_lines_are_found_whichever_way_they_were_scanned():
     """The two-way plan goes along X, forth and back, and once along Y; a turned plan along its own line."""
     along_x, along_y = distinct_scan_lines(PLAN)

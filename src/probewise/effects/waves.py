@@ -45,7 +45,15 @@ def starting_point_of_wave(entry: FloatArray, amounts: FloatArray) -> FloatArray
     return np.asarray(setting)
 
 
-class _WaveEffect(NamedEffect[V]):
+class _PeriodicEffect(NamedEffect[V]):
+    """Base of effects whose phase has a prior over two turns, which hold every posterior mode twice."""
+
+    @property
+    def n_peaks(self) -> int:
+        return 2
+
+
+class _WaveEffect(_PeriodicEffect[V]):
     """Base of effects with amplitude, frequency or period, and phase; bank entries hold a sine and a cosine."""
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
@@ -148,7 +156,7 @@ class PeriodicPositionError(CountsPlaceFromOrigin, _WaveEffect[Poses]):
 
 
 @dataclass(frozen=True)
-class StickSlip(CountsPlaceFromOrigin, NamedEffect[Poses]):
+class StickSlip(CountsPlaceFromOrigin, _PeriodicEffect[Poses]):
     """Stick-slip of the slide: X + amp_mm saw((X - X0) / period_mm + phase), a sawtooth of 1 to -1, X0 of `origin`."""
 
     typical_mm: float = 0.3

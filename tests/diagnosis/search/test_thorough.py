@@ -1,7 +1,7 @@
 """Nested sampling beside Laplace: the truth where it is known, agreement where it should be, and who wins."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -99,15 +99,6 @@ def test_a_line_weighs_what_quadrature_says():
     assert null.agree
 
 
-@dataclass(frozen=True)
-class Wave(Flicker):
-    """A flicker that says how often its two turns of phase hold each peak."""
-
-    @property
-    def n_peaks(self) -> int:
-        return 2
-
-
 @pytest.mark.slow
 def test_a_wave_weighs_what_quadrature_over_all_its_phases_says():
     """Both peaks of two turns of phase are in the prior that nested sampling explores, so neither counts again."""
@@ -115,7 +106,7 @@ def test_a_wave_weighs_what_quadrature_over_all_its_phases_says():
     plain = line_recording(0.0)
     time, n = plain.plan.time_s, len(plain)
     recording = replace(plain, readings=plain.readings - 0.05 * time + 0.4 * np.sin(2 * np.pi * 0.11 * time + 1.0))
-    wave = Wave(typical=0.1, lowest_hz=0.1, highest_hz=0.12, n_frequencies=8)
+    wave = Flicker(typical=0.1, lowest_hz=0.1, highest_hz=0.12, n_frequencies=8)
     found = search(Prepared(recording, {wave.name: wave}, level, LightSensorApparatus(), recording))
     candidate = next(own for own, _ in thorough._leading_hypotheses(found) if own.names == (wave.name,))
     told = thorough._weigh_by_nested_sampling(

@@ -154,8 +154,8 @@ class Form:
 
     @property
     def n_peaks(self) -> int:
-        """Number of equivalent posterior modes: 1; 2 for a wave (its phase spans two turns); 4 for its second copy."""
-        if self.joined is None:
+        """Number of equivalent posterior modes: 1; 2 with a phase (it spans two turns); 4 for a wave's second copy."""
+        if "phase" not in self.marginals:
             return 1
         return 2 if name_of_first_copy(self.name) is None else 4
 

@@ -74,7 +74,7 @@ def test_other_settings_and_damaged_files_are_refused(tmp_path):
     with pytest.raises(FileError, match="a second time"):
         read_campaign(path)
     path.write_text("".join([lines[0], "nonsense\n", *lines[1:]]))
-    with pytest.raises(FileError, match="row 2"):
+    with pytest.raises(FileError, match="line 2"):
         read_campaign(path)
     path.write_text(json.dumps({"something": "else"}) + "\n")
     with pytest.raises(FileError, match="this is not a campaign file"):

@@ -64,7 +64,10 @@ class ShapeError(ProbewiseError, ValueError):
 
 
 class FileError(ProbewiseError, ValueError):
-    """Report a file that cannot be used: `path`, place (`row`, `column`), what was `found`, what is `allowed`."""
+    """Report a file that cannot be used: `path`, place (`row`, `column`), what was `found`, what is `allowed`.
+
+    `row` counts from 1; it is called the row of a table, and the line of any other file.
+    """
 
     def __init__(
         self, path: object, found: str, allowed: str, *, row: int | None = None, column: str | None = None
@@ -72,7 +75,7 @@ class FileError(ProbewiseError, ValueError):
         self.path, self.found, self.allowed, self.row, self.column = str(path), found, allowed, row, column
         where = str(path)
         if row is not None:
-            where += f", row {row}"
+            where += f", {'row' if where.lower().endswith('.csv') else 'line'} {row}"
         if column is not None:
             where += f", column {shortened(column, _LONGEST_VALUE)}"
         super().__init__(f"{where}: {shortened(found)}; allowed: {shortened(allowed)}")

@@ -221,11 +221,11 @@ def file_of(folder, text):
 
 
 FILES = {
-    "no Python": ("def connect(:", r"mine.py, row 1: is no Python"),
-    "stops": ("x = 1\nimport nowhere_to_be_found", r"mine.py, row 2: stops with ModuleNotFoundError: No module named"),
+    "no Python": ("def connect(:", r"mine.py, line 1: is no Python"),
+    "stops": ("x = 1\nimport nowhere_to_be_found", r"mine.py, line 2: stops with ModuleNotFoundError: No module named"),
     "no connect": ("def conect(): pass", "mine.py: connect is missing; allowed: def connect"),
     "a number": ("connect = 3", "mine.py: connect is a int; allowed: def connect"),
-    "leaves": ("raise SystemExit(3)", "mine.py, row 1: stops with SystemExit: 3"),
+    "leaves": ("raise SystemExit(3)", "mine.py, line 1: stops with SystemExit: 3"),
 }
 
 

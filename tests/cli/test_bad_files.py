@@ -191,7 +191,7 @@ def test_a_journal_line_whose_numbers_are_texts_is_refused(line, refused, sensor
     whole["pose"] = {"x_mm": 0.0, "y_mm": 0.0, "orientation_rad": 0.0}
     path = tmp_path / "bad.jsonl"
     path.write_text('{"format": "journal/1"}\n' + json.dumps(whole | line) + "\n")
-    assert "row 2" in refused("diagnose", path, "--sensor", sensor_file, "--out", tmp_path / "out")
+    assert "line 2" in refused("diagnose", path, "--sensor", sensor_file, "--out", tmp_path / "out")
 
 
 def test_a_byte_order_mark_is_taken_wherever_text_is_read(sensor_file, tmp_path, capsys):

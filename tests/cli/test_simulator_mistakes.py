@@ -24,7 +24,7 @@ def refused(capsys, tmp_path, file, *arguments, table=None, more=()):
 
 FILES = {
     "a column that the table lacks": (
-        ('data["power_w"]', 'data["power"]'), "row 10: simulate raises KeyError: 'power'; allowed: columns run, t_s,",
+        ('data["power_w"]', 'data["power"]'), "line 10: simulate raises KeyError: 'power'; allowed: columns run, t_s,",
     ),
     "readings of another shape": (("return p", "return np.ones(3)\n    return p"), "shape (3,); allowed: (36,)"),
     "no number at all": (("return p", 'return np.nan * data["t_s"]\n    return p'), "NaN at every place"),
@@ -34,7 +34,7 @@ FILES = {
     "a reading that the table lacks": (('"temp_c"', '"temp"'), "reading is 'temp'; allowed: a column of the table"),
     "a name that is misspelt": (("\nparameters", "\nparameter"), "was parameter meant to be parameters?"),
     "an error at every place": (
-        ("return p", "raise ValueError('too hot')\n    return p"), "row 10: simulate raises ValueError: too hot",
+        ("return p", "raise ValueError('too hot')\n    return p"), "line 10: simulate raises ValueError: too hot",
     ),
     "a control that the table lacks": (('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'"),
     "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
@@ -44,7 +44,7 @@ FILES = {
     "a range that ends at NaN": (('"sd": 0.05', '"range": (float("nan"), None)'), 'noise["range"] is (nan, None)'),
     "an sd that is a list": (('"sd": 0.05', '"sd": [0.05]'), 'noise["sd"] is [0.05]'),
     "a negative sd of NumPy": (('"sd": 0.05', '"sd": np.int64(-1)'), 'noise["sd"] is'),
-    "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "row 9: is no Python"),
+    "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "line 9: is no Python"),
     "no simulator": (("def simulate", "def simulat"), "simulate, rates is 'neither'"),
     "runs that are not named": (
         ('time, run = "t_s", "run"', 'time = "t_s"'), "per_run is ['start_c']; allowed: nothing, or run =",
@@ -65,10 +65,13 @@ def cell(row, column, text):
 
 
 TABLES = {
-    "a reading that is text": (cell(5, "temp_c", "warm"), "warm in row 5"),
+    "a reading that is text": (cell(5, "temp_c", "warm"), "in row 5 is 'warm'"),
     "an input that is text": (cell(5, "power_w", "4;5"), "these contain text: power_w ('4;5')"),
     "a time that is missing": (cell(5, "t_s", ""), "row 5, column t_s: the cell is empty"),
-    "a time that falls": (cell(5, "t_s", "1"), "column 't_s' is '1 in row 5, after 10 in run 1'"),
+    "a time that falls": (
+        cell(5, "t_s", "1"),
+        "column 't_s' in row 5 is 1.0; allowed: 10 or more, since time does not fall within run 1",
+    ),
     "no rows": ("run,t_s,power_w,room_c,temp_c\n", "no row below the header"),
 }
 
@@ -91,7 +94,7 @@ def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path
         'states = {"temp_c": "start_c"}\n\ndef rates(s, p, u):\n    return {"temp_c": p["gain"] * s["heat"]}\n'
     )
     said = refused(capsys, tmp_path, law)
-    assert "heater.py, row 12: rates raises KeyError: 'heat'" in said
+    assert "heater.py, line 12: rates raises KeyError: 'heat'" in said
     assert "states temp_c" in said
 
 
@@ -101,7 +104,7 @@ def test_a_mistake_in_observe_is_told_of_observe(capsys, tmp_path):
         'def observe(s, p, u):\n    return s["hot"]\n'
     )
     said = refused(capsys, tmp_path, law)
-    assert "row 13: observe raises KeyError: 'hot'; allowed: columns" in said
+    assert "line 13: observe raises KeyError: 'hot'; allowed: columns" in said
 
 
 def test_a_sensor_beside_a_simulator_is_refused(capsys, tmp_path):

@@ -115,17 +115,17 @@ def test_a_missing_reading_is_null_and_comes_back_as_nan(tmp_path):
     ("content", "says"),
     [
         (b"", "no whole first line"),
-        (b"x,y\n1,2\n", "row 1.*JSON"),
+        (b"x,y\n1,2\n", "line 1.*JSON"),
         (b'{"format": "journal/2"}\n', r"journal/2.*journal/1"),
         (b'[1]\n{"index": 1}\n', "JSON list"),
-        (b'{"format": "journal/1"}\n{"index": 1}\n', "row 2, column pose"),
-        (b'{"format": "journal/1"}\n\xff\xfe\n', "row 2"),
-        (b'{"format": "journal/1", "seed": NaN}\n', "row 1.*NaN is no JSON number"),
-        (b'{"format": "journal/1", "seed": 1, "seed": 2}\n', "row 1.*'seed' comes twice"),
-        (b'{"format": "journal/1"}\n' + b"[" * 100_000 + b"\n", "row 2"),
+        (b'{"format": "journal/1"}\n{"index": 1}\n', "line 2, column pose"),
+        (b'{"format": "journal/1"}\n\xff\xfe\n', "line 2"),
+        (b'{"format": "journal/1", "seed": NaN}\n', "line 1.*NaN is no JSON number"),
+        (b'{"format": "journal/1", "seed": 1, "seed": 2}\n', "line 1.*'seed' comes twice"),
+        (b'{"format": "journal/1"}\n' + b"[" * 100_000 + b"\n", "line 2"),
     ],
 )
-def test_a_damaged_journal_says_which_file_which_row_and_what(tmp_path, content, says):
+def test_a_damaged_journal_says_which_file_which_line_and_what(tmp_path, content, says):
     path = tmp_path / "bad.jsonl"
     path.write_bytes(content)
     with pytest.raises(FileError, match=says) as caught:
@@ -137,7 +137,7 @@ def test_a_line_that_is_missing_in_the_middle_is_found(tmp_path):
     write(tmp_path / "j", 3)
     lines = (tmp_path / "j").read_text().splitlines(keepends=True)
     (tmp_path / "j").write_text("".join([*lines[:2], *lines[3:]]))
-    with pytest.raises(FileError, match=r"row 3: index 3; allowed: 2"):
+    with pytest.raises(FileError, match=r"line 3: index 3; allowed: 2"):
         read_journal(tmp_path / "j")
 
 

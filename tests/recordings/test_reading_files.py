@@ -190,8 +190,8 @@ def with_white(**more):
 
 
 BAD_DESCRIPTIONS = {
-    "does not parse": ('{"format": \n "recording/1",,}', ["row 2", "JSON"]),
-    "cut short": ('{"format": "recording/1"', ["row 1", "JSON"]),
+    "does not parse": ('{"format": \n "recording/1",,}', ["line 2", "JSON"]),
+    "cut short": ('{"format": "recording/1"', ["line 1", "JSON"]),
     "not a number of JSON": ('{"format": "recording/1", "reading": {"min": NaN}}', ["NaN"]),
     "a list": ("[]", ["an object"]),
     "a name twice": ('{"format": 1, "format": 2}', ["'format' comes twice"]),

@@ -139,7 +139,7 @@ def test_a_formula_needs_the_column_in_it_and_no_reading():
 def test_a_model_with_a_lag_refuses_a_time_that_falls_within_a_run_and_one_without_predicts_it():
     model, table = _line_with("lag", tau_s=1.0)
     again = table.with_columns({"t": table.time_s % 20})
-    with pytest.raises(ParameterError, match=r"0 in row 22, after 19.*begins anew"):
+    with pytest.raises(ParameterError, match=r"in row 22 is 0.0; allowed: 19 or more.*begins anew"):
         predicted(model, again)
     drift, _ = _line_with("offset_drift", a=0.01)
     np.testing.assert_allclose(predicted(drift, again).mean, table.columns["y"] + 0.01 * again.time_s)

@@ -129,8 +129,8 @@ class RowsInRuns:
             falls = np.flatnonzero(np.diff(table.time_s[rows]) < 0)
             if falls.size:
                 at = int(rows[falls[0] + 1])
-                found = f"{table.time_s[at]:g} after {table.time_s[rows[falls[0]]]:g} in run {name!r}, row {at + 2}"
-                raise ParameterError(f"column {table.time!r}", found, "a time that does not fall within a run")
+                least = f"{table.time_s[rows[falls[0]]]:g} or more, since time does not fall within run {name}"
+                raise ParameterError(f"column {table.time!r} in row {at + 2}", float(table.time_s[at]), least)
         longest = max(len(rows) for rows in by_run)
         return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
 

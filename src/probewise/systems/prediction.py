@@ -83,9 +83,10 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
         readings = np.full(len(table), np.nan)
     elif readings.dtype != np.float64:
         bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_float_or_empty(cell)), 0)
-        found = f"{readings[bad]!s} in row {bad + 2}"
         raise ParameterError(
-            f"reading {simulator.reading!r}", found, "a number in each row, or nothing where it is missing"
+            f"reading {simulator.reading!r} in row {bad + 2}",
+            str(readings[bad]),
+            "a number in each row, or nothing where it is missing",
         )
     sd = simulator.noise.sd
     recording = RunRecording(
@@ -95,8 +96,8 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
         values = table.covariates[recording.sd_column]
         wrong = np.flatnonzero(recording.usable & ~(np.isfinite(values) & (values > 0)))
         if wrong.size:
-            found = f"{values[wrong[0]]:g} in row {wrong[0] + 2}"
-            raise ParameterError(f'noise["sd"], column {sd!r}', found, "greater than 0 wherever there is a reading")
+            name = f'noise["sd"], column {sd!r} in row {wrong[0] + 2}'
+            raise ParameterError(name, float(values[wrong[0]]), "greater than 0 wherever there is a reading")
     return recording
 
 

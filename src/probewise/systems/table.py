@@ -145,10 +145,11 @@ class RunTable:
             falls = np.flatnonzero(np.diff(self.time_s[rows]) < 0)
             if falls.size:
                 before, at = rows[falls[0]], rows[falls[0] + 1]
-                run = f" in run {name}" if self.run is not None else ""
-                found = f"{self.time_s[at]:g} in row {at + 2}, after {self.time_s[before]:g}{run}"
+                where = f"column {self.time!r} in row {at + 2}"
+                own = "its run" if self.run is None else f"run {name}"
+                allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
                 cure = "" if self.run is not None else '; where it begins anew name the runs: run = "..."'
-                raise ParameterError(f"column {self.time!r}", found, f"a time that does not fall within a run{cure}")
+                raise ParameterError(where, float(self.time_s[at]), f"{allowed}{cure}")
 
     def interpolated_within_runs(self, values: FloatArray) -> FloatArray:
         """Return a column, (n_points,), with its missing values interpolated linearly from row to row of each run.

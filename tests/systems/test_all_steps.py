@@ -108,7 +108,6 @@ def test_the_cost_is_how_often_the_rates_are_evaluated(effect, max_step):
     _, cost = integrate_from_known_trajectories(
         case.problem(theta), steps, case.memory, effects="effects", theta=theta, n_own=3
     )
-    n_calls -= 1  # one to see which columns it reads
     assert cost == pytest.approx(n_calls, rel=0.5 if effect is _rubbed else 0.01)
 
 
@@ -131,10 +130,42 @@ def test_a_law_that_takes_one_column_for_each_run_alone_is_stepped():
 
     case = _Case(law=Law({"phi": "phi0", "omega": 0.0}, rates))
     theta = np.stack([MIDDLE, 1.01 * MIDDLE])
-    case.near(theta)
-    found, _ = case.near(theta)
+    for refusals in (0, 0, 1, 2):  # at first no trajectory is known
+        assert case.memory.n_refused == refusals
+        found, _ = case.near(theta)
     assert case.memory.useless
     np.testing.assert_array_equal(found["phi"], case.stepped(theta)["phi"])
+
+
+def test_a_sample_that_a_law_refuses_does_not_slow_down_all_that_follow():
+    def rates(s, p, u):
+        if np.any(p["l_m"] < 0.1):
+            raise ValueError("so short a pendulum is none")
+        return LAW.rates(s, p, u)
+
+    case = _Case(law=replace(LAW, rates=rates))
+    theta = np.stack([MIDDLE, 1.01 * MIDDLE])
+    case.near(theta)
+    for _ in range(4):
+        with pytest.raises(ValueError, match="none"):
+            case.near(theta * [0.01, 1, 1])
+    assert not case.memory.useless
+
+
+def test_a_column_that_a_law_reads_later_only_is_there():
+    """Not at the first rows: it is pushed from the first second on."""
+
+    def rates(s, p, u):
+        push = np.where(u["t_s"] > 1, u["push"], 0.0) if np.max(u["t_s"]) > 1 else 0.0
+        return {**LAW.rates(s, p, {"push": 0.0}), "omega": -9.81 * np.sin(s["phi"]) + push}
+
+    case = _Case(law=replace(LAW, rates=rates))
+    theta = np.stack([MIDDLE, 1.01 * MIDDLE])
+    found = case.stepped(theta)["phi"]
+    assert np.isfinite(found).all()
+    for _ in range(2):
+        again, _ = case.near(theta)
+        np.testing.assert_allclose(again["phi"], found, rtol=1e-8, atol=1e-10)
 
 
 def test_the_memory_of_trajectories_does_not_grow_without_end():

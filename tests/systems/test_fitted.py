@@ -6,10 +6,11 @@ import json
 import numpy as np
 import pytest
 from heater import ABOUT, SIMULATOR, TABLE, fitted
+from scipy.special import ndtri
 
 from probewise.errors import FileError, ParameterError
-from probewise.systems import FittedSystem, Law, RunTable, Simulator
-from probewise.systems.forms import bind_forms
+from probewise.systems import FittedSystem, Law, RunTable, Simulator, System
+from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit, rebind_forms
 
 
@@ -67,6 +68,43 @@ def test_every_form_that_is_bound_again_does_what_it_did():
         np.testing.assert_array_equal(first, second, err_msg=name)
 
 
+def test_a_bend_that_is_bound_again_ends_where_it_did_whatever_the_unit():
+    """Outlying readings are left out of the range that is expected, by the sd of a reading."""
+    x = np.linspace(0.0, 1.0, 200)
+    readings = 3 * x + 0.3 * x**3 + np.random.default_rng(1).normal(0.0, 0.02, 200)
+    readings[::40] += 2
+    table = RunTable({"x": x, "y": readings})
+    simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], noise={"sd": 0.02})
+    system = System.of(simulator, table)
+    about = ReferenceFit(system, table, np.clip(ndtri(np.array([0.3])), -5, 5), 0.02)
+    theta = np.array([[3.0, 0.1, 3.0]])
+    known = extract_stored_fit(about)
+    first = bind_forms(about)["nonlinearity"]
+    (second,) = rebind_forms(["nonlinearity"], simulator, known).values()
+    predicted, again = (system.chain(table, [form]).predict(theta, table) for form in (first, second))
+    np.testing.assert_array_equal(predicted, again)
+    (other,) = rebind_forms(["nonlinearity"], simulator, dataclasses.replace(known, sd=1.0)).values()
+    assert np.abs(system.chain(table, [other]).predict(theta, table) - predicted).max() > 0.01
+
+
+def test_predictions_that_are_no_number_are_stored():
+    """In a row without a reading a simulator may predict none."""
+    predicted = np.where(np.arange(len(TABLE)) == 3, np.nan, ABOUT.predicted)
+    given = StoredFit(TABLE, predicted, 0.07, {"warm": predicted})
+    known = FittedSystem.from_json(dataclasses.replace(fitted(), known=given).to_json(), SIMULATOR).known
+    np.testing.assert_array_equal(known.predicted, predicted)
+    np.testing.assert_array_equal(known.states["warm"], predicted)
+    assert known.sd == 0.07
+
+
+def test_the_file_of_another_reading_is_refused_without_fingerprints():
+    here, there = (dataclasses.replace(SIMULATOR, fingerprint="", unit=unit) for unit in ("degC", "K"))
+    text = dataclasses.replace(fitted(), simulator=here).to_json()
+    assert FittedSystem.from_json(text, here).to_json() == text
+    with pytest.raises(FileError, match=r"fitted to temp_c \(degC\); allowed: a model of temp_c \(K\)"):
+        FittedSystem.from_json(text, there)
+
+
 def test_forms_are_bound_again_without_a_call_of_rates():
     """They were called at the middle of the prior, where they may raise."""
 
@@ -77,5 +115,5 @@ def test_forms_are_bound_again_without_a_call_of_rates():
     simulator = Simulator("y", "V", {"a": (0, 1)}, law=law, time="t")
     level = np.linspace(0.0, 1.0, 20)
     table = RunTable({"t": np.arange(20.0), "y": level}, "t")
-    known = StoredFit(table, level, {"upper": level, "lower": level**2})
+    known = StoredFit(table, level, 1.0, {"upper": level, "lower": level**2})
     assert rebind_forms(["limit:upper"], simulator, known).keys() == {"limit:upper"}

@@ -110,7 +110,7 @@ def _line_with(effect, **sizes):
     simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], time="t")
     samples = np.tile([3.0, *sizes.values()], (500, 1))
     names = ("a", *(f"{effect}.{name}" for name in sizes))
-    known = StoredFit(table, table.columns["y"])
+    known = StoredFit(table, table.columns["y"], 0.1)
     return FittedSystem(simulator, names, samples, np.full(500, 0.1), effects=(effect,), known=known), table
 
 
@@ -119,6 +119,23 @@ def test_a_column_without_numbers_that_an_effect_reads_is_refused_by_name(column
     model, table = _line_with("sensitivity:room", a=1.0)
     with pytest.raises(ParameterError, match=r"room.*numbers in this column"):
         predicted(model, table.with_columns({"room": column}))
+
+
+def test_a_column_named_like_a_state_is_not_needed_for_an_effect_on_the_state():
+    t = np.linspace(0.0, 4.0, 40)
+    a = np.exp(-t)
+    table = RunTable({"t": t, "a": a + 0.1, "b": 1 - a}, "t")
+    law = Law(
+        {"a": 1.0, "b": 0.0}, lambda s, p, u: {"a": -p["k"] * s["a"], "b": p["k"] * s["a"]}, lambda s, p, u: s["b"]
+    )
+    simulator = Simulator("b", "mol", {"k": (0, 10)}, law=law, time="t")
+    samples, names = np.tile([1.0, 0.2], (500, 1)), ("k", "damping:a.a")
+    known = StoredFit(table, 1 - a, 0.1, {"a": a, "b": 1 - a})
+    model = FittedSystem(
+        simulator, names, samples, np.full(500, 0.1), effects=("damping:a",), max_step=0.1, known=known
+    )
+    found = predicted(model, RunTable({"t": t, "b": 1 - a}, "t"))
+    np.testing.assert_allclose(found.mean, (1 - np.exp(-1.2 * t)) / 1.2, atol=1e-4)
 
 
 def _formula_of_the_room_temperature():

@@ -44,6 +44,7 @@ _NUDGE = 1e-7  # of each state's largest value, for the Jacobian
 _FAR = 1e-3  # change from a known trajectory, in a state's largest value, from which another one is remembered
 _MOST_NEW = 8  # trajectories remembered of one batch
 _MOST_KNOWN = 48  # trajectories remembered
+_REFUSALS = 3  # errors in a row of all steps together after which a law is only stepped; one may be of a sample far off
 _WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at the cost of a step of all of them
 # Samples times runs up to which all steps at once cost less than one after another: near known trajectories, where two
 # evaluations of all steps suffice, and far from them, where a dozen are needed.
@@ -120,10 +121,18 @@ class KnownTrajectory:
 
 @dataclass(eq=False)
 class TrajectoryCache:
-    """Cache of solved trajectories by (steps, effects); `useless` if the law cannot evaluate all steps at once."""
+    """Cache of solved trajectories by (steps, effects).
+
+    `n_refused` counts how often in a row the law raised an error for all steps together, and none step by step.
+    """
 
     known: dict[tuple[Hashable, Hashable], list[KnownTrajectory]] = field(default_factory=dict)
-    useless: bool = False
+    n_refused: int = 0
+
+    @property
+    def useless(self) -> bool:
+        """Whether the law seems unable to evaluate all steps at once, as rates for one value per run only are."""
+        return self.n_refused >= _REFUSALS
 
     def known_and_nearest_indices(
         self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
@@ -220,6 +229,7 @@ def integrate_from_known_trajectories(
         return states_by_name, n_steps * evaluations_per_step(motion, steps.schedule.method)
     states, left, cost = None, np.arange(n_samples), 0
     known, nearest = memory.known_and_nearest_indices(steps, effects, theta, n_own)
+    refused = False
     if known:
         try:
             with np.errstate(all="ignore"):
@@ -227,12 +237,14 @@ def integrate_from_known_trajectories(
             states, left = solved.states, np.flatnonzero(~solved.done)
             cost = -(-solved.n_evaluated // _WORTH_A_STEP)
             memory.add(steps, effects, solved.new_trajectories_to_cache(theta))
-        except Exception:  # rates that take no more columns than there are runs
-            memory.useless = True
+            memory.n_refused = 0
+        except Exception:  # of the law: for these samples, or for more columns than there are runs
+            refused = True
     if left.size:
         motion, parameters, columns = law_and_inputs(left)
         every = states_by_step(motion, steps.places, parameters, columns, steps.schedule)
         there = np.stack([[*s.values()] for s in every], axis=2)
+        memory.n_refused += refused
         if states is None:
             states = there
         else:
@@ -378,8 +390,7 @@ def _stepping_function(
     """Return a function from the states before each step to those after, (n_states, n, n_steps, n_runs) each."""
     motion, parameters, columns = law_and_inputs(samples)
     n_states = len(motion.law.states)
-    first = {state: np.zeros((len(samples), steps.n_runs)) for state in motion.law.states}
-    inputs = LawInputs.arranged_by_runs(motion, steps.places, parameters, columns, first)
+    inputs = LawInputs.arranged_by_runs(motion.law, steps.places, parameters, columns)
     between = inputs.interpolator_of_steps(steps.gap_of_step)
     passing = time_gaps(steps.places, columns)[:, steps.gap_of_step]
     stepper = Stepper(motion, steps.schedule.method, between, passing.reshape(len(passing), -1))

@@ -33,7 +33,7 @@ from probewise.systems.table import RunTable
 
 FORMAT = "system/1"
 _ORIGINS = 1  # rule by which effects on a recording far from 0 count: files of earlier versions, from 0, have none
-_BEND = 1  # rule by which a bend has its ends: files of earlier versions, at those of the law's predictions, have none
+_BEND = 2  # rule by which a bend has its ends: files of earlier versions, without the sd that tells outliers, have less
 _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` writes"
 
 
@@ -175,6 +175,9 @@ class FittedSystem(NamedSamples):
             raise FileError(path, f"format {found!r}", f"{FORMAT!r}: {_WHAT}")
         try:
             own = document["simulator"]
+            fitted_to, here = f"{own['reading']} ({own['unit']})", f"{simulator.reading} ({simulator.unit})"
+            if fitted_to != here:  # simulators made in Python have no fingerprint
+                raise FileError(path, f"fitted to {fitted_to}", f"a model of {here}, as the simulator predicts")
             if own["fingerprint"] != simulator.fingerprint:
                 raise FileError(
                     path, f"fitted with {own['source']} of fingerprint {own['fingerprint']}",
@@ -250,8 +253,9 @@ def _stored_fit_to_json(known: StoredFit) -> dict[str, Any]:
         "time": table.time,
         "run": table.run,
         "columns": {name: _column_to_json(values) for name, values in table.columns.items()},
-        "predicted": known.predicted.tolist(),
-        "states": {name: values.tolist() for name, values in known.states.items()},
+        "predicted": _column_to_json(known.predicted),
+        "sd": known.sd,
+        "states": {name: _column_to_json(values) for name, values in known.states.items()},
         "held": list(known.held),
     }
 
@@ -266,11 +270,12 @@ def _column_to_json(values: NDArray[Any]) -> list[Any]:
 def _stored_fit_from_json(document: Mapping[str, Any], simulator: Simulator) -> StoredFit:
     columns = {name: _column_from_json(values) for name, values in document["columns"].items()}
     table = RunTable(columns, document["time"], document["run"])
-    states = {name: np.array(values, dtype=np.float64) for name, values in document["states"].items()}
+    states = {name: _column_from_json(values) for name, values in document["states"].items()}
     held = document.get("held")  # a file of an earlier version has none: only a law's columns were held then
     if held is None:
         held = table.covariates if simulator.law is not None and simulator.law.hold == "previous" else ()
-    return StoredFit(table, np.array(document["predicted"], dtype=np.float64), states, tuple(held))
+    sd = float(document.get("sd", 1.0))  # a file of an earlier version has none: only ends of bends depend on it
+    return StoredFit(table, _column_from_json(document["predicted"]), sd, states, tuple(held))
 
 
 def _column_from_json(values: list[Any]) -> NDArray[Any]:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import ParameterError
 from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
@@ -80,8 +79,7 @@ class LawWithEffects:
         self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
     ) -> Mapping[str, Any]:
         """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`."""
-        own = u.copy() if isinstance(u, _ReadTracker) else dict(u)
-        given = self.law.rates(dict(s), dict(p), own)  # copies, which a user's function may change
+        given = self.law.rates(dict(s), dict(p), dict(u))  # copies, which a user's function may change
         if self._has_no_effects:
             return given
         out = {state: given[state] for state in self.law.states}
@@ -124,13 +122,8 @@ class RowsInRuns:
     @cached_property
     def row_by_position_and_run(self) -> IntArray:
         """Row of the table at each position of each run, (n_places, n_runs); after its end, a run's last row."""
-        table, by_run = self.table, self.table.rows_by_scan()
-        for name, rows in zip(table.scan_names, by_run, strict=True):
-            falls = np.flatnonzero(np.diff(table.time_s[rows]) < 0)
-            if falls.size:
-                at = int(rows[falls[0] + 1])
-                least = f"{table.time_s[rows[falls[0]]]:g} or more, since time does not fall within run {name}"
-                raise ParameterError(f"column {table.time!r} in row {at + 2}", float(table.time_s[at]), least)
+        self.table.require_rising_time()
+        by_run = self.table.rows_by_scan()
         longest = max(len(rows) for rows in by_run)
         return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
 
@@ -233,7 +226,7 @@ def states_by_step(
     gaps = time_gaps(places, columns)
     s = motion.clip_and_stop_states({}, dict(start))
     with np.errstate(all="ignore"):
-        given_there = LawInputs.arranged_by_runs(motion, places, parameters, columns, start)
+        given_there = LawInputs.arranged_by_runs(motion.law, places, parameters, columns)
         yield s
         for k, n in enumerate(schedule.n_steps.tolist()):
             stepper = Stepper(motion, schedule.method, given_there.interpolator_of_gap(k), gaps[:, k])
@@ -393,17 +386,13 @@ class LawInputs:
     @classmethod
     def arranged_by_runs(
         cls,
-        motion: LawWithEffects,
+        law: Law,
         places: RowsInRuns,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
-        start: Mapping[str, FloatArray],
     ) -> LawInputs:
-        """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
-
-        Columns that the law does not read are left out; the law is evaluated once, at the states `start`, to find them.
-        """
-        rows, law, time = places.row_by_position_and_run, motion.law, places.table.time
+        """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs."""
+        rows, time = places.row_by_position_and_run, places.table.time
         constant: dict[str, Any] = {}
         moving: dict[str, FloatArray] = {}
         for name, values in parameters.items():
@@ -412,16 +401,11 @@ class LawInputs:
                 constant[name] = own[:, 0]
             else:
                 moving[name] = own
-        first = {name: _values_at_rows(values, rows[:1])[:, 0] for name, values in columns.items()}
-        asked = _ReadTracker(first)
-        motion.rates(start, {**constant, **{name: values[:, 0] for name, values in moving.items()}}, asked, {})
         sloping: dict[str, FloatArray] = {}
         held: dict[str, NDArray[Any]] = {}
-        for name in asked.names:
-            if name not in columns:  # one that the law adds itself
-                continue
-            slopes = name == time or (law.hold == "linear" and columns[name].dtype == np.float64)
-            (sloping if slopes else held)[name] = _values_at_rows(columns[name], rows)
+        for name, values in columns.items():
+            slopes = name == time or (law.hold == "linear" and values.dtype == np.float64)
+            (sloping if slopes else held)[name] = _values_at_rows(values, rows)
         return cls(constant, moving, held, sloping)
 
     def interpolator_of_gap(self, k: int) -> Callable[[Any], Pair]:
@@ -447,46 +431,6 @@ class LawInputs:
         sloping = {name: value_and_rise(v) for name, v in self.sloping.items()}
         held = {name: flattened(v[:, gap]) for name, v in self.held.items()}
         return _interpolator(constant, moving, held, sloping)
-
-
-class _ReadTracker(dict[str, Any]):
-    """A mapping of columns that records which of them a law reads."""
-
-    def __init__(self, columns: Mapping[str, Any]) -> None:
-        super().__init__(columns)
-        self.names: dict[str, None] = {}
-
-    def __getitem__(self, name: str) -> Any:
-        if name in self:
-            self.names[name] = None
-        return super().__getitem__(name)
-
-    def copy(self) -> _ReadTracker:
-        """Return a copy whose reads are recorded here."""
-        out = _ReadTracker(dict(super().items()))
-        out.names = self.names
-        return out
-
-    def get(self, name: str, default: Any = None) -> Any:
-        if name in self:
-            self.names[name] = None
-        return super().get(name, default)
-
-    def __iter__(self) -> Iterator[str]:
-        self.names |= dict.fromkeys(super().keys())
-        return super().__iter__()
-
-    def keys(self) -> Any:
-        self.names |= dict.fromkeys(super().keys())
-        return super().keys()
-
-    def values(self) -> Any:
-        self.names |= dict.fromkeys(super().keys())
-        return super().values()
-
-    def items(self) -> Any:
-        self.names |= dict.fromkeys(super().keys())
-        return super().items()
 
 
 def _interpolator(

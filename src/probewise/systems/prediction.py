@@ -36,6 +36,7 @@ from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, covariate_of_column, relative_sds_of_column
 
+_OF_A_COLUMN = "sensitivity:", "depends:"  # effects, besides those on an input, that name a column last
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
 _SOME = 200  # samples used to estimate the scatter of predictions in each row
@@ -324,14 +325,26 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
 
 
 def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
-    """Return the names of the recording's columns of numbers that effects act on or name in formulas."""
+    """Return the names of the recording's columns of numbers that effects act on or name in formulas.
+
+    A column may be named like a state or a parameter, on which other effects act.
+    """
     assert fitted.known is not None
-    known_names = [name for name in fitted.effects if not name.startswith(PROPOSAL)]
-    targets = [f"{name.removesuffix(AGAIN)}:" for name in known_names]
-    in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
     columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
-    named = {name for name in columns if any(f":{name}:" in target for target in targets)}
-    return named | {name for name in columns if covariate_of_column(name) in in_formulas}
+    in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
+    targets = {
+        target
+        for name, form in forms.items()
+        if form.stage is Stage.INPUT or name.startswith(_OF_A_COLUMN)
+        for target in _possible_targets(name.removesuffix(AGAIN))
+    }
+    return {name for name in columns if name in targets or covariate_of_column(name) in in_formulas}
+
+
+def _possible_targets(name: str) -> list[str]:
+    """Return what an effect's name may end with after a colon; names of columns may contain colons."""
+    parts = name.split(":")
+    return [":".join(parts[k:]) for k in range(1, len(parts))]
 
 
 def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:

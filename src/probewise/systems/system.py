@@ -82,6 +82,9 @@ class System:
         for name in simulator.controls:
             if name not in table.columns:
                 raise ParameterError("controls", name, f"a column of the table: {', '.join(table.columns)}")
+        if not columns_without_reading(simulator, table):
+            allowed = "a column besides the reading, such as the time or the number of each row"
+            raise ParameterError("columns", list(table.columns), allowed)
         bare = cls(simulator, table.scan_names)
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])

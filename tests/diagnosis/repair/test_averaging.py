@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from heater import ABOUT
 
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.repair.averaging import can_share_one_model, mix_over_hypotheses, mix_over_orders
@@ -14,6 +15,7 @@ from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import UNNAMED, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import ACCURATE_NODES
+from probewise.systems.forms import bind_forms
 
 PLAN = two_way_plan()
 EXTENT = Extent(10.0, 60.0, PLAN)
@@ -116,3 +118,13 @@ def test_what_does_not_fit_into_one_model():
     assert can_share_one_model([first], [BUILT["lag"]])
     assert can_share_one_model([BUILT["lag"]], [dataclasses.replace(BUILT["lag"])])
     assert not can_share_one_model([SimpleNamespace(name="own", nothing=None)], [BUILT["lag"]])
+
+
+def test_variants_of_a_form_share_one_model_unless_they_act_otherwise():
+    """A step in one interval and in another are one action with other priors; a factor and a slope are two."""
+    step = bind_forms(ABOUT)["offset_step"]
+    first, second = step.variants()[:2]
+    assert can_share_one_model([first], [second])
+    assert step.variants()[0] is first
+    assert can_share_one_model([first], [step.with_fewer_variants().variants()[0]])
+    assert not can_share_one_model([first], [dataclasses.replace(first, act=lambda value, theta, rows: value)])

@@ -47,6 +47,8 @@ def test_what_has_a_chance_is_refitted_and_is_as_probable_as_by_another_search(p
     assert len(stages) == len(finer) < len(first.evidences.fits)
     assert found.prepared.null.max_step == found.prepared.apparatus.system.max_step == 0.01
     assert all(null.max_step == 0.01 for null in found.nulls.values())
+    # Effects were bound to the predictions of the coarser step, and are stored with them.
+    assert found.prepared.apparatus.about is first.prepared.apparatus.about
 
 
 def test_a_search_that_errors_of_the_integration_may_have_led_is_made_again(prepared):

@@ -90,6 +90,18 @@ def test_an_sd_of_0_where_nothing_was_read_does_not_count():
     assert "noise 0.05 V" in audit_system(simulator, table).assumed
 
 
+def test_where_all_times_are_equal_rows_count():
+    simulator, table = _TABLES["all times equal"]
+    about = prepare_system(simulator, table_for(simulator, table)).apparatus
+    np.testing.assert_array_equal(about.covariate_values_by_name(_Y)["row"], np.arange(_N))
+
+
+def test_a_table_of_readings_alone_is_refused():
+    constant = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"])
+    with pytest.raises(ParameterError, match=r"columns is \['y'\]; allowed: a column besides the reading"):
+        prepare_system(constant, table_for(constant, {"y": _Y}))
+
+
 def test_a_row_that_no_reading_can_be_predicted_for_is_refused():
     """Without a reading too: no effect on the mean was looked for, since none had a finite change there."""
     x = np.where(np.arange(_N) < 5, -1.0, _X + 1)

@@ -11,6 +11,7 @@ from probewise.errors import ParameterError
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.proposals import formula_forms
+from probewise.systems.forms.readings import values_at_earlier_times
 from probewise.systems.motion import LawWithEffects
 
 SD = 0.01
@@ -119,6 +120,12 @@ def test_an_input_delay_looks_the_column_up_as_it_was():
         drive = np.interp(_T[rows] - 0.4, _T[rows], TABLE.columns["drive"][rows])
         expected[rows] = ABOUT.theta[0, 0] + ABOUT.theta[0, 1] * drive
     np.testing.assert_allclose(_read("input_delay:drive", 0.4), expected, atol=1e-12)
+
+
+def test_a_delay_of_nothing_changes_nothing_where_rows_share_a_time():
+    values = np.array([[1.0, 2.0, 3.0, 4.0]])
+    found = values_at_earlier_times(np.array([0.0, 0.0, 1.0, 1.0]), values, np.array([0.0, 0.5]))
+    np.testing.assert_array_equal(found, [[1.0, 2.0, 3.0, 4.0], [1.0, 1.0, 2.5, 2.5]])
 
 
 def test_a_lag_goes_towards_what_it_should_read():
@@ -311,6 +318,11 @@ def test_two_settlings_add_up_at_the_start_of_each_run():
     setting = form.start(form.bank()[0], np.array([2.0, -3.0]))
     typical = form.bank()[0, 0, 0]
     np.testing.assert_allclose(setting[:2], [2 * typical, -3 * typical])
+    turned = form.apply(np.zeros((1, N_ROWS)), np.array([[-0.8, 0.5, 2.0, 0.2]]), TABLE)[0]
+    np.testing.assert_allclose(turned, found, atol=1e-12)
+    assert form.n_peaks == 2  # for the two may be exchanged, and their priors are the same
+    density = form.prior.log_prob(np.array([[0.5, -0.8, 0.2, 2.0], [-0.8, 0.5, 2.0, 0.2]]))
+    assert density[0] == pytest.approx(density[1])
 
 
 def test_a_dose_is_the_integral_since_the_start_of_the_run_and_saturates():

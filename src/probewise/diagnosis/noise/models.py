@@ -138,7 +138,8 @@ class NoiseModel:
         sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
         lost_share = value_at_node(noise.lost_share)
         value = value_at_node(noise.lost_value)
-        lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * (1 + abs(value))) & (lost_share > 0)
+        alike = np.isclose(self._usable_readings, value, rtol=1e-9, atol=1e-9 * float(np.ptp(self._usable_readings)))
+        lost = far & alike & (lost_share > 0)
         carry = np.where(
             self._n_rows_since_previous_in_scan > 0,
             value_at_node(noise.rho) ** np.maximum(self._n_rows_since_previous_in_scan, 1),
@@ -218,7 +219,7 @@ def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -
     """
     if not ends:
         return -math.log(cells)
-    at_end = any(abs(value - end) <= 1e-9 * (1 + abs(end)) for end in ends)
+    at_end = any(abs(value - end) <= 1e-9 * (max(ends) - min(ends) + abs(end)) for end in ends)
     return math.log(0.5 * at_end / len(ends) + 0.5 / cells)
 
 

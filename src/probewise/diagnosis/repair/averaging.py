@@ -49,12 +49,19 @@ def mix_over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: 
 def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
     """Return whether hypotheses of these effects can be combined in one model.
 
-    Shared effects must be equal, bound to the same scans; all others need parameters at which they change nothing.
+    Shared effects must change readings alike, bound to the same scans; all others need parameters at which they change
+    nothing.
     """
     known = {effect.name: effect for effect in first}
     shared = {effect.name for effect in second if effect.name in known}
-    alike = all(known[effect.name] == effect for effect in second if effect.name in shared)
+    alike = all(_change_readings_alike(known[effect.name], effect) for effect in second if effect.name in shared)
     return alike and all(effect.nothing for effect in (*first, *second) if effect.name not in shared)
+
+
+def _change_readings_alike(one: NamedEffect[Any], other: NamedEffect[Any]) -> bool:
+    """Return whether effects are equal, or variants of one form with the same action: these differ in priors alone."""
+    act = getattr(one, "act", None)
+    return one == other or (act is not None and act is getattr(other, "act", None))
 
 
 def mix_over_hypotheses(

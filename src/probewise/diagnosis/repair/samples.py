@@ -155,7 +155,8 @@ def sample_model(
     residuals = recording.readings[recording.usable] - predicted
     sigma = law.likeliest_sigma(law(residuals.T))
     noise_sd = sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, n_samples))
-    noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
+    largest = float(np.abs(recording.readings[recording.usable]).max()) or 1.0
+    noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + largest * 1e-12)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
     effects = (*found.model.effects, *on_noise)
     null = found.model.sensor

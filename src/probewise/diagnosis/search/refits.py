@@ -80,7 +80,8 @@ class Refits:
         """
         found = self._fit_from_best_start(model, starts, law, max_steps)
         if beyond is not None and not law.has_memory and not _improves_fit(found, beyond.found, law):
-            return WeighedFit.of(found, law, beyond.evidence, 0.0)
+            plain = beyond.with_log_evidence_shifted(-beyond.log_prior_factor).evidence
+            return WeighedFit.of(found, law, plain, beyond.log_detectable)
         for _ in range(2):
             evidence = self.noises.evidence_by_noise(found)
             best = self.noises.best_evidence(evidence).likeliest_law

@@ -86,15 +86,19 @@ class SimulatorApparatus:
         The system, its table, the first fit, and the sd of a reading.
     stop
         The level at which the meter stops without having declared it, if the readings show one.
+    finer
+        The system with a finer integration step, if the leading hypotheses were refitted with one. Effects keep the
+        scales and origins of `about`.
     """
 
     about: ReferenceFit
     stop: MeterStop | None = None
+    finer: System | None = None
 
     @property
     def system(self) -> System:
         """The simulator over the runs of the table."""
-        return self.about.system
+        return self.finer or self.about.system
 
     @property
     def rows_are_in_order(self) -> bool:
@@ -208,7 +212,8 @@ class SimulatorApparatus:
     def covariate_values_by_name(self, predicted: FloatArray) -> dict[str, FloatArray]:
         """Return every covariate by name at each row, (n_points,), for predictions (n_points,); the run is last."""
         table, own = self.about.table, self.system.simulator
-        out = {"time" if table.has_varying_time else "row": table.time_s, "level": predicted}
+        along = {"time": table.time_s} if table.has_varying_time else {"row": table.row_number}
+        out = {**along, "level": predicted}
         columns = {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
         out |= {covariate_of_column(name): v for name, v in columns.items()}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}

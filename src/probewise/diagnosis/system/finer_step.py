@@ -94,9 +94,7 @@ def searched_at_step(searched: Searched, max_step: float, *, progress: Progress 
         prepared=replace(
             prepared,
             null=finer,
-            apparatus=replace(
-                apparatus, about=replace(apparatus.about, system=replace(apparatus.system, max_step=max_step))
-            ),
+            apparatus=replace(apparatus, finer=replace(apparatus.system, max_step=max_step)),
         ),
         nulls=dict.fromkeys(searched.nulls, finer),
     ).with_evidences(replace(searched.evidences, fits=fits, unknown=unknown))

@@ -219,8 +219,12 @@ def _nested_samples_and_evidence(
     z = np.clip(found.samples(N_SAMPLES, rng=rng), -FARTHEST, FARTHEST)
     law, usable = noise.likeliest_law, prepared.recording.usable
     residuals = prepared.recording.readings[usable] - null.found.model.predict(z)[:, usable]
-    sigma = law.likeliest_sigma(law(residuals.T))
-    noise_sd = sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, N_SAMPLES))
+    if law.flat:
+        nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
+        noise_sd = np.array([own.sigma * own.sd_factor_of_rounding for own in noise.nodes.laws])[nodes]
+    else:
+        sigma = law.likeliest_sigma(law(residuals.T))
+        noise_sd = sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, N_SAMPLES))
     theta = cast(Any, null.found.model.sensor).theta(z)
     evidence = Evidence(found.log_z + null.log_prior_factor, found.log_z_error, method)
     return replace(samples, theta=theta, noise_sd=noise_sd), evidence

@@ -97,6 +97,8 @@ class Form:
         leaves them out, for other readings would have suggested others.
     shared_scale
         Whether its parameters, all with the same prior, are about as large as each other: see `SharedScalePrior`.
+    exchangeable
+        Whether it is the sum of two terms of the same kind and priors, so that each mode is there twice.
     """
 
     name: str
@@ -118,6 +120,7 @@ class Form:
     counted_from: str = ""
     suggested: FloatArray | None = None
     shared_scale: bool = False
+    exchangeable: bool = False
 
     @cached_property
     def prior(self) -> Product | SharedScalePrior:
@@ -154,9 +157,12 @@ class Form:
 
     @property
     def n_peaks(self) -> int:
-        """Number of equivalent posterior modes: 1; 2 with a phase (it spans two turns); 4 for a wave's second copy."""
+        """Number of equivalent posterior modes within the prior.
+
+        A phase spans two turns, which doubles it; a wave's second copy may be exchanged with the first.
+        """
         if "phase" not in self.marginals:
-            return 1
+            return 2 if self.exchangeable else 1
         return 2 if name_of_first_copy(self.name) is None else 4
 
     @property
@@ -175,7 +181,14 @@ class Form:
         return ()
 
     def variants(self) -> tuple[Form, ...]:
-        """Return itself and its alternatives, or one variant for each interval in which its change point may lie."""
+        """Return itself and its alternatives, or one variant for each interval in which its change point may lie.
+
+        They are the same objects at each call, so that two fits with the same variant have equal effects.
+        """
+        return self._variants
+
+    @cached_property
+    def _variants(self) -> tuple[Form, ...]:
         if self.change_points is None:
             return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
         last = list(self.marginals)[-1]

@@ -167,4 +167,5 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
             "proposal, not a known effect"
         ),
         expression=text,
+        exchangeable=True,
     )

@@ -250,7 +250,8 @@ def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray
     share = np.clip((asked - time[after - 1]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
     values = np.broadcast_to(values, asked.shape)
     low, high = np.take_along_axis(values, after - 1, axis=1), np.take_along_axis(values, after, axis=1)
-    return np.asarray(low + share * (high - low))
+    # Where two rows have the same time, interpolation would take the last for the first.
+    return np.where(by[:, None] == 0, values, low + share * (high - low))
 
 
 def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:

@@ -26,18 +26,20 @@ _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_r
 class StoredFit:
     """The part of a reference fit that rebinding needs: its table, and predicted readings and states, (n_points,) each.
 
-    `held` are the columns that the model holds constant from row to row.
+    `sd` is the noise sd of a reading, by which outlying readings are told where a bend gets its ends. `held` are the
+    columns that the model holds constant from row to row.
     """
 
     table: RunTable
     predicted: FloatArray
+    sd: float
     states: Mapping[str, FloatArray] = field(default_factory=dict)
     held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class _StoredReferenceFit(ReferenceFit):
-    """A reference fit known by its stored predictions: nothing is simulated; sizes, for priors only, are arbitrary."""
+    """A reference fit known by its stored predictions: nothing is simulated; amplitudes of priors are arbitrary."""
 
     known: StoredFit | None = None
 
@@ -75,7 +77,7 @@ class _StoredReferenceFit(ReferenceFit):
 def extract_stored_fit(about: ReferenceFit) -> StoredFit:
     """Return the part of a reference fit from which its forms can be bound again."""
     held = tuple(name for name in driving_columns(about) if about.is_held_between_rows(name))
-    return StoredFit(about.table, about.predicted, about.states, held)
+    return StoredFit(about.table, about.predicted, about.sd, about.states, held)
 
 
 def rebind_forms(
@@ -105,7 +107,7 @@ def rebind_forms(
     if longer is not known.table:
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
         states = {name: values[rows] for name, values in known.states.items()}
-        beyond = StoredFit(longer, known.predicted[rows], states, known.held)
+        beyond = StoredFit(longer, known.predicted[rows], known.sd, states, known.held)
         per_run = [name for name in wanted if has_value_per_run(name)]
         found |= _bind_wanted_forms(per_run, simulator, beyond)
     lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
@@ -124,7 +126,7 @@ def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit
     if not wanted:
         return {}
     system = System(simulator, known.table.scan_names)
-    about = _StoredReferenceFit(system, known.table, np.zeros(system.n_params), 1.0, known)
+    about = _StoredReferenceFit(system, known.table, np.zeros(system.n_params), known.sd, known=known)
     found = bind_forms(about)
     if any(name.startswith(PROPOSAL) for name in wanted):
         found |= {form.name: form for form in formula_forms(about)}

@@ -128,14 +128,14 @@ def test_a_case_of_which_clean_is_said_is_not_called_right_though_the_right_name
 
 def test_alarms_and_names_on_clean_recordings_are_counted():
     quiet, loud = _case(), _case(p_value=0.01, said=["lag"])
-    assert _row([quiet, loud], "false alarms, clean, alpha .05").found.value == 0.5
-    assert _row([quiet, loud], "physics named, clean").found.value == 0.5
+    assert _row([quiet, loud], "false alarms, no effect, white noise, alpha .05").found.value == 0.5
+    assert _row([quiet, loud], "physics named, no effect, white noise").found.value == 0.5
 
 
 def test_noise_of_another_kind_is_scored_by_its_name():
     told = _case(truth=["outliers"], other_noise=True, noise_model="outliers", p_value=0.4)
     missed = _case(truth=["outliers"], said=[], other_noise=True, noise_model="outliers", p_value=0.4)
-    assert _row([told, missed], "noise told as it is, other noise").found.value == 0.5
+    assert _row([told, missed], "noise named right, no effect, other noise").found.value == 0.5
     assert _row([told], "outliers").found.value == 0.0
 
 
@@ -164,8 +164,11 @@ def test_where_the_right_model_gains_nothing_there_is_no_share():
 def test_what_is_on_no_list_is_unknown_or_as_good_as_the_true_law(said, gains, told, named):
     strange = _hidden("strange_switch:u", 20.0, on_the_list=False)
     case = _case("outside", 20.0, truth=["unknown"], hides=[strange], said=said, gains=gains)
-    assert _row([case], "not on the list, lambda 20: unknown, or as good as the true law").found.value == told
-    assert _row([case], "by a formula or a name").found.value == named
+    assert (
+        _row([case], "out of vocabulary, lambda 20: unknown, a right name, or 0.8 of the held-out gain").found.value
+        == told
+    )
+    assert _row([case], "the same without unknown").found.value == named
 
 
 def test_intervals_are_counted_one_by_one():

@@ -94,7 +94,7 @@ def test_pictures_that_the_front_pages_show_are_there(page):
         (r"\bSSF\b", "spatial sensitivity function"),
         (r"\blambda\b|λ", "standard deviations of the noise"),
         (r"\bnats?\b", "unit of natural log probability"),
-        (r"\balias", "same trace"),
+        (r"\balias", "by less than 3 nats"),
     ],
     ids=["SSF", "lambda", "nat", "alias"],
 )

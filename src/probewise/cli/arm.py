@@ -52,14 +52,13 @@ from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Reading, RequestToPerson, SimulatedArm
+    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, RequestToPerson, SimulatedArm
     from probewise.cli._bench import SimulatedBench
     from probewise.recordings import Plan
 
 MARKS = "marks"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
 _MOST_READINGS = 100_000  # limit of one scan
-_OFF_PLAN_MM = 5.0  # tolerance in mm, since a user's own instrument may report the true place
 BLOCK_MM = 32.0
 WHITE = "uniform:1"
 _HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of reading upwards
@@ -506,9 +505,10 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise._progress import progress_shown
     from probewise.arm import carry_out, recording_of_readings
     from probewise.arm.carry_out import BY_HAND_S, duration_s
+    from probewise.cli._earlier_readings import earlier_readings, read_unfinished_recording
     from probewise.cli._person import PersonAtBench, is_pty
     from probewise.cli._sheet_check import SheetCheck
-    from probewise.recordings import read_recording, write_recording
+    from probewise.recordings import write_recording
 
     named = arguments.plan in SHIPPED
     out = checked_output_file(arguments.out, *([] if named else [Path(arguments.plan)]))
@@ -523,13 +523,16 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         plan = plan_for_lego_arm(asked, geometry)
     width, height = (0.0, 0.0) if own else geometry.field_mm
     origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
-    taken = _earlier_readings(out, plan, resume=arguments.resume, dry=arguments.dry_run)
+    is_lego = arguments.arm is None or parse_arm(arguments.arm).is_lego
+    taken = [] if arguments.dry_run else earlier_readings(out, plan, resume=arguments.resume, is_lego=is_lego)
     start_s = taken[-1].time_s if taken else 0.0
 
     def kept_message() -> str:
         if not out.exists():
             return "nothing was read"
-        return message_to_resume(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
+        return message_to_resume(
+            out, len(read_unfinished_recording(out)), "reading", arguments, "--resume", of=len(plan)
+        )
 
     instrument, bench = _open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
     _warn_and_confirm_lowering(arguments, instrument, geometry)
@@ -571,32 +574,6 @@ def _plan_for_simulated_sensor(plan: Plan, sensor: Path) -> Plan:
     from probewise.calibration import read_sensor
 
     return without_measured_covariates(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
-
-
-def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
-    """List the readings of an earlier session, from `out`; none in a dry run, or without `resume`.
-
-    Raises FileError if they do not match the plan's first rows, or the file exists without `resume`.
-    """
-    import numpy as np
-
-    from probewise.arm import readings_of_recording
-    from probewise.recordings import read_recording
-
-    if dry:
-        return []
-    if not resume:
-        if out.exists():
-            raise FileError(out, "the file exists already", "--resume to continue it, or another --out")
-        return []
-    before = read_recording(out)
-    rows, first = before.plan, plan.take(np.arange(min(len(before), len(plan))))
-    same_length = len(first) == len(before)
-    off_mm = [abs(getattr(rows, axis) - getattr(first, axis)) for axis in ("x_mm", "y_mm")] if same_length else []
-    same = same_length and all((off <= _OFF_PLAN_MM).all() for off in off_mm)
-    if not same or [rows.pattern_names[k] for k in rows.pattern] != [first.pattern_names[k] for k in first.pattern]:
-        raise FileError(out, "readings of another plan", "the first rows of this plan, from an earlier session")
-    return readings_of_recording(before)
 
 
 def _open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:

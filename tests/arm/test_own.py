@@ -355,12 +355,22 @@ def test_where_it_knows_that_it_read_is_written_in_the_plans_frame():
         (Own(reachable=lambda p: p[:, 0] < 105), {}, ReachError, r"the place of row 3 of the plan \(mm\) is \(110"),
         (Own(), {"covariates": {"led": [1, 1, 0, 0]}}, ParameterError, "the plan's led is 0.0; allowed: 1"),
         (Own(), {"height_mm": 14, "covariates": {"height_mm": [14, 10, 10, 10]}}, ParameterError, "height_mm is 10.0"),
+        (
+            Own(),
+            {"covariates": {"height_mm": [math.nan, 10, 14, 20]}},
+            ParameterError,
+            "height_mm is 14.0; allowed: 10",
+        ),
     ],
 )
 def test_a_plan_that_it_cannot_carry_out_is_refused_before_anything_moves(own, changes, error, message):
     with pytest.raises(error, match=message):
         taken(own, [], plan(**changes))
     assert own.asked == []
+
+
+def test_one_height_in_every_row_is_where_an_instrument_that_does_not_lift_reads():
+    assert len(taken(Own(), [], plan(covariates={"height_mm": [math.nan, 10, 10, 10]}))) == 4
 
 
 def test_any_object_that_measures_carries_out_a_plan():

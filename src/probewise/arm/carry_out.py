@@ -194,8 +194,8 @@ def _can_turn_sensor(arm: OwnInstrument | SimulatedArm) -> bool:
     return isinstance(arm, SimulatedArm) or arm.can_turn
 
 
-def _can_lift_sensor(arm: OwnInstrument | SimulatedArm) -> bool:
-    return isinstance(arm, SimulatedArm) or arm.can_lift
+def _can_lift_sensor(arm: LegoArm | OwnInstrument | SimulatedArm) -> bool:
+    return isinstance(arm, SimulatedArm) or (isinstance(arm, OwnInstrument) and arm.can_lift)
 
 
 def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
@@ -260,13 +260,13 @@ def reachable_places_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Reachabl
 
 def _require_feasible_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -> None:
     """Raise ParameterError if the plan needs the LED off, or a height at which this arm does not read."""
-    there = {"led": 1.0}
-    if isinstance(arm, LegoArm):
-        there["height_mm"] = arm.geometry.read_height_mm
-    elif not _can_lift_sensor(arm) and plan.instrumentation.height_mm is not None:
-        there["height_mm"] = plan.instrumentation.height_mm
+    height_mm = arm.geometry.read_height_mm if isinstance(arm, LegoArm) else plan.instrumentation.height_mm
+    there = {"led": 1.0} | ({} if _can_lift_sensor(arm) else {"height_mm": height_mm})
     for name, value in there.items():
         wanted = plan.covariates.get(name, np.empty(0))
-        other = wanted[np.isfinite(wanted) & (wanted != value)]
-        if other.size:
-            raise ParameterError(f"the plan's {name}", float(other[0]), f"{value:g}, which this arm reads at")
+        wanted = wanted[np.isfinite(wanted)]
+        if value is None and wanted.size:  # an arm that reads at one height, which the plan alone says
+            value = float(wanted[0])
+        if (wanted != value).any():
+            found = float(wanted[wanted != value][0])
+            raise ParameterError(f"the plan's {name}", found, f"{value:g} in every row: this arm reads at no other")

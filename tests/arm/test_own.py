@@ -90,6 +90,22 @@ BAD = {
         {"value": 3, "orientation_deg": 90},
         "a name in what measure returned is 'orientation_deg'; allowed: .*orientation_rad",
     ),
+    "a session": (
+        {"value": 3, "session": 2},
+        "a name in what measure returned is 'session'; allowed: a name that is",
+    ),
+    "a Reading with a time beside it": (
+        Reading(1.0, HERE, 1.0, {"time_s": 1.0}),
+        "a name in what measure returned is 'time_s'; allowed: .* time_s and pose of a Reading",
+    ),
+    "a Reading with a place beside it": (
+        Reading(1.0, HERE, 1.0, {"x_mm": 1.0}),
+        "a name in what measure returned is 'x_mm'",
+    ),
+    "a Reading with an angle beside it": (
+        Reading(1.0, HERE, 1.0, {"orientation_rad": 1.0}),
+        "a name in what measure returned is 'orientation_rad'",
+    ),
     "a Reading that is infinite": (Reading(math.inf, HERE, 1.0), "value of what measure returned is inf"),
     "a Reading at no time": (Reading(1.0, HERE, math.nan), "time_s of what measure returned is nan"),
     "a Reading nowhere": (Reading(1.0, Pose(math.nan, 2.0), 1.0), "x_mm of what measure returned is nan"),

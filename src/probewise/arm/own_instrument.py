@@ -25,11 +25,12 @@ from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
 from probewise.errors import FileError, LinkError, ParameterError, ShapeError
+from probewise.recordings.columns import KNOWN, SESSION
 from probewise.recordings.python_file import error_on_one_line, run_python_file
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
-_TAKEN = ("reading", "scan", "pattern", "orientation_deg")  # names of a recording's columns, not allowed for covariates
+_TAKEN = (*KNOWN, SESSION)
 
 
 class Measures(Protocol):
@@ -206,13 +207,16 @@ class OwnInstrument:
             return Reading(_checked_value("what measure returned", found), pose, now_s)
         if "value" not in found:
             raise ParameterError("what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
-        known = {name: _checked_covariate(name, number) for name, number in found.items() if name != "value"}
-        time_s = known.pop("time_s", now_s)
-        place = {name: known.pop(name, getattr(pose, name)) for name in _OF_THE_POSE}
-        for name, number in (("time_s", time_s), *place.items()):
+        own = {"time_s": now_s} | {name: getattr(pose, name) for name in _OF_THE_POSE}
+        known = {
+            name: _checked_covariate(name, number) for name, number in found.items() if name not in (*own, "value")
+        }
+        own = {name: _checked_covariate_value(name, found.get(name, usual)) for name, usual in own.items()}
+        for name, number in own.items():
             checked_finite_number(f"{name} of what measure returned", number)
+        time_s = own.pop("time_s")
         value = _checked_value("value of what measure returned", found["value"])
-        return Reading(value, Pose(**place, height_mm=pose.height_mm), time_s, known)
+        return Reading(value, Pose(**own, height_mm=pose.height_mm), time_s, known)
 
     @contextlib.contextmanager
     def _errors_located(self, what: str) -> Iterator[None]:
@@ -300,9 +304,19 @@ def _checked_reading(found: Reading) -> Reading:
 
 def _checked_covariate(name: object, number: object) -> float:
     """Return a covariate of a reading as a float, NaN if missing; ParameterError for a name that is not allowed."""
-    if not isinstance(name, str) or not name.isprintable() or name != name.strip() or name in ("", *_TAKEN):
-        taken = "no name that a recording has a column for" if name in _TAKEN else "a printable text"
-        raise ParameterError("a name in what measure returned", name, f"{taken}; of an angle: orientation_rad")
+    if name in _TAKEN:
+        allowed = (
+            "a name that is no column of a recording; time and place are time_s, x_mm, y_mm, orientation_rad of a "
+            "dict, or time_s and pose of a Reading"
+        )
+        raise ParameterError("a name in what measure returned", name, allowed)
+    if not isinstance(name, str) or not name.isprintable() or name != name.strip() or not name:
+        raise ParameterError("a name in what measure returned", name, "a printable text without blanks around it")
+    return _checked_covariate_value(name, number)
+
+
+def _checked_covariate_value(name: str, number: object) -> float:
+    """Return a number beside a reading as a float, NaN if missing."""
     number = number.item() if isinstance(number, np.generic | np.ndarray) and np.ndim(number) == 0 else number
     if not isinstance(number, Real) or math.isinf(number):
         raise ParameterError(f"{name} of what measure returned", number, "a finite number, or nan where it is missing")

@@ -18,9 +18,8 @@ from probewise.recordings.table import MISSING, count_numbers
 
 _A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
 _THE_ONLY = "pattern"  # name of a single pattern that was given without one
-_KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
-
-
+KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
+"""Names of a table's columns that are no covariates; SESSION is none either."""
 SESSION = "session"
 """Name of the column of `Plan.sessions`."""
 A_SESSION = "a whole number from 0, the same throughout a scan"
@@ -125,7 +124,7 @@ def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -
         "covariates", columns, "what was logged beside the readings, by name: {'temperature_c': [21.3, ...]}"
     )
     for name in columns:
-        if name in (*_KNOWN, SESSION):
+        if name in (*KNOWN, SESSION):
             raise ParameterError("covariates", name, "a name that is no column of a recording; see its own argument")
     return {name: numbers_per_reading(name, values, n_points) for name, values in columns.items()}
 
@@ -152,7 +151,7 @@ def numeric_covariates_and_notes(columns: Mapping[str, ArrayLike]) -> tuple[dict
     """Return the numeric columns by name, without a recording's own but for `session`, and notes on the others."""
     out, notes = {}, []
     for name, values in columns.items():
-        if name in _KNOWN:
+        if name in KNOWN:
             continue
         try:
             out[name] = numbers_per_reading(name, texts_to_numbers(values))

@@ -20,7 +20,7 @@ from probewise.arm import (
     shipped_geometry_path,
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
-from probewise.errors import LinkError, ReachError
+from probewise.errors import LinkError, ParameterError, ReachError
 
 SHIPPED = read_geometry(shipped_geometry_path())
 PLACES = [(300.0, 200.0), (800.0, 450.0), (524.0, 60.0), (524.0, 320.0), (60.0, 300.0)]
@@ -244,6 +244,8 @@ def test_a_joint_can_be_turned_alone_as_far_as_the_guard_allows(bench):
             arm.turn_joint(0, math.radians(200))
         with pytest.raises(ReachError, match="the sensor's height while the shoulder moves"):
             arm.turn_joint(1, math.radians(-100))
+        with pytest.raises(ParameterError, match="by_rad is nan; allowed: a finite number"):
+            arm.turn_joint(0, math.nan)
 
 
 def test_the_battery_and_the_sensor_can_be_read_without_moving(bench):

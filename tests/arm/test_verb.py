@@ -104,6 +104,8 @@ def test_home_here_sets_the_counters_where_a_person_brought_the_arm(capsys):
     [
         (["jog", "wrist", "5"], "allowed: X,Y in mm; or base, shoulder, elbow, and degrees"),
         (["jog", "base", "far"], "a number of degrees"),
+        (["jog", "base", "nan"], "WHERE is 'nan'; allowed: a number of degrees"),
+        (["jog", "base", "inf"], "WHERE is 'inf'; allowed: a number of degrees"),
         (["jog", "300;200"], "X,Y in mm"),
         (["scan", "300,200", "400,nan"], "X,Y is '400,nan'"),
         (["jog", "5,5"], "a place on the field"),

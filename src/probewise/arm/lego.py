@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
+from probewise._kinds import checked_finite_number
 from probewise.arm.basics import Clock, Side
 from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped_to_pi
 from probewise.arm.instrument import Pose, Reading
@@ -286,9 +287,12 @@ class LegoArm:
         self._machine.keep_awake()
 
     def turn_joint(self, joint: int, by_rad: float) -> None:
-        """Turn one joint (0 to 2: base, shoulder, elbow) by an angle; ReachError if this would leave the limits."""
+        """Turn one joint (0 to 2: base, shoulder, elbow) by an angle; ReachError if this would leave the limits.
+
+        Raises ParameterError if the angle is not finite.
+        """
         angles = self.angles_rad
-        angles[joint] += by_rad
+        angles[joint] += checked_finite_number("by_rad", by_rad)
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
 
     turn = turn_joint  # its old name

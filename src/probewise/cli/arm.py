@@ -300,15 +300,23 @@ def _jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> N
                 if arguments.down:
                     _prompter(arguments, arm)("check the sensor's position; it will be raised again")
         case [joint, text] if joint in JOINTS:
-            try:
-                by_rad = math.radians(float(text))
-            except ValueError as error:
-                raise ParameterError("WHERE", text, "a number of degrees") from error
+            by_rad = math.radians(_parse_degrees(text))
             with _open_lego_arm(arguments, geometry) as arm:
                 arm.turn_joint(JOINTS.index(joint), by_rad)
                 _print_position(arm, quiet=arguments.quiet)
         case _:
             raise ParameterError("WHERE", " ".join(arguments.where), f"X,Y in mm; or {', '.join(JOINTS)}, and degrees")
+
+
+def _parse_degrees(text: str) -> float:
+    """Parse a finite number of degrees; raise ParameterError for anything else."""
+    try:
+        degrees = float(text)
+    except ValueError:
+        degrees = math.nan
+    if not math.isfinite(degrees):
+        raise ParameterError("WHERE", text, "a number of degrees")
+    return degrees
 
 
 def _bring_home(arguments: argparse.Namespace, geometry: Geometry) -> None:

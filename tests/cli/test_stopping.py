@@ -14,6 +14,7 @@ from probewise._signals import ENDING, SAME_S, defer_signals
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
+from probewise.cli._explore_pictures import _remove_earlier_results
 from probewise.cli._stopping import Stopped, raise_if_stopped, reporting_what_is_kept, stoppable
 from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
@@ -232,6 +233,36 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
     names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     results = {"report.html", "run.gif", "result.json", "samples.csv", "sensor.json"}
     assert names == {"journal.jsonl", "frames/001.png", "notes.txt"} | results
+
+
+@pytest.mark.parametrize("is_input", [False, True])
+def test_results_of_an_earlier_run_do_not_stand_beside_a_new_journal_when_it_is_stopped(
+    is_input, sensor_file, tmp_path, quick_frames, monkeypatch
+):
+    """Its sensor.json stays if it is the input of this run."""
+    drawn = exploration.robot_view_png
+
+    def stopped_at_the_second(*_, **__):
+        return signal.raise_signal(signal.SIGTERM) if (out / "frames" / "001.png").exists() else drawn()
+
+    monkeypatch.setattr(exploration, "robot_view_png", stopped_at_the_second)
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("result.json", "samples.csv", "report.html", "notes.txt"):
+        (out / name).write_text("old")
+    (out / "sensor.json").write_text(sensor_file.read_text())
+    words = command(out / "sensor.json" if is_input else sensor_file, out, "--max-readings", 2)
+    assert main(words) == 128 + signal.SIGTERM
+    left = {p.name for p in out.iterdir()}
+    assert left == {"journal.jsonl", "frames", "notes.txt"} | ({"sensor.json"} if is_input else set())
+
+
+def test_a_sensor_file_without_results_beside_it_is_no_earlier_result(sensor_file, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "sensor.json").write_text(sensor_file.read_text())
+    _remove_earlier_results(out, ())
+    assert (out / "sensor.json").exists()
 
 
 @pytest.mark.slow

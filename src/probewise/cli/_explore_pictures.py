@@ -18,7 +18,7 @@ from probewise.report import exploration as report
 from probewise.report.animation import animated_gif
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from probewise._arrays import FloatArray
     from probewise.experiment import Exploration, Step
@@ -26,12 +26,16 @@ if TYPE_CHECKING:
 
 @dataclass
 class Pictures:
-    """The pictures of a run: draws each step as it arrives, and keeps steps and pictures for the report."""
+    """The pictures of a run: draws each step as it arrives, and keeps steps and pictures for the report.
+
+    `files` are the run's input files, which stay where they are when results of an earlier run are removed from `out`.
+    """
 
     out: Path
     inputs: ExploreInputs
     live: bool
     truth_mm: FloatArray | None
+    files: Sequence[Path] = ()
     steps: list[Step] = field(default_factory=list)
     shadows: list[Step] = field(default_factory=list)
     """Steps of the other sensor model on the same readings."""
@@ -45,7 +49,7 @@ class Pictures:
         self.frames.append(self._draw_frame(step, shadow))
         raise_if_stopped()  # a signal may have damaged the picture
         if step.number == 1 and not step.replayed:
-            _remove_earlier_results(self.out)
+            _remove_earlier_results(self.out, self.files)
         folder = self.out / "frames"
         folder.mkdir(exist_ok=True)
         write_bytes_atomically(folder / f"{step.number:03d}.png", self.frames[-1])
@@ -73,7 +77,11 @@ class Pictures:
     def write_results(
         self, stage: StagedFiles, result: Exploration, *, seed: int, known: Mapping[str, float] | None
     ) -> None:
-        """Write report, animation, result.json, posterior samples, and the sensor model as learnt by the run."""
+        """Write report, animation, result.json, posterior samples and sensor.json.
+
+        The sensor is the one that the run was given, with the effect that the run found in it, if any; what a run with
+        --learn-sensor learnt of SSF and levels is not in it.
+        """
         beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
         page = report.page_html(
             result,
@@ -92,8 +100,12 @@ class Pictures:
         stage.write("sensor.json", learnt.to_json())
 
 
-def _remove_earlier_results(out: Path) -> None:
-    """Remove report, animation, live page and frames of an earlier run from `out`, so that two runs do not mix."""
-    for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png"):
+def _remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
+    """Remove the results of an earlier run from `out`, but none of `files`, so that two runs do not mix."""
+    # Without a result.json, a sensor.json is none of these results, but perhaps somebody's calibration.
+    of_machine = ("result.json", "samples.csv", "sensor.json") if (out / "result.json").exists() else ()
+    spared = {path.resolve() for path in files}
+    for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png", *of_machine):
         for path in out.glob(pattern):
-            path.unlink()
+            if path.resolve() not in spared:
+                path.unlink()

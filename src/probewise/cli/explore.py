@@ -176,7 +176,8 @@ def run(arguments: argparse.Namespace) -> int:
     warn_and_confirm_lowering(inputs.arm, site.arm, inputs.geometry)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
         warn_if_place_sd_large(inputs.geometry, inputs.experiment.stop_sd_mm)
-    pictures = Pictures(out, inputs, arguments.live, site.outline_mm)
+    read = [arguments.sensor, *([] if arguments.levels is None else tables_and_descriptions([arguments.levels]))]
+    pictures = Pictures(out, inputs, arguments.live, site.outline_mm, read)
     steps = pictures.steps
 
     def kept_message() -> str:
@@ -221,7 +222,6 @@ def run(arguments: argparse.Namespace) -> int:
             pictures.draw_and_write(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
     drawing = progress_shown(quiet=arguments.quiet)
-    read = [arguments.sensor, *([] if arguments.levels is None else tables_and_descriptions([arguments.levels]))]
     with (
         reporting_what_is_kept(kept_message, results=True),
         drawing as progress,

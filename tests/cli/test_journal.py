@@ -1,14 +1,17 @@
 """`probewise diagnose` on the journal of a run: the shape is not known, the sensor may be wrong all the same."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from mixtures import fixed_mixture
 
-from probewise.calibration import read_sensor
+from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.experiment import experiment_for
+from probewise.cli._journal import find_journal_sensor_file
+from probewise.errors import FileError
+from probewise.experiment import experiment_for, sensor_entry
 from probewise.recordings import Disc, Instrumentation, Plan, read_plan
 from probewise.scene import Circle, Field, KnownScene
 from probewise.sensor import Chain, FixedLevels
@@ -95,6 +98,27 @@ def refused(capsys, *arguments):
 def test_a_journal_needs_the_sensor_of_its_run(journal_file, tmp_path, capsys):
     assert "--sensor" in refused(capsys, "diagnose", journal_file, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("named", ["sensor.json", "../sensors/sensor.json"])
+def test_a_journal_finds_its_sensor_where_results_took_its_place(named, journal_file, sensor_file):
+    """As explore --sensor DIR/sensor.json --out DIR leaves it when an effect is found: renamed."""
+    sensor = read_sensor(sensor_file)
+    sensor_file.unlink()
+    first, *rest = journal_file.read_text().splitlines()
+    first = json.dumps({**json.loads(first), **sensor_entry(sensor, named)})
+    journal_file.write_text("\n".join([first, *rest]) + "\n")
+    place = journal_file.parent / named
+    place.parent.mkdir(exist_ok=True)
+    write_sensor(sensor, place)
+    assert find_journal_sensor_file(journal_file) == place
+    place.rename(place.with_name("sensor_kept_2.json"))
+    for name in ("sensor.json", "sensor_kept.json"):
+        write_sensor(dataclasses.replace(sensor, notes=(f"another, {name}",)), place.with_name(name))
+    assert find_journal_sensor_file(journal_file) == place.with_name("sensor_kept_2.json")
+    place.with_name("sensor_kept_2.json").unlink()
+    with pytest.raises(FileError, match="is another by now"):
+        find_journal_sensor_file(journal_file)
 
 
 def test_two_unknown_shapes_at_once_are_refused(journal_file, sensor_file, tmp_path, capsys):

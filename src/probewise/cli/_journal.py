@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import itertools
 import math
 from collections.abc import Mapping
@@ -52,6 +53,8 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recor
 def find_journal_sensor_file(path: Path) -> Path:
     """Return the path of the sensor.json of a journal's run: its original path, or beside the journal.
 
+    Where results have taken the file's place, it is one of the sensor_kept*.json there.
+
     Raises FileError if the journal names none, or that file is missing or has changed.
     """
     from probewise.calibration import read_sensor
@@ -62,12 +65,19 @@ def find_journal_sensor_file(path: Path) -> Path:
     give = "--sensor S.json, that of the run or a newer one"
     if not isinstance(named, str) or not isinstance(wanted, str):
         raise FileError(path, "it does not name its sensor's file", give)
-    standing = [place for place in (path.parent / named, path.parent / Path(named).name) if place.exists()]
+    places = (path.parent / named, path.parent / Path(named).name)
+    standing = [place for place in places if place.exists()]
+    standing += [renamed for place in places for renamed in _renamed_inputs(place)]
     for place in standing:
         if sensor_entry(read_sensor(place))["sensor_sha256"] == wanted:
             return place
     found = "is another by now" if standing else "is not there any more"
     raise FileError(path, f"its sensor {named} (as seen from {path.parent}) {found}", give)
+
+
+def _renamed_inputs(path: Path) -> list[Path]:
+    """List the files to which an input was renamed where a result took its place (see `staged_output`)."""
+    return sorted(path.parent.glob(f"{glob.escape(path.stem)}_kept*{path.suffix}"))
 
 
 def _instrumentation_declared_by_run(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:

@@ -157,6 +157,13 @@ def test_a_scan_shows_what_readings_bring(arm_file, capsys):
     assert [row.split(",")[4:] for row in rows] == [["140", "21"], ["840", "22"]]
 
 
+def test_a_scan_shows_where_readings_were_taken(arm_file, capsys):
+    true = 'return {"value": 1.0, "x_mm": pose.x_mm + 0.25, "y_mm": pose.y_mm - 0.5, "orientation_rad": math.pi / 2}'
+    assert run("arm", "scan", "500,260", "600,260", "--readings", "2", "--arm", arm_file(true)) == 0
+    rows = capsys.readouterr().out.splitlines()[1:]
+    assert [row.split(",")[:3] for row in rows] == [["500.250", "259.500", "90.000"], ["600.250", "259.500", "90.000"]]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

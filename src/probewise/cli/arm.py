@@ -504,9 +504,11 @@ def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
             if k == 0 and not isinstance(arm, LegoArm):
                 names = list(reading.covariates)
                 print_result(",".join((_COLUMNS, *names)))
-            turned = np.degrees(reading.pose.orientation_rad)
-            more = (f",{reading.covariates.get(name, math.nan):.9g}" for name in names)
-            print_result(f"{x_mm:.3f},{y_mm:.3f},{turned:.3f},{reading.time_s:.3f},{reading.value:.9g}{''.join(more)}")
+            at, more = reading.pose, (f",{reading.covariates.get(name, math.nan):.9g}" for name in names)
+            print_result(
+                f"{at.x_mm:.3f},{at.y_mm:.3f},{math.degrees(at.orientation_rad):.3f},{reading.time_s:.3f},"
+                f"{reading.value:.9g}{''.join(more)}"
+            )
 
 
 def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:

@@ -2,13 +2,15 @@
 
 import io
 import json
+import signal
 
 import numpy as np
 import pytest
 
-from probewise.arm import LegoArm, read_geometry, shipped_geometry_path
+from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.calibration import FittedSensor, write_sensor
+from probewise.cli import arm as verb
 from probewise.cli import main
 from probewise.errors import LinkError
 from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan, write_recording
@@ -225,3 +227,74 @@ def test_what_lies_under_a_real_arm_is_not_given(bricks, sensor_file, tmp_path, 
     assert status == 2
     assert "1048,520, the geometry's" in said
     assert not bricks["opened"]
+
+
+@pytest.fixture
+def stop_as_it_rises(bricks, monkeypatch):
+    """Stop the command as the sensor begins to rise for the n-th time: behind the telegram that turns the motor."""
+    raise_sensor = LegoArm.raise_sensor
+
+    def at(n):
+        rises = []
+
+        def struck(arm):
+            rises.extend([None] if arm._is_down else [])
+            if len(rises) == n:
+                rises.append(None)  # once
+                paper = bricks["opened"][-1]
+                write = paper.write
+
+                def stopping(data):
+                    write(data)
+                    if data[3] == 0x04 and not paper.at_rest:
+                        paper.write = write
+                        signal.raise_signal(signal.SIGINT)
+
+                paper.write = stopping
+            raise_sensor(arm)
+
+        monkeypatch.setattr(LegoArm, "raise_sensor", struck)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield at
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("n_read", [1, 3], ids=["in a scan", "before the sensor is to be turned"])
+def test_a_stop_while_the_sensor_rises_keeps_the_reading_and_asks_for_nothing(
+    n_read, stop_as_it_rises, bricks, plan_file, tmp_path, capsys, monkeypatch
+):
+    """The motors are released before the reading is written. Two looks at the sheet come first."""
+    at_rest = []
+    spy = then(write_recording, lambda: at_rest.append(bricks["opened"][-1].at_rest))
+    monkeypatch.setattr("probewise.recordings.write_recording", spy)
+    stop_as_it_rises(2 + n_read)
+    out = tmp_path / "rec.csv"
+    arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
+    status, said = run(capsys, *arguments)
+    assert status == 130
+    assert f"stopped; {out} keeps {n_read} of 13 readings; go on with" in said
+    assert said.count("then press Enter") == 1
+    assert len(at_rest) == n_read
+    assert at_rest[-1]
+    assert bricks["opened"][0].at_rest
+    assert run(capsys, *arguments, "--resume")[0] == 0
+    assert len(read_recording(out)) == 13
+
+
+@pytest.mark.parametrize("n_poses", [1, 2], ids=["the end of with", "the next measurement"])
+def test_a_stop_while_the_sensor_rises_is_raised_by_what_comes_next(n_poses, stop_as_it_rises, bricks):
+    geometry, place = read_geometry(shipped_geometry_path()), (300.0, 200.0)
+    pose = Pose(*place, float(geometry.orientation_rad(np.array([place]))[0]))
+    readings = []
+
+    def measure():
+        with verb.open_nxt_arm("x", geometry) as arm:
+            readings.extend(arm.measure(pose) for _ in range(n_poses))
+
+    stop_as_it_rises(1)
+    with pytest.raises(KeyboardInterrupt):
+        measure()
+    assert len(readings) == 1
+    assert bricks["opened"][0].at_rest
+    assert not bricks["opened"][0].is_open

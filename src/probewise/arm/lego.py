@@ -14,6 +14,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_finite_number
+from probewise._signals import defer_signals
 from probewise.arm.basics import Clock, Side
 from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped_to_pi
 from probewise.arm.instrument import Pose, Reading
@@ -84,8 +85,10 @@ class LegoArm:
         self.turned_rad = 0.0
         self.mounted_rad = 0.0
         self.first_down: Callable[[float], None] | None = None
+        self._stop: KeyboardInterrupt | None = None  # held back until a finished reading has been handed over
 
     def __enter__(self) -> Self:
+        self._stop = None
         self._machine.__enter__()
         return self
 
@@ -94,6 +97,8 @@ class LegoArm:
     ) -> None:
         """Raise the sensor if it is down, then release the motors; after an exception, only release them."""
         try:
+            if error is None:
+                self._raise_held_stop()
             if error is None and self._is_down:
                 self.raise_sensor()
         except BaseException as failure:
@@ -131,6 +136,9 @@ class LegoArm:
     def measure(self, pose: Pose) -> Reading:
         """Move to a pose, lower the sensor, read it, and raise it.
 
+        A KeyboardInterrupt while the sensor rises releases the motors at once, but the reading is returned: the next
+        `measure`, or the end of `with`, raises it.
+
         Returns
         -------
         The reading, with the actual pose by the motors' counters, and the covariates `height_mm`, `battery_mv`.
@@ -143,6 +151,7 @@ class LegoArm:
         LinkError
             If the brick does not answer, or a motor does not move, before the reading is taken.
         """
+        self._raise_held_stop()
         place = np.array([[pose.x_mm, pose.y_mm]])
         require_within_reach(self.geometry, place, "pose")
         if pose.height_mm not in (None, self.geometry.read_height_mm):
@@ -161,11 +170,29 @@ class LegoArm:
         value = self.read_here()
         time_s = self._clock.monotonic() - self._zero_s
         covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": battery_mv}
-        there = self._pose()
-        # The reading is complete. A connection lost now is noticed at the next move, which starts with raising.
-        with contextlib.suppress(LinkError):
-            self.raise_sensor()
-        return Reading(value=value, pose=there, time_s=time_s, covariates=covariates)
+        reading = Reading(value=value, pose=self._pose(), time_s=time_s, covariates=covariates)
+        self._raise_after_reading()
+        return reading
+
+    def _raise_after_reading(self) -> None:
+        """Raise the sensor; neither a lost connection nor a stop loses the reading that is complete."""
+        try:
+            # A connection lost now is noticed at the next move, which starts with raising.
+            with contextlib.suppress(LinkError):
+                self.raise_sensor()
+        except KeyboardInterrupt as stop:
+            try:
+                with defer_signals():
+                    self.release()
+            except LinkError:
+                raise stop from None  # a motor may turn: the end of `with` stops it by other means
+            self._stop = stop
+
+    def _raise_held_stop(self) -> None:
+        """Raise the KeyboardInterrupt that came while the sensor rose after the last reading, if there was one."""
+        stop, self._stop = self._stop, None
+        if stop is not None:
+            raise stop
 
     def go_over(self, x_mm: float, y_mm: float) -> None:
         """Move the sensor over a place, at about travel height.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from probewise._kinds import did_you_mean
 from probewise.cli._common import CommandError, add_path, print_warning
+from probewise.cli._stopping import raise_if_stopped
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -294,6 +295,7 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
     def ask(text: str) -> str:
         from tqdm import tqdm
 
+        raise_if_stopped()  # an arm may have held the stop back until its reading was kept
         answers: queue.Queue[str] = queue.Queue()
         with tqdm.external_write_mode(file=sys.stderr):  # a progress bar would overwrite the question
             sys.stderr.write(text)

@@ -141,7 +141,9 @@ class LegoArm:
 
         Returns
         -------
-        The reading, with the actual pose by the motors' counters, and the covariates `height_mm`, `battery_mv`.
+        The reading, with the actual pose by the motors' counters, and the covariates `height_mm` and `battery_mv`. In
+        the files of recordings, `height_mm` is the commanded height, the geometry's `read_height_mm`; the height by the
+        counters, `position_mm[2]`, differs from it by some tenths of a millimetre.
 
         Raises
         ------

@@ -19,10 +19,8 @@ LAWS = {
 
 def looks(law, heights, *, off_mm=0.0, noise=0.0, rng=None):
     return [
-        HeightReading(
-            (100.0 * k, 50.0), h, law(h + off_mm) + (noise * rng.standard_normal() if rng else 0.0), noise or 0.02
-        )
-        for k, h in enumerate(heights)
+        HeightReading(h, law(h + off_mm) + (noise * rng.standard_normal() if rng else 0.0), noise or 0.02)
+        for h in heights
     ]
 
 

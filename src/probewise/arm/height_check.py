@@ -24,9 +24,8 @@ ROUNDING_MM = 0.2  # sd of a height that whole counts leave
 
 @dataclass(frozen=True)
 class HeightReading:
-    """Mean reading over white at one place and height (by the motors' counters), and its standard error."""
+    """Mean reading over white at one height (by the motors' counters), and its standard error."""
 
-    place_mm: tuple[float, float]
     height_mm: float
     value: float
     error: float

@@ -436,7 +436,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
             arm.go_down(*place, height_mm)
             values = np.array([arm.brightness() for _ in range(arguments.readings)])
             error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
-            return HeightReading(place, float(arm.position_mm[2]), float(values.mean()), error)
+            return HeightReading(float(arm.position_mm[2]), float(values.mean()), error)
 
         arm.go_over(*places[0])
         lowest_mm = geometry.read_height_mm

@@ -153,9 +153,6 @@ repaired = repaired_sensor
 sensor_named = sensor_entry
 """The old name of `sensor_entry`."""
 
-usual_trust = default_trust
-"""The old name of `default_trust`."""
-
 Streams = RandomStreams
 """The old name of `RandomStreams`."""
 

@@ -19,9 +19,6 @@ from probewise.systems.forms.sorted_rows import jump_in_sorted_rows, sorting_col
 
 __all__ = ["WORDS", "Form", "ReferenceFit", "bind_forms", "driving_columns"]
 
-About = ReferenceFit
-"""The old name of `ReferenceFit`."""
-
 WORDS: Mapping[str, str] = MappingProxyType(readings.WORDS | inputs.WORDS | parameters.WORDS | rates.WORDS)
 """A noun phrase for each form, with places for its targets."""
 

@@ -8,7 +8,7 @@ import pytest
 
 from probewise.arm import OwnInstrument, Pose, Reading, SimulatedArm, as_instrument, carry_out, recording_of_readings
 from probewise.errors import FileError, LinkError, ParameterError, ReachError, ShapeError
-from probewise.recordings import HalfPlane, Plan, Quadrant, read_recording, write_recording
+from probewise.recordings import HalfPlane, Plan, Quadrant, Uniform, read_recording, write_recording
 
 PLACES = np.array([[0.0, 0.0], [30.0, 40.0]])
 
@@ -350,6 +350,27 @@ def test_a_sensor_that_the_rows_taken_before_may_have_left_turned_is_turned_back
         for first in (4, 0):
             list(carry_out(arm, plan(orientation_rad=angles), origin_mm=(0.0, 0.0), ask=asked.append, first=first))
     assert turns_asked(asked) == [0, 0, 60, 0]
+
+
+@pytest.mark.parametrize(
+    ("own", "changes", "angles"),
+    [
+        (Own(), {}, [0, 60]),
+        (Own(), {"orientation_rad": 0.0}, [0]),
+        (Own(), {"patterns": {"edge": Uniform(1.0), "corner": Uniform(0.0)}}, [0, 60]),
+        (Own(), {"patterns": {"edge": Uniform(1.0), "corner": Uniform(0.0)}, "orientation_rad": 0.0}, []),
+        (Own(turns=True), {}, []),
+    ],
+    ids=["turns over an edge", "over an edge", "turns over plain sheets", "over plain sheets", "turns by itself"],
+)
+def test_a_sensor_that_somebody_may_have_turned_is_turned_back_where_that_matters(own, changes, angles):
+    asked = []
+    with as_instrument(own) as arm:
+        arm.mounted_rad = math.nan
+        for _ in range(2):
+            read = list(carry_out(arm, plan(**changes), origin_mm=(0.0, 0.0), ask=asked.append))
+    assert [reading.pose.orientation_rad for reading in read] == plan(**changes).orientation_rad.tolist()
+    assert turns_asked(asked) == (angles * 2 if len(angles) == 2 else angles)
 
 
 def test_one_that_turns_its_sensor_and_lifts_it_is_told_where_to_and_nobody_is_asked():

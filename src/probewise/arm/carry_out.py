@@ -15,6 +15,7 @@ from probewise.arm.own_instrument import Measures, OwnInstrument, as_instrument
 from probewise.arm.reach import ReachablePlaces, require_within_reach
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
+from probewise.recordings.patterns import Uniform
 from probewise.recordings.plan import Plan, Recording
 from probewise.recordings.where_white import where_white_in_words
 
@@ -59,7 +60,9 @@ def carry_out(
     The LEGO arm's sensor turns with the base; the person turns the sensor by the right angles that come nearest to the
     planned orientation. With a user's own instrument that cannot turn its sensor, the person turns the sensor to the
     planned orientation. The person is asked whenever the angle on the mount changes, and before row `first` if an
-    earlier plan, or earlier rows of this one, turned the sensor.
+    earlier plan, or earlier rows of this one, turned the sensor. If `arm.mounted_rad` is NaN, as somebody may have
+    turned it before, the person is asked too, unless the plan neither turns the sensor nor has a pattern that looks
+    different to a turned one.
 
     Parameters
     ----------
@@ -94,6 +97,7 @@ def carry_out(
     turns = row_measurer.hand_turns_rad(plan, places)
     if (turns[:first] > _SAME_TURN_RAD).any():
         arm.mounted_rad = math.nan  # by hand, in an earlier session
+    does_not_matter = math.isnan(arm.mounted_rad) and not (row_measurer.by_hand and _orientation_matters(plan, turns))
     lying = -1
     for row in range(first, len(plan)):
         if plan.pattern[row] != lying:
@@ -103,12 +107,12 @@ def carry_out(
             shown = f": {where_white_in_words(plan.patterns[name])}" if name in plan.patterns else ""
             ask(RequestToPerson(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         turned = float(turns[row])
-        if not abs(turned - arm.mounted_rad) <= _SAME_TURN_RAD:
+        if not does_not_matter and not abs(turned - arm.mounted_rad) <= _SAME_TURN_RAD:
             text = f"turn the sensor on its mount to {math.degrees(turned):.4g} degrees, {row_measurer.from_where}"
             ask(RequestToPerson(text, turned_rad=turned))
             arm.mounted_rad = turned
         x_mm, y_mm = places[row].tolist()
-        reading = row_measurer.measure_row(x_mm, y_mm, arm.mounted_rad, plan, row)
+        reading = row_measurer.measure_row(x_mm, y_mm, turned, plan, row)
         there = _place_in_plan_frame_mm(reading, plan, row, origin_mm)
         yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
 
@@ -150,6 +154,7 @@ class _LegoRowMeasurer:
     """Helper of `carry_out` for the LEGO arm: the base turns the sensor, and a person adds turns by right angles."""
 
     from_where = "anticlockwise seen from above, from where the geometry has it"
+    by_hand = True
 
     def __init__(self, arm: LegoArm) -> None:
         self._arm = arm
@@ -174,11 +179,12 @@ class _OwnRowMeasurer:
 
     def __init__(self, arm: OwnInstrument | SimulatedArm) -> None:
         self._arm = arm
-        self._turns, self._lifts = _can_turn_sensor(arm), _can_lift_sensor(arm)
+        self._lifts = _can_lift_sensor(arm)
+        self.by_hand = not _can_turn_sensor(arm)
 
     def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
         """Return the angle to which a person turns the sensor for each row, (n_points,): 0 if the instrument does."""
-        if self._turns:
+        if not self.by_hand:
             return np.zeros(len(plan))
         off = (plan.orientation_rad - self._arm.orientation_rad(places_mm)) % math.tau
         return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
@@ -188,6 +194,12 @@ class _OwnRowMeasurer:
         height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._lifts else math.nan
         up_mm = None if math.isnan(height_mm) else float(height_mm)
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
+
+
+def _orientation_matters(plan: Plan, turns_rad: FloatArray) -> bool:
+    """Return whether a sensor that is turned on its mount may read otherwise, or has to be turned for some row."""
+    patterns = [plan.patterns.get(name) for name, _ in plan.rows_by_pattern()]
+    return not all(isinstance(each, Uniform) for each in patterns) or bool((turns_rad > _SAME_TURN_RAD).any())
 
 
 def _can_turn_sensor(arm: OwnInstrument | SimulatedArm) -> bool:

@@ -553,6 +553,7 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
             _prompter(arguments, arm) if bench is None else partial(bench.carry_out_request, plan.patterns, origin)
         )
         if by_person:
+            arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
             ask = PersonAtBench(
                 arm, plan, origin, check, check_sheets=not own, emulated=not own and is_pty(_nxt_port(arguments.arm))
             )

@@ -222,6 +222,8 @@ def _opened_plan_runner(
     warn_and_confirm_lowering(chosen, opened, geometry)
     with opened as arm:
         by_hand, laid = prompter(arm), list[str]()
+        if bench is None and not arguments.no_hands:
+            arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
 
         def take_readings(number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
             def ask(request: RequestToPerson) -> None:

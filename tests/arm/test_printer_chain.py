@@ -85,7 +85,7 @@ def test_record_calibrate_explore_and_diagnose_with_the_printer(tmp_path, monkey
         own = ("--arm", "printer.py")
         settings = ("--unit", "counts", "--range", "0,1023", "--step", "1")
         run("arm", "record", "paper", "--out", "mine.csv", *own, "--origin-mm", "110,110", *settings)
-        assert len(person.asked) == 9  # five sheets, four turns
+        assert len(person.asked) == 10  # five sheets, four turns, and at the start how the sensor stands
         run("calibrate", "mine.csv", "--out", "my_sensor", "--method", "quick", "--orders", "1", "2")
         person.surface, person.turned_rad = CIRCLE, 0.0
         run("explore", "--sensor", "my_sensor/sensor.json", *own, "--field", "220,220", "--out", "found")

@@ -11,8 +11,9 @@ import pytest
 
 from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
-from probewise.cli import main
+from probewise.cli import main, parser
 from probewise.cli._arm import InstrumentWithCallbacks
+from probewise.cli._explore_inputs import read_checked_inputs
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
@@ -116,7 +117,10 @@ def test_how_the_sensor_stands_and_how_often_it_reads_may_be_chosen_and_are_kept
 
 REFUSED = {
     "no wrist": (("--orientations", "0,45", "--arm", "nxt:/dev/null"), "no joint of which turns its sensor"),
-    "one height": (("--heights", "10,14", "--arm", "nxt:/dev/null"), "which reads 14 mm above the surface"),
+    "one height": (
+        ("--heights", "10,14", "--arm", "nxt:/dev/null"),
+        "none with the LEGO arm but 14: it reads that many mm above",
+    ),
     "a point sees no height": (("--heights", "10", "--model", "naive"), "which knows no height"),
     "nor beside": (("--heights", "10", "--both-models"), "the naive model has no height"),
     "into the table": (("--heights", "0,10"), "finite, greater than 0"),
@@ -135,6 +139,12 @@ def test_what_an_arm_cannot_choose_is_refused_in_one_line(options, why, sensor_f
     assert said.count("\n") == 1
     assert why in said
     assert not out.exists()
+
+
+@pytest.mark.usefixtures("at_14_mm")
+def test_the_lego_arms_own_height_may_be_named(sensor_file, tmp_path):
+    words = ("explore", "--sensor", sensor_file, "--out", tmp_path, "--heights", "14", "--arm", "nxt:/dev/null")
+    assert read_checked_inputs(parser().parse_args([str(word) for word in words])).experiment.heights_mm == (14.0,)
 
 
 def test_a_height_is_refused_where_that_of_the_calibration_is_not_known(sensor_file, tmp_path, capsys):

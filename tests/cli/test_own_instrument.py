@@ -91,6 +91,26 @@ def test_a_run_goes_on_where_the_instrument_failed_and_keeps_what_its_readings_b
     assert journal.settings["options"]["reading_range"] == [0.0, 1023.0]
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_frames")
+@pytest.mark.filterwarnings("always::probewise.errors.DoubtfulResultWarning")
+def test_readings_at_another_height_than_the_calibrated_one_are_doubtful_and_the_result_says_so(
+    arm_file, ten_bits, tmp_path, capsys
+):
+    sensor, out = read_sensor(ten_bits), tmp_path / "out"
+    scale = dataclasses.replace(sensor.instrumentation, height_mm=14.0)
+    write_sensor(dataclasses.replace(sensor, instrumentation=scale), ten_bits)
+    arm = arm_file('return {"value": 140, "height_mm": 20}')
+    assert run("explore", "--sensor", ten_bits, "--out", out, "--max-readings", 2, "--arm", arm) == 0
+    said = capsys.readouterr()
+    doubt = "the arm reads 20 mm above the surface, and the sensor was calibrated at 14 mm"
+    assert said.err.count(f"warning: {doubt}") == 1
+    assert said.out.count(f"doubtful: {doubt}") == 1
+    (note,) = json.loads((out / "result.json").read_text())["notes"]
+    assert note.startswith(doubt)
+    assert doubt in (out / "report.html").read_text()
+
+
 def test_ctrl_c_closes_the_instrument_and_keeps_the_journal(arm_file, ten_bits, tmp_path, capsys, closed):
     out = tmp_path / "out"
     struck = arm_file("os.kill(os.getpid(), signal.SIGINT)")

@@ -1,15 +1,26 @@
 """The sensor's height is one more thing that the robot may choose."""
 
+import json
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from probewise.arm import Pose, Reading
+from probewise.arm import LegoArm, Pose, Reading, as_instrument, read_geometry, shipped_geometry_path
 from probewise.calibration import FittedSensor
+from probewise.cli._arm import InstrumentWithCallbacks
 from probewise.effects import HeightGradient
-from probewise.errors import ParameterError, ReachError
-from probewise.experiment import arm_over, experiment_for, explore, paper_experiment, read_journal
+from probewise.errors import DoubtfulResultWarning, ParameterError, ReachError
+from probewise.experiment import (
+    arm_over,
+    experiment_for,
+    explore,
+    paper_experiment,
+    read_journal,
+    result_json,
+    run,
+)
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.recordings import Disc, Instrumentation, Plan
@@ -164,6 +175,72 @@ def test_a_journal_names_the_height_only_beside_others_to_choose(small, close_se
     seed = np.random.SeedSequence(1)
     assert experiment_for(close_sensor, CIRCLE, FIELD).settings(seed)["options"]["calibrated_height_mm"] is None
     assert asked(small).settings(seed)["options"]["calibrated_height_mm"] == 14.0
+
+
+class OwnArm:
+    """Reads a disc from 20 mm; `tells` is what it says of that beside the reading, `more` what it declares."""
+
+    def __init__(self, tells, **more):
+        self.tells = tells
+        self.__dict__ |= more
+
+    def measure(self, pose):
+        value = WORLD.read(DISC, pose.x_mm, pose.y_mm, time_s=0.0, rng=None, height_mm=20.0)
+        return {"value": value, **self.tells}
+
+
+ELSEWHERE = {
+    "of each reading": OwnArm({"height_mm": 20.0}),
+    "of the arm": OwnArm({}, read_height_mm=20.0),
+    "of both": OwnArm({"height_mm": 20.0}, read_height_mm=20.0),
+    "of an arm with callbacks": InstrumentWithCallbacks(
+        as_instrument(OwnArm({}, read_height_mm=20.0)), lambda _: None, lambda _: None
+    ),
+}
+
+
+@pytest.mark.parametrize("arm", ELSEWHERE.values(), ids=ELSEWHERE.keys())
+def test_a_run_at_another_height_than_the_calibrated_one_is_doubtful_and_says_so_once(small, arm):
+    experiment = asked(small, heights_mm=())
+    with pytest.warns(DoubtfulResultWarning) as warned:
+        found = run(arm, experiment, rng=np.random.default_rng(1), max_readings=3)
+    (said,) = warned
+    assert "reads 20 mm above the surface, and the sensor was calibrated at 14 mm" in str(said.message)
+    assert "calibrate the sensor at 20 mm, or name the height (heights_mm, --heights 20)" in str(said.message)
+    assert all(step.notes == (str(said.message),) for step in found.steps)
+    assert json.loads(result_json(found))["notes"] == [str(said.message)]
+    assert f"doubtful: {said.message}" in found.summary()
+
+
+def test_an_arm_that_declares_its_height_is_doubted_before_it_moves(small):
+    moved = []
+    arm = OwnArm({}, read_height_mm=20.0, measure=moved.append)
+    steps = explore(arm, asked(small, heights_mm=()), rng=np.random.default_rng(1))
+    with warnings.catch_warnings(action="error"), pytest.raises(DoubtfulResultWarning):
+        next(steps)
+    assert not moved
+
+
+@pytest.mark.parametrize(
+    ("tells", "changes"),
+    [
+        ({"height_mm": 14.1}, {}),
+        ({"height_mm": np.nan}, {}),
+        ({}, {}),
+        ({"height_mm": 20.0}, {"calibrated_height_mm": None}),
+        ({"height_mm": 20.0}, {"heights_mm": (20.0,)}),
+    ],
+)
+def test_a_height_that_is_calibrated_unknown_or_named_leaves_no_doubt(small, tells, changes):
+    experiment = asked(small, **({"heights_mm": ()} | changes))
+    arm = OwnArm(tells, lifts=True)
+    found = run(arm, experiment, rng=np.random.default_rng(1), max_readings=1)
+    assert found.notes == ()
+
+
+def test_the_lego_arm_declares_its_height():
+    geometry = replace(read_geometry(shipped_geometry_path()), read_height_mm=20.0)
+    assert LegoArm(None, geometry).read_height_mm == 20.0
 
 
 def test_an_arm_without_that_height_says_so():

@@ -117,6 +117,11 @@ class LegoArm:
         """Place and height (x, y, height) of the sensor's face by the motors' counters, lab frame, shape (3,)."""
         return np.asarray(self.geometry.position_mm(self.angles_rad[None, :])[0])
 
+    @property
+    def read_height_mm(self) -> float:
+        """Height of the sensor above the surface when it reads, in mm."""
+        return self.geometry.read_height_mm
+
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at places, (n_places, 2), its turn by hand included: shape (n_places,)."""
         return wrapped_to_pi(self.geometry.orientation_rad(places_mm) + self.turned_rad)

@@ -142,6 +142,13 @@ class OwnInstrument:
 
     lifts = can_lift  # its old name
 
+    @property
+    def read_height_mm(self) -> float | None:
+        """Height above the surface at which the object reads: its attribute `read_height_mm`; None: not known."""
+        height_mm = getattr(self._own, "read_height_mm", None)
+        with self._errors_located("read_height_mm"):
+            return None if height_mm is None else checked_finite_number("read_height_mm of the instrument", height_mm)
+
     def sentence(self) -> str:
         """Describe the allowed places in words."""
         return f"places that reachable of {self.source or 'the instrument'} allows"
@@ -255,8 +262,9 @@ def as_instrument(
         methods: `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`,
         seconds from a pose to each place; `orientation_rad(places_mm)`, the sensor's own orientation at each place; a
         single value applies to all places. Attributes `turns = True` and `lifts = True` declare that the sensor is
-        turned to the pose's orientation and reads at the pose's height. `__exit__`, or else `close()`, is always called
-        at the end.
+        turned to the pose's orientation and reads at the pose's height; `read_height_mm` is the height at which it
+        reads otherwise, if that is known, so that `explore` can compare it with the calibration's. `__exit__`, or else
+        `close()`, is always called at the end.
     start_s
         Time at the start, for resuming an earlier run; without effect on instruments of this package.
     name

@@ -226,6 +226,12 @@ class InstrumentWithCallbacks:
         self.reachable, self.orientation_rad = instrument.reachable, instrument.orientation_rad
         self.travel_s = instrument.travel_s
 
+    @property
+    def read_height_mm(self) -> float | None:
+        """The instrument's height above the surface when it reads, in mm, if it declares one."""
+        height_mm: float | None = getattr(self._instrument, "read_height_mm", None)
+        return height_mm
+
     def __enter__(self) -> Self:
         self._instrument.__enter__()
         return self

@@ -131,8 +131,12 @@ def _checked_setting_choices(
     if geometry is not None:
         refused = {
             "--orientations": "none with the LEGO arm, no joint of which turns its sensor",
-            "--heights": f"none with the LEGO arm, which reads {geometry.read_height_mm:g} mm above the surface",
+            "--heights": (
+                f"none with the LEGO arm but {geometry.read_height_mm:g}: it reads that many mm above the surface"
+            ),
         }
+        if heights_mm == (geometry.read_height_mm,):
+            del refused["--heights"]
     elif arguments.both_models:
         refused = {"--heights": "none with --both-models, since the naive model has no height"}
     for option, allowed in refused.items():

@@ -81,6 +81,7 @@ def result_json(run: Exploration) -> str:
         "shape": asdict(found_shape(run)),
         "chance_off_12mm": probability_of_length_off(run.experiment, run.posterior, OFF_MM),
         "left_out": left_out_after_step(run.last, run.experiment.trust).as_json(),
+        "notes": list(run.notes),
         "bits": run.last.bits,
         "seconds": run.seconds,
     }

@@ -115,7 +115,7 @@ def recording_of(
     is the covariate `height_mm`, unless the reading has its own.
     """
     n = len(readings)
-    covariates = [_covariates_with_height(reading) for reading in readings]
+    covariates = [covariates_with_height(reading) for reading in readings]
     names = sorted({name for known in covariates for name in known})
     zeros = np.zeros(n, dtype=np.int64)
     plan = Plan(
@@ -136,7 +136,7 @@ def recording_of(
     return Recording(plan, _value_per_reading(readings, lambda r: r.value), source)
 
 
-def _covariates_with_height(reading: Reading) -> Mapping[str, float]:
+def covariates_with_height(reading: Reading) -> Mapping[str, float]:
     """Return a reading's covariates; `height_mm` is the pose's, if the pose has one and the covariates have none."""
     height_mm = reading.pose.height_mm
     return reading.covariates if height_mm is None else {"height_mm": height_mm, **reading.covariates}

@@ -34,6 +34,7 @@ from probewise.experiment.journal import (
 )
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior, prior_posterior
+from probewise.experiment.reading_height import doubt_about_height, height_of_reading_mm
 from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
 from probewise.experiment.stopping_rule import (
     OFF_SDS,
@@ -285,6 +286,12 @@ def explore(
         If no hypothesis could have given the readings.
     LinkError
         If the instrument fails, or returns a reading out of range.
+
+    Warns
+    -----
+    DoubtfulResultWarning
+        Once, if the arm reads at another height than that of the sensor's calibration, without `heights_mm`; the notes
+        of every step after that say so too.
     """
     require_measures("instrument", instrument)
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
@@ -353,6 +360,9 @@ def _yield_steps(
     first = _rng_of_reading(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
     state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
+    doubt = doubt_about_height(experiment, getattr(instrument, "read_height_mm", None))
+    if doubt is not None:
+        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     with _journal_writer(path, before, settings) as writer:
         stopped = False
         while not stopped:
@@ -362,6 +372,8 @@ def _yield_steps(
             _require_value_in_range(experiment, reading)  # before it is written, or a resumed run fails again
             if writer is not None and entry is None:
                 writer.write_reading(number, reading)
+            if doubt is None and (doubt := doubt_about_height(experiment, height_of_reading_mm(reading))) is not None:
+                warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
             state, info = step(
                 state,
                 reading,
@@ -380,6 +392,8 @@ def _yield_steps(
                     state = dataclasses.replace(state, next_pose=entry.summary.next_pose)
             if number == 1 and notes:
                 info = dataclasses.replace(info, notes=(*info.notes, *notes))
+            if doubt is not None:
+                info = dataclasses.replace(info, notes=(*info.notes, doubt))
             stopped = info.stop_reason is not None
             yield info
 

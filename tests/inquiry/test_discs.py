@@ -46,6 +46,16 @@ def test_the_table_predicts_what_the_model_does_at_any_place_and_orientation(mad
     assert np.sqrt((away**2).mean()) < 0.001
 
 
+def test_the_led_dims_what_the_table_predicts_as_what_the_model_does(made, places):
+    led = rng(2).uniform(size=len(places))
+    led[:20], led[20:40] = 0.0, np.nan
+    dimmed = replace(places, covariates={"led": led})
+    theta, chain = made.circles(60), made.chain()
+    np.testing.assert_allclose(forecast_of(chain).model.predict(theta, dimmed), chain.predict(theta, dimmed), atol=0.03)
+    naive = made.naive()
+    assert (DiscTable.of(naive).predict(theta, dimmed) == naive.predict(theta, dimmed)).all()
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.7])
 def test_the_weights_of_levels_are_those_of_asking_every_hypothesis(made, turn):
     """On a subset of places: by rounding a hypothesis may count for the next level, but the mean stays."""

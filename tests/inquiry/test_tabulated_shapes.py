@@ -84,6 +84,17 @@ def test_predictions_near_the_edges_are_those_of_the_closed_form(name, mixture):
     assert np.abs(quick - exact).max() < 0.04 * SPAN  # at the tip of a thin ellipse
 
 
+def test_the_led_dims_what_the_tables_predict_as_what_the_model_does():
+    shape, rng = SHAPES["rectangle"], np.random.default_rng(4)
+    model, theta = chain(shape), hypotheses(shape, 60)
+    plan = Designs(Grid(), (0.0, 0.9)).plan("field").take(rng.integers(2 * 8515, size=900))
+    led = rng.uniform(size=len(plan))
+    led[:300], led[300:350] = 0.0, np.nan
+    dimmed = replace(plan, covariates={"led": led})
+    off = TabulatedForecast.of(model).predict(theta, dimmed) - model.predict(theta, dimmed)
+    assert np.abs(off).max() < 0.04 * SPAN
+
+
 @pytest.mark.parametrize("name", ["rectangle", "triangle", "ellipse", "any of two"])
 def test_the_weights_of_levels_are_those_of_asking_every_hypothesis(name):
     """Their distribution functions differ by no more than what lies within a level and an error of 1 % of the span."""

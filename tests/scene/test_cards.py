@@ -48,6 +48,8 @@ def test_tables_with_cards_laid_over_them_are_the_chain(chain, plan):
     forecast = forecast_of(chain)
     assert isinstance(forecast, CardedForecast)
     np.testing.assert_allclose(forecast.model.predict(theta, plan), chain.predict(theta, plan), atol=0.02)
+    dimmed = replace(plan, covariates={"led": np.linspace(0.0, 1.0, len(plan))})
+    np.testing.assert_allclose(forecast.model.predict(theta, dimmed), chain.predict(theta, dimmed), atol=0.02)
     likelihood = experiment_of(REFERENCE).likelihood
     rng = np.random.default_rng(1)
     for rival in rivals_of(chain, likelihood, (1048.0, 520.0)):

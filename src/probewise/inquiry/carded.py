@@ -20,6 +20,7 @@ from probewise.recordings.plan import Plan
 from probewise.scene.cards import Card, CardedScene, mean_albedo_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import RegionsAndPoses, response
+from probewise.sensor.commanded import led_state, with_led_on
 from probewise.sensor.stages import Poses, SensorModel
 
 _REACH = 6.0  # sds of the footprint
@@ -59,8 +60,8 @@ class CardedModel:
             Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan
         )
         dark, bright = self.black_and_white_readings
-        seen = (self.plain.predict(theta, plan) - dark) / (bright - dark)
-        return np.asarray(dark + (bright - dark) * mean_albedo_with_cards(seen, self.cards, covered))
+        seen = (self.plain.predict(theta, with_led_on(plan)) - dark) / (bright - dark)
+        return np.asarray(dark + (bright - dark) * led_state(plan) * mean_albedo_with_cards(seen, self.cards, covered))
 
     @property
     def black_and_white_readings(self) -> tuple[float, float]:

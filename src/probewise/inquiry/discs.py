@@ -21,6 +21,7 @@ from probewise.inquiry.scanlines import ROWS, Interval, PlacesNearEdges, Scanlin
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
+from probewise.sensor.commanded import led_state
 from probewise.sensor.stages import AnyEffect, SensorModel, require_theta_columns
 
 NAMES = ("x_mm", "y_mm", "radius_mm")
@@ -100,7 +101,10 @@ class DiscTable:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings by interpolation, theta (n_samples, 3) -> (n_samples, n_points)."""
-        return self.predict_at(theta, plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
+        level = self.predict_at(theta, plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
+        if "led" not in plan.covariates or self.margin_mm == 0.0:  # without margin: the naive sensor, which has no LED
+            return level
+        return self.dark + led_state(plan) * (level - self.dark)
 
     def predict_at(
         self, theta: FloatArray, x_mm: FloatArray, y_mm: FloatArray, orientation_rad: FloatArray

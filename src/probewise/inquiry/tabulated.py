@@ -28,7 +28,7 @@ from probewise.inquiry.tabulated_shapes import TabulatedShapes
 from probewise.recordings.plan import Instrumentation, Plan
 from probewise.scene import HypothesisScene, Shape, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
-from probewise.sensor.commanded import height_ratio
+from probewise.sensor.commanded import height_ratio, led_state
 from probewise.sensor.stages import SensorModel
 
 _PER_SD = 2.0  # levels per noise sd: rounding adds 2 % to its variance, which thousands of hypotheses average out
@@ -129,14 +129,15 @@ class TabulatedForecast:
         if len(plan) > _FEW:
             return predict_where_visible(self.model, theta, plan)
         ways, which = np.unique(np.stack([plan.orientation_rad, _relative_heights(plan)]), axis=1, return_inverse=True)
-        out = np.empty((len(theta), len(plan)))
+        out, led = np.empty((len(theta), len(plan))), np.broadcast_to(led_state(plan), len(plan))
         for number, way in enumerate(ways.T.tolist()):
             rows = np.flatnonzero(which.ravel() == number)
             shapes = self._tabulated_shapes_at(theta, *way)
             if shapes is None or ways.shape[1] > _MOST_WAYS:
                 return predict_where_visible(self.model, theta, plan)
             dark, bright = self._dark_and_bright_at_height(way[1])
-            out[:, rows] = dark + (bright - dark) * shapes.footprint_share(plan.x_mm[rows], plan.y_mm[rows])
+            seen = shapes.footprint_share(plan.x_mm[rows], plan.y_mm[rows])
+            out[:, rows] = dark + (bright - dark) * led[rows] * seen
         return out
 
     def predictive(

@@ -21,7 +21,8 @@ from probewise.experiment import (
 )
 from probewise.recordings.patterns import Disc
 from probewise.recordings.plan import Instrumentation
-from probewise.scene import Circle
+from probewise.scene import Circle, Field, HypothesisScene
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture
 
 SETTINGS = {"shape": "Circle()", "seed": "7", "spawn_key": [0], "options": {"n_live": 60}}
 
@@ -254,6 +255,38 @@ def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path)
     with pytest.raises(LinkError, match=r"beyond the sensor: reading is 1023\.0; allowed: 0 to 100"):
         run(Broken(), experiment, rng=np.random.default_rng(5), journal=tmp_path / "j")
     assert read_journal(tmp_path / "j").entries == ()
+
+
+IMPOSSIBLE = {
+    "a lamp of eight bits": ({"led": 128}, {}, r"led is 128\.0; allowed: 0 \(off\) to 1 \(on\)"),
+    "in the table": (
+        {"height_mm": 0.0},
+        {"heights_mm": (14.0,), "calibrated_height_mm": 14.0},
+        r"height_mm is 0\.0; allowed: greater than 0",
+    ),
+}
+
+
+@pytest.mark.parametrize(("tells", "changes", "said"), IMPOSSIBLE.values(), ids=IMPOSSIBLE.keys())
+def test_what_a_reading_cannot_have_been_taken_with_is_not_written(small, tmp_path, tells, changes, said):
+    """Predictions refuse it: such a journal could not be resumed, whatever became of the instrument."""
+
+    class Own:
+        lifts = True
+
+        def measure(self, pose):
+            return {"value": 10.0, **tells}
+
+    mixture = FixedMixture(np.ones(1), np.zeros((1, 2)), 9.0 * np.eye(2)[None])
+    scene = HypothesisScene(Circle(Field(400.0, 300.0), (40.0, 80.0)))
+    model = Chain(mixture, FixedLevels(10.0, 60.0), scene, n_nodes=FAST_NODES)
+    experiment = small.experiment(shape=scene.shape, model=model, **changes)
+    path = tmp_path / "j"
+    with pytest.raises(LinkError, match=f"what the instrument returned is beyond the sensor: {said}"):
+        run(Own(), experiment, rng=np.random.default_rng(5), journal=path)
+    assert read_journal(path).entries == ()
+    tells = {}
+    assert len(run(Own(), experiment, rng=np.random.default_rng(5), journal=path, max_readings=1).readings) == 1
 
 
 def test_the_clock_of_ones_own_instrument_goes_on_where_an_earlier_run_ended(small, tmp_path):

@@ -49,6 +49,7 @@ from probewise.experiment.stopping_rule import (
 from probewise.experiment.utility_near_end import utility_map_and_must_continue
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
+from probewise.sensor.commanded import require_possible_commands
 
 
 def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Generator) -> ExplorationState:
@@ -285,7 +286,7 @@ def explore(
     NotConvergedError
         If no hypothesis could have given the readings.
     LinkError
-        If the instrument fails, or returns a reading out of range.
+        If the instrument fails, or returns a reading out of range, or with an impossible `led` or `height_mm`.
 
     Warns
     -----
@@ -369,7 +370,7 @@ def _yield_steps(
             number = len(state.readings) + 1
             entry = replayed[number - 1] if number <= len(replayed) else None
             reading = instrument.measure(state.next_pose) if entry is None else entry.reading
-            _require_value_in_range(experiment, reading)  # before it is written, or a resumed run fails again
+            _require_possible_reading(experiment, reading)  # before it is written, or a resumed run fails again
             if writer is not None and entry is None:
                 writer.write_reading(number, reading)
             if doubt is None and (doubt := doubt_about_height(experiment, height_of_reading_mm(reading))) is not None:
@@ -398,10 +399,11 @@ def _yield_steps(
             yield info
 
 
-def _require_value_in_range(experiment: Experiment, reading: Reading) -> None:
-    """Raise LinkError for a reading out of range: the instrument is at fault, and the run can be resumed."""
+def _require_possible_reading(experiment: Experiment, reading: Reading) -> None:
+    """Raise LinkError for a value, LED or height out of range: the instrument is at fault; the run can be resumed."""
     try:
         experiment.readout.require_in_range(reading.value)
+        require_possible_commands(experiment.problem([reading]).recording.plan)
     except ParameterError as error:
         raise LinkError(f"what the instrument returned is beyond the sensor: {error}") from error
 

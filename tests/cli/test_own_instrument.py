@@ -128,7 +128,10 @@ REFUSED = {
     "a geometry": (["--geometry", "a.toml"], "--geometry is 'a.toml'; allowed: none with FILE.py"),
     "a truth": (["--truth", "600,260,90"], "--truth is '600,260,90'; allowed: none with a real arm"),
     "the brick with ten bits": (["--arm", "emulator"], "--sensor is .*ten_bits.json'; allowed: one that reads in LEGO"),
-    "a turn": (["--orientations", "0,45"], "--orientations is '0,45'; allowed: none with .*turns = True"),
+    "a turn": (
+        ["--orientations", "0,45"],
+        r"orientations_rad \(--orientations\) is .*; allowed: none with .*turns = True",
+    ),
 }
 
 

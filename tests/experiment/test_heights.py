@@ -238,6 +238,47 @@ def test_a_height_that_is_calibrated_unknown_or_named_leaves_no_doubt(small, tel
     assert found.notes == ()
 
 
+REFUSED = {
+    "heights": ({}, {}, r"heights_mm \(--heights\) is \(12.0, 21.0\); .* read at pose.height_mm: lifts = True"),
+    "a height that is not its own": ({"read_height_mm": 20.0}, {"heights_mm": (21.0,)}, "heights_mm"),
+    "turns": (
+        {"lifts": True},
+        {"orientations_rad": (0.0, 0.5)},
+        r"orientations_rad \(--orientations\) is \(0.0, 0.5\); .* to pose.orientation_rad: turns = True",
+    ),
+}
+
+
+@pytest.mark.parametrize("with_callbacks", [False, True])
+@pytest.mark.parametrize(("declared", "changes", "message"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_an_arm_does_not_declare_that_it_can_is_refused_before_it_moves(
+    small, tmp_path, with_callbacks, declared, changes, message
+):
+    """It would be recorded as turned or lifted, and would not be."""
+    moved = []
+    arm = as_instrument(OwnArm({}, measure=moved.append, **declared))
+    arm = InstrumentWithCallbacks(arm, print, print) if with_callbacks else arm
+    path = tmp_path / "journal.jsonl"
+    with pytest.raises(ParameterError, match=message):
+        next(explore(arm, asked(small, **changes), rng=np.random.default_rng(1), journal=path))
+    assert not moved
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("declared", "changes"),
+    [
+        ({"lifts": True}, {}),
+        ({"read_height_mm": 21.0}, {"heights_mm": (21.0,)}),
+        ({"turns": True}, {"heights_mm": (), "orientations_rad": (0.0, 0.5)}),
+    ],
+)
+def test_what_an_arm_declares_that_it_can_may_be_chosen(small, declared, changes):
+    steps = explore(OwnArm({}, **declared), asked(small, **changes), rng=np.random.default_rng(1))
+    assert next(steps).number == 1
+    steps.close()
+
+
 def test_the_lego_arm_declares_its_height():
     geometry = replace(read_geometry(shipped_geometry_path()), read_height_mm=20.0)
     assert LegoArm(None, geometry).read_height_mm == 20.0

@@ -58,7 +58,11 @@ class SimulatedArm:
     ----------
     mounted_rad
         Always 0, since no person turns the sensor.
+    turns, lifts
+        Always True: it takes the orientation and the height of every pose.
     """
+
+    turns = lifts = True
 
     def __init__(
         self,

@@ -7,7 +7,7 @@ import math
 import queue
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -232,6 +232,16 @@ class InstrumentWithCallbacks:
         height_mm: float | None = getattr(self._instrument, "read_height_mm", None)
         return height_mm
 
+    @property
+    def turns(self) -> bool:
+        """Whether the instrument declares that it can turn its sensor."""
+        return bool(getattr(self._instrument, "turns", False))
+
+    @property
+    def lifts(self) -> bool:
+        """Whether the instrument declares that it can read at other heights."""
+        return bool(getattr(self._instrument, "lifts", False))
+
     def __enter__(self) -> Self:
         self._instrument.__enter__()
         return self
@@ -248,29 +258,6 @@ class InstrumentWithCallbacks:
         reading = self._instrument.measure(pose)
         self._read(reading)
         return reading
-
-
-def require_turns_and_lifts(
-    arm: Instrument, orientations_deg: Sequence[float] | None, heights_mm: Sequence[float] | None
-) -> None:
-    """Check that a user's instrument, already entered, can take the orientations and heights that were given.
-
-    Raises ParameterError if orientations are given and it does not declare `turns`, or heights and not `lifts`.
-    """
-    from probewise.arm import OwnInstrument
-
-    if not isinstance(arm, OwnInstrument):
-        return
-    wanted = (
-        ("--orientations", orientations_deg, arm.can_turn, "turn its sensor to pose.orientation_rad; turns"),
-        ("--heights", heights_mm, arm.can_lift, "read at pose.height_mm; lifts"),
-    )
-    for option, values, can, what in wanted:
-        if values and not can:
-            listed = ",".join(f"{value:g}" for value in values)
-            raise ParameterError(
-                option, listed, f"none with {arm.source}: it does not declare that it can {what} = True does"
-            )
 
 
 def prompter(arm: Instrument) -> Callable[[str], None]:

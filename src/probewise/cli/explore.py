@@ -13,7 +13,6 @@ from probewise.cli._arm import (
     ARMS,
     InstrumentWithCallbacks,
     add_geometry,
-    require_turns_and_lifts,
     warn_and_confirm_lowering,
     warn_if_place_sd_large,
 )
@@ -212,7 +211,6 @@ def run(arguments: argparse.Namespace) -> int:
             )
         ) as own,
     ):
-        require_turns_and_lifts(site.arm, arguments.orientations, arguments.heights)
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:

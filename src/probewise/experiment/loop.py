@@ -22,6 +22,7 @@ from probewise.arm.own_instrument import Measures, as_instrument, require_measur
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
 from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_readings_and_utilities
 from probewise.experiment.aligned_angles import with_aligned_angles
+from probewise.experiment.arm_abilities import require_turns_and_lifts
 from probewise.experiment.arm_error import arm_error_in_posterior, draw_shape_shifts_from_arm_error
 from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.experiment.hidden import HiddenShape
@@ -282,7 +283,8 @@ def explore(
     FileError
         If the journal is damaged, belongs to a run with other settings, or is written to by another process.
     ParameterError
-        If the journal holds more than `max_readings` readings, or no place is more informative than others.
+        If the journal holds more than `max_readings` readings, no place is more informative than others, or the
+        instrument does not declare that it can turn or lift its sensor as the experiment may choose.
     NotConvergedError
         If no hypothesis could have given the readings.
     LinkError
@@ -356,6 +358,7 @@ def _yield_steps(
     settings: Mapping[str, Any],
 ) -> Generator[Step, None, None]:
     """Yield the steps: those of the journal `before`, then those of new readings, which are written to `path`."""
+    require_turns_and_lifts(instrument, experiment)
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
     field = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
     first = _rng_of_reading(seed, 0)

@@ -16,9 +16,20 @@ from scipy.stats import multivariate_normal
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
 from probewise.experiment import ArmReachAndTravel as FieldOf
-from probewise.experiment import Exploration, OneScan, arm_over, begin, explore, read_journal, run, step
+from probewise.experiment import (
+    Exploration,
+    OneScan,
+    acquisition,
+    arm_over,
+    begin,
+    explore,
+    loop,
+    read_journal,
+    run,
+    step,
+)
 from probewise.inference import GaussianKnown, StudentT
-from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, prior_entropy
+from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, UtilityMap, prior_entropy
 from probewise.recordings import Disc
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 from probewise.scene.scenes import HypothesisScene
@@ -518,6 +529,43 @@ def test_several_readings_are_chosen_at_a_time(small):
     assert again == poses[:3]
     with pytest.raises(ParameterError, match="batch"):
         small.experiment(batch=2, utility=ReadingEntropy())
+
+
+@pytest.fixture
+def peaked(small):
+    """A map of another utility than information, with its peak at one place, and where that is."""
+    experiment = small.experiment(grid=COARSE)
+    values = np.zeros(len(experiment.designs))
+    values[7] = 1.0
+    design = experiment.designs[7]
+    there = UtilityMap(experiment.designs, values, np.ones(len(values), dtype=bool), "chance to end the run")
+    return there, (design.x_mm, design.y_mm)
+
+
+def one_step(experiment, arm, planned):
+    """Take the first step by hand, with poses planned before it."""
+    field = FieldOf.from_instrument(arm, experiment.grid)
+    state = replace(begin(experiment, field, rng=rng()), planned=planned)
+    return step(state, arm.measure(state.next_pose), experiment, field, prior_bits=0.0, rng=rng())
+
+
+def test_a_batch_near_the_end_is_the_one_reading_that_may_end_the_run(small, peaked, monkeypatch):
+    there, place = peaked
+    monkeypatch.setattr(acquisition, "utility_map", lambda *_: there)
+    state, info = one_step(small.experiment(batch=3, grid=COARSE), small.arm(), ())
+    assert (info.next_pose.x_mm, info.next_pose.y_mm) == place
+    assert state.planned == ()
+
+
+@pytest.mark.parametrize("asks", [False, True])
+def test_a_reading_for_which_the_run_goes_on_is_taken_before_those_planned(small, peaked, monkeypatch, asks):
+    there, place = peaked
+    experiment, planned = small.experiment(batch=3, grid=COARSE), (Pose(10.0, 20.0), Pose(30.0, 40.0))
+    assert len(experiment.kinds) == 1
+    object.__setattr__(experiment, "trust", 0.9)  # this sensor has no rivals, so the constructor would refuse
+    monkeypatch.setattr(loop, "utility_map_and_must_continue", lambda *_, **__: (there, asks))
+    state, info = one_step(experiment, small.arm(), planned)
+    assert (info.next_pose, *state.planned) == ((Pose(*place),) if asks else planned)
 
 
 def test_repeats_are_taken_on_the_spot(small):

@@ -14,7 +14,17 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
-from probewise.inquiry import Goal, Grid, UtilityInput, UtilityMap, choose, choose_several, reachable_rows, utility_map
+from probewise.inquiry import (
+    Goal,
+    Grid,
+    InformationGain,
+    UtilityInput,
+    UtilityMap,
+    choose,
+    choose_several,
+    reachable_rows,
+    utility_map,
+)
 from probewise.inquiry.forecast import resampled_rows_and_weights
 from probewise.nested.importance import Weighted
 
@@ -113,8 +123,12 @@ def predict_readings_and_utilities(
 def next_poses(
     experiment: Experiment, utility_input: UtilityInput, utilities: UtilityMap, *, rng: np.random.Generator
 ) -> tuple[Pose, ...]:
-    """Choose the next pose, or the experiment's `batch` of poses; each comes as often as its design repeats it."""
-    if experiment.batch > 1:
+    """Choose the next pose, or the experiment's `batch` of poses; each comes as often as its design repeats it.
+
+    A batch is chosen for its joint information. Where the map shows another utility, as near the end of a run, only the
+    best design of the map is taken.
+    """
+    if experiment.batch > 1 and utilities.label == InformationGain.label:
         rows = choose_several(utility_input, experiment.batch, rng=rng)
     else:
         rows = (choose(utilities.values, utilities.reachable, rng=rng),)

@@ -103,8 +103,8 @@ class Experiment:
         footprint and dim the signal (see `sensor.commanded`). Without selectable heights every reading counts as one at
         the height of the calibration, about which effects of the height change it; None: not known, 14 mm for these.
     batch
-        Readings chosen together for their joint information; above 1 only with the default utility or
-        `InformationGain`.
+        Readings chosen together for their joint information, until the utility near the end of a run chooses them one
+        by one; above 1 only with the default utility or `InformationGain`.
     stop_sd_mm
         The run ends when the posterior sds of all of the shape's parameters in mm are below this: 4 mm, half the
         spacing of LEGO holes, in the paper. For a set of shapes, the parameters of the most probable shape.

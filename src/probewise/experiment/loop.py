@@ -180,7 +180,9 @@ def step(
         max_readings=max_readings,
         arm_sd=arm_sd,
     )
-    pose, *planned = state.planned or next_poses(experiment, utility_input, utilities, rng=rng)
+    # A reading for which the run goes on, though the shape is known, is not one of those planned before.
+    planned_before = () if asks else state.planned
+    pose, *planned = planned_before or next_poses(experiment, utility_input, utilities, rng=rng)
     info = Step(
         number=len(readings),
         reading=reading,

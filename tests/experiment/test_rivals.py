@@ -337,8 +337,11 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     with arm_of(Trial(REFERENCE, 0)) as arm:
         field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
     utility_input, _ = predict_readings_and_utilities(doubting, joined, joined.theta[:20], field, at=inside)
+    missing = [
+        replace(r, value=math.nan, pose=Pose(2 * x - r.pose.x_mm, 2 * y - r.pose.y_mm)) for r in on_edge
+    ]  # on the far side, without a value
     outline = OutlineReadingDistances.from_region(
-        utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge)
+        utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge, *missing)
     )
     assert outline is not None
     far = outline.far_side_design

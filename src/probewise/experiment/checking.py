@@ -139,7 +139,8 @@ class OutlineReadingDistances:
         edge, nearest = edge[within], away.argmin(axis=1)[within]
         diameter = float(np.linalg.norm(edge[:, None] - edge, axis=2).max())
         unread = cls(edge, nearest, np.full(len(edge), np.inf), spacing, diameter)
-        taken = np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings]).reshape(-1, 2)
+        # A missing reading has seen nothing.
+        taken = np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings if not math.isnan(r.value)]).reshape(-1, 2)
         apart = unread.nearest_reading_distances_if_read_at(taken).min(axis=1, initial=np.inf)
         return cls(edge, nearest, apart, spacing, diameter)
 

@@ -52,6 +52,7 @@ from probewise.experiment.posterior import prior_posterior
 from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
+from probewise.experiment.utility_near_end import _ENDS, _LABEL, utility_map_and_must_continue
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
 from probewise.recordings import Instrumentation, Plan, Uniform
@@ -283,6 +284,42 @@ def test_a_reading_tells_names_by_what_they_predict():
     assert bits[0] == pytest.approx(0.0, abs=1e-9)
     assert bits[1] == pytest.approx(1.0, abs=1e-6)
     assert bits[2] == pytest.approx(exact, abs=0.01)
+
+
+def test_repeats_tell_names_by_their_mean():
+    """Four readings of the same noise tell as much as one of half the noise."""
+    weight, names = np.full(400, 1 / 400), np.repeat(["", "halo"], 200)
+    even = norm.ppf((np.arange(200) + 0.5) / 200)
+    near = np.concatenate([20.0 + 0.5 * even, 22.0 + 0.5 * even])[:, None]
+    repeated = expected_bits_about_left_out_effect(weight, near, names, Readout(2.0), repeats=4)
+    assert repeated == pytest.approx(expected_bits_about_left_out_effect(weight, near, names, Readout(1.0)), abs=0.003)
+    assert repeated > 1.5 * expected_bits_about_left_out_effect(weight, near, names, Readout(2.0))
+
+
+@pytest.mark.parametrize(
+    ("sd_mm", "what"), [((30.0, 30.0, 9.0), _LABEL), ((6.0, 1.0, 1.0), _ENDS)], ids=["far from the end", "near the end"]
+)
+def test_near_the_end_repeats_are_worth_more_than_one_reading(doubting, sd_mm, what):
+    """At every place that is a candidate with one reading and with nine: the noise of their mean is a third."""
+    experiment = replace(doubting, repeats=(1, 9), noise_sd=6.0)
+    rng = np.random.default_rng(1)
+    posterior = prior_posterior(doubting.kinds[:1], 600, rng=rng)
+    (particles,) = posterior.particles
+    theta = np.array([500.0, 260.0, 90.0]) + np.array(sd_mm) * rng.standard_normal((600, 3))
+    weighted = replace(particles.weighted, theta=theta)
+    posterior = replace(posterior, particles=(replace(particles, weighted=weighted),))
+    readings = (Reading(35.0, Pose(500.0, 170.0), 8.0), Reading(35.0, Pose(500.0, 350.0), 16.0))
+    with arm_of(Trial(REFERENCE, 0)) as arm:
+        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
+    of = predict_readings_and_utilities(experiment, weighted, theta[:20], field, at=readings[-1])
+    there, _ = utility_map_and_must_continue(experiment, posterior, *of, readings, rng=rng)
+    assert there.label == what
+    once, nine_times = there.values.reshape(2, -1)
+    both = (once > 0) & (nine_times > 0)
+    assert both.sum() > 5
+    more = nine_times[both] - once[both]
+    assert more.min() > -1e-3
+    assert more.mean() > 0.03
 
 
 def test_a_few_stragglers_of_a_name_promise_nothing():

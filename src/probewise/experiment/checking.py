@@ -35,7 +35,7 @@ _AT_EDGE = 1.0  # spacings of the grid within which a reading is at the edge
 
 
 def expected_bits_about_left_out_effect(
-    weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout
+    weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout, *, repeats: int = 1
 ) -> FloatArray:
     """Return the expected information of a reading about the name of the effect left out: the smaller of two estimates.
 
@@ -50,16 +50,17 @@ def expected_bits_about_left_out_effect(
         Predicted readings, (n, n_designs).
     readout
         Cells and noise of a reading.
+    repeats
+        Number of readings at each design, of which the mean counts.
 
     Returns
     -------
     Bits, (n_designs,).
     """
     each = [names == name for name in np.unique(names)]
-    by_gaussians = _expected_bits_by_gaussians(weight, answers, each, readout.noise_sd)
-    return np.asarray(
-        np.maximum(np.minimum(by_gaussians, _expected_bits_by_cells(weight, answers, each, readout)), 0.0)
-    )
+    by_gaussians = _expected_bits_by_gaussians(weight, answers, each, readout.noise_sd / math.sqrt(repeats))
+    by_cells = _expected_bits_by_cells(weight, answers, each, readout, repeats)
+    return np.asarray(np.maximum(np.minimum(by_gaussians, by_cells), 0.0))
 
 
 def _expected_bits_by_gaussians(
@@ -91,10 +92,10 @@ def _expected_bits_by_gaussians(
 
 
 def _expected_bits_by_cells(
-    weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout
+    weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout, repeats: int
 ) -> FloatArray:
     """Return bits about the name, (n_designs,): entropy of the histogram of readings minus its mean given the name."""
-    given = WeightsGivenReading(answers, weight, readout, fine=_CELL)
+    given = WeightsGivenReading(answers, weight, readout, fine=_CELL, repeats=repeats)
     told = entropy_bits(given.weight_by_cell)
     for own in each:
         part = float(weight[own].sum())

@@ -8,9 +8,11 @@ added, and readings that leave a side of the shape unread count half (`checking`
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
@@ -91,6 +93,7 @@ def utility_map_and_must_continue(
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
+    n_repeats = utility_input.designs.n_repeats[utility_input.rows[rows]]
     names = np.array([kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own])
     seen = (
         np.ones(len(rows), dtype=np.bool_)
@@ -98,11 +101,11 @@ def utility_map_and_must_continue(
         else outline.leaves_no_far_side_mask(available_places_mm(utility_input)[rows])
     )
     if known and not far:
-        utility = expected_bits_about_left_out_effect(weight, answers, names, utility_input.readout)
+        utility = _bits_about_names(weight, answers, names, n_repeats, utility_input)
         return _utility_map_of_candidates(utility_input, utilities, rows, utility, NAMES), bool(
             utility.max() >= ENOUGH_BITS
         )
-    utility = _expected_bits(weight, answers, utility_input)
+    utility = _expected_bits(weight, answers, n_repeats, utility_input)
     if known:
         # The far side first: it has to be read in any case, and tells something about the names too.
         there = seen if seen.any() else np.isin(rows, far)
@@ -112,13 +115,19 @@ def utility_map_and_must_continue(
     order = np.argsort(-utility, kind="stable")
     best = np.unique(np.concatenate([order[:_ENDING], order[seen[order]][:_ENDING]]))
     chance = _probability_of_meeting_rule(
-        lengths, weight, answers[:, best], utility_input, goal.sd, OFF_SDS * experiment.stop_sd_mm
+        lengths,
+        weight,
+        answers[:, best],
+        n_repeats[best],
+        utility_input,
+        goal.sd,
+        OFF_SDS * experiment.stop_sd_mm,
     )
     if chance.max() < _LEAST_CHANCE:
         return _utility_map_of_candidates(utility_input, utilities, rows, utility, _LABEL), False
     # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
-    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + expected_bits_about_left_out_effect(
-        weight, answers[:, best], names, utility_input.readout
+    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + _bits_about_names(
+        weight, answers[:, best], names, n_repeats[best], utility_input
     )
     return _utility_map_of_candidates(utility_input, utilities, rows[best], ends, _ENDS), False
 
@@ -202,33 +211,60 @@ def _plan_from_arm_to_candidates(utility_input: UtilityInput, rows: IntArray, la
     return replace(taken, x_mm=x_mm, y_mm=y_mm, time_s=time_s, scan=scan, scan_names=tuple(str(k) for k in range(n)))
 
 
-def _expected_bits(weight: FloatArray, answers: FloatArray, utility_input: UtilityInput) -> FloatArray:
+def _bits_about_names(
+    weight: FloatArray,
+    answers: FloatArray,
+    names: NDArray[np.str_],
+    n_repeats: IntArray,
+    utility_input: UtilityInput,
+) -> FloatArray:
+    """Return the expected information about the effect left out, (n_designs,), by the repeats of each design."""
+    out = np.empty(answers.shape[1])
+    for n, own in _designs_by_repeats(n_repeats):
+        out[own] = expected_bits_about_left_out_effect(weight, answers[:, own], names, utility_input.readout, repeats=n)
+    return out
+
+
+def _expected_bits(
+    weight: FloatArray, answers: FloatArray, n_repeats: IntArray, utility_input: UtilityInput
+) -> FloatArray:
     """Return the expected information, (n_designs,), in bits, by predictions, (n, n_designs), and weights, (n,)."""
-    given = WeightsGivenReading(answers, weight, utility_input.readout)
-    middle = np.array([0.5 * float(answers.min() + answers.max())])
-    of_noise = float(entropy_bits(utility_input.readout.cell_probability(middle, fine=1.0))[0])
-    return np.maximum(entropy_bits(given.weight_by_cell) - of_noise, 0.0)
+    out, readout = np.empty(answers.shape[1]), utility_input.readout
+    for n, own in _designs_by_repeats(n_repeats):
+        given = WeightsGivenReading(answers[:, own], weight, readout, repeats=n)
+        middle = np.array([0.5 * float(answers[:, own].min() + answers[:, own].max())])
+        of_noise = float(entropy_bits(readout.cell_probability(middle, repeats=n, fine=1.0))[0])
+        out[own] = entropy_bits(given.weight_by_cell) - of_noise
+    return np.maximum(out, 0.0)
 
 
 def _probability_of_meeting_rule(
     lengths: FloatArray,
     weight: FloatArray,
     answers: FloatArray,
+    n_repeats: IntArray,
     utility_input: UtilityInput,
     goal_sd_mm: float,
     off_mm: float,
 ) -> FloatArray:
-    """Return the probability, (n_designs,), that the posterior after a reading there meets the stopping rule."""
+    """Return the probability, (n_designs,), that the posterior after a design's readings meets the stopping rule."""
     away = lengths - weight @ lengths
-    given = WeightsGivenReading(answers, weight, utility_input.readout)
     out = np.empty(answers.shape[1])
-    for design, mass in enumerate(given.weight_by_cell):
-        joint = given.weight_by_hypothesis_and_cell(design)
-        ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
-        for length in away.T:
-            mean = length @ joint / mass
-            ends &= length**2 @ joint / mass - mean**2 < goal_sd_mm**2
-            off |= np.abs(length[:, None] - mean) > off_mm
-        ends &= np.where(off, joint, 0.0).sum(axis=0) < MOST_OFF * mass
-        out[design] = mass[ends].sum() / mass.sum()
+    for n, own in _designs_by_repeats(n_repeats):
+        given = WeightsGivenReading(answers[:, own], weight, utility_input.readout, repeats=n)
+        for design, (row, mass) in enumerate(zip(own.tolist(), given.weight_by_cell, strict=True)):
+            joint = given.weight_by_hypothesis_and_cell(design)
+            ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
+            for length in away.T:
+                mean = length @ joint / mass
+                ends &= length**2 @ joint / mass - mean**2 < goal_sd_mm**2
+                off |= np.abs(length[:, None] - mean) > off_mm
+            ends &= np.where(off, joint, 0.0).sum(axis=0) < MOST_OFF * mass
+            out[row] = mass[ends].sum() / mass.sum()
     return out
+
+
+def _designs_by_repeats(n_repeats: IntArray) -> Iterator[tuple[int, IntArray]]:
+    """Yield each number of repeats, of which the mean counts, and the indices of the designs that have it."""
+    for n in np.unique(n_repeats).tolist():
+        yield n, np.flatnonzero(n_repeats == n)

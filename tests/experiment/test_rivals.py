@@ -48,7 +48,7 @@ from probewise.experiment.noise_rivals import (
     OutlierLikelihood,
     SignalDependentLikelihood,
 )
-from probewise.experiment.posterior import prior_posterior
+from probewise.experiment.posterior import Posterior, prior_posterior
 from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
@@ -56,6 +56,7 @@ from probewise.experiment.utility_near_end import _ENDS, _LABEL, utility_map_and
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
 from probewise.recordings import Instrumentation, Plan, Uniform
+from probewise.report.exploration import page_html, robot_view_png
 from probewise.sensor import mixture_parameter_names
 from probewise.study import ConcealedTrial, arm_of, concealed_csv_rows, experiment_of, run_concealed_trial
 from probewise.study.concealed import _arm_in_concealed_world
@@ -284,6 +285,25 @@ def test_a_reading_tells_names_by_what_they_predict():
     assert bits[0] == pytest.approx(0.0, abs=1e-9)
     assert bits[1] == pytest.approx(1.0, abs=1e-6)
     assert bits[2] == pytest.approx(exact, abs=0.01)
+
+
+@pytest.mark.parametrize(("name", "tested"), [("dropouts", False), ("", True)])
+def test_the_fit_is_tested_where_the_declared_noise_leads(doubting, stepped, monkeypatch, name, tested):
+    """Chi-square is of that noise alone."""
+    index = [kind.left_out for kind in doubting.kinds].index(name)
+    monkeypatch.setattr(Posterior, "most_probable_kind_index", index)
+    rng = np.random.default_rng(4)
+    with arm_of(Trial(REFERENCE, 0)) as arm:
+        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
+        state = begin(doubting, field, rng=rng)
+        _, info = step(state, stepped[0].reading, doubting, field, prior_bits=0.0, rng=rng, max_readings=1)
+    assert (info.p_value is not None) == tested
+    found = Exploration(doubting, (info,))
+    said = "not tested: the most probable noise is not the declared one"
+    assert (f"fit          {said}" in found.summary().splitlines()) == (not tested)
+    frame = robot_view_png(info, doubting, [], levels=(10.0, 60.0))
+    assert (said in page_html(found, [frame], seed=1, model="ssf")) == (not tested)
+    assert not doubting.fit_is_doubtful(info.p_value)
 
 
 def test_repeats_tell_names_by_their_mean():

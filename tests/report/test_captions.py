@@ -134,6 +134,7 @@ def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run
         "shape",
         "chance_off_12mm",
         "left_out",
+        "notes",
         "bits",
         "seconds",
     ]

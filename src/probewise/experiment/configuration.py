@@ -115,7 +115,8 @@ class Experiment:
         out (`experiment.rivals`), and ends only when the lengths are known whichever it is.
     doubt_p
         p-value of the best hypothesis below which the run reports that no hypothesis explains the readings and that
-        the posterior is not to be trusted; 0 for a model that is known to be coarse.
+        the posterior is not to be trusted; 0 for a model that is known to be coarse. Where the most probable noise is
+        not the declared one, the fit is not tested.
     n_particles
         Number of weighted posterior samples.
     n_samples
@@ -304,6 +305,10 @@ class Experiment:
 
     is_known = may_stop
     """The old name of `may_stop`."""
+
+    def fit_is_doubtful(self, p_value: float | None) -> bool:
+        """Return whether the p-value of the best hypothesis says that none explains the readings; None: not tested."""
+        return p_value is not None and p_value < self.doubt_p
 
     def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
         """Return the settings for a journal's first line as JSON values; models and likelihoods also by digest."""

@@ -138,14 +138,13 @@ def step(
         wary, joined, posterior = _wary_kinds_and_posterior(experiment, carried, rng)
     mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     leader = carried.kinds[carried.most_probable_kind_index]
-    p_value, worst = p_value_and_worst_reading(
-        experiment, carried.particles[carried.most_probable_kind_index].weighted, leader.problem(problem.recording)
-    )
-    if leader.likelihood is not experiment.likelihood:
-        p_value = 1.0  # this noise model allows for outliers
-    notes = () if posterior.run is None else posterior.run.warnings
-    if p_value < experiment.doubt_p:
-        notes = (*notes, doubt_message(p_value, worst, readings))
+    p_value, notes = None, () if posterior.run is None else posterior.run.warnings
+    if leader.likelihood is experiment.likelihood:  # chi-square is of this noise
+        p_value, worst = p_value_and_worst_reading(
+            experiment, carried.particles[carried.most_probable_kind_index].weighted, leader.problem(problem.recording)
+        )
+        if experiment.fit_is_doubtful(p_value):
+            notes = (*notes, doubt_message(p_value, worst, readings))
     drawn = experiment.inference_method.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
     likely = max(shapes, key=shapes.__getitem__, default="")
 

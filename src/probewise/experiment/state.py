@@ -61,6 +61,7 @@ class Step(ShowsItself):
         Information gained so far: prior minus posterior differential entropy of all parameters.
     p_value
         p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
+        None where the most probable noise is not the declared one, of which this test is.
     posterior
         Weighted posterior of all parameters, with the evidence; the odds of a left-out effect are raised (`WARY`).
     sensor
@@ -93,7 +94,7 @@ class Step(ShowsItself):
     map: UtilityMap
     next_pose: Pose | None
     bits: float
-    p_value: float
+    p_value: float | None
     posterior: Weighted
     sensor: Mapping[str, tuple[float, float]]
     left_out: Mapping[str, float]
@@ -237,7 +238,7 @@ class Exploration(ShowsItself):
     @property
     def reached(self) -> bool:
         """Whether the target precision was reached, arm included, with a hypothesis that explains the readings."""
-        trusted = self.last.p_value >= self.experiment.doubt_p
+        trusted = not self.experiment.fit_is_doubtful(self.last.p_value)
         return trusted and self.experiment.may_stop(self.sd, self.last.shapes, self.last.chance_off)
 
     @property
@@ -273,7 +274,9 @@ class Exploration(ShowsItself):
             f"information  {last.bits:.1f} bits, {self.bits_per_reading:.2f} per reading "
             f"(the paper's count: {PAPER_BITS:g} bits, {self.paper_bits_per_reading:.2f} per reading)",
             f"log Z        {self.posterior.log_z:.2f} ± {self.posterior.log_z_error:.2f}",
-            f"fit          p = {last.p_value:.2g} (how often a right hypothesis fits no better)",
+            "fit          not tested: the most probable noise is not the declared one"
+            if last.p_value is None
+            else f"fit          p = {last.p_value:.2g} (how often a right hypothesis fits no better)",
         ]
         if self.hidden is not None:
             lay = ", ".join(f"{name} {value:.{_n_decimals(name)}f}" for name, value in self.hidden.parameters.items())

@@ -99,7 +99,7 @@ def stop_reason(
     experiment: Experiment,
     sd: FloatArray,
     known: bool,
-    p_value: float,
+    p_value: float | None,
     utilities: UtilityMap,
     n_readings: int,
     max_readings: int | None,
@@ -107,13 +107,13 @@ def stop_reason(
 ) -> str | None:
     """Return the reason why a run ends, or None if it continues.
 
-    `arm_sd` is the part of the shape's sds that comes from the arm, (n_params,), which no reading lowers; `sd` is that
-    of the readings alone.
+    `p_value` is that of the best hypothesis, None if it was not tested. `arm_sd` is the part of the shape's sds that
+    comes from the arm, (n_params,), which no reading lowers; `sd` is that of the readings alone.
     """
     names = experiment.shape.prior.names
     included = "" if arm_sd is None else ", the arm's own error included"
     widest = largest_sd_mm(names, sd if arm_sd is None else np.hypot(sd, arm_sd))
-    if known and p_value < experiment.doubt_p:
+    if known and p_value is not None and experiment.fit_is_doubtful(p_value):
         return (
             f"no hypothesis explains the readings (p = {p_value:.1g}), so the posterior, narrow as it is "
             f"({widest:.1f} mm), is not to be trusted; a diagnosis of the readings asks what the model leaves out"

@@ -355,8 +355,10 @@ def page_html(
     )
 
 
-def _fit_in_words(p_value: float) -> str:
-    """Write the p-value of the best hypothesis's fit, and its meaning."""
+def _fit_in_words(p_value: float | None) -> str:
+    """Write the p-value of the best hypothesis's fit, and its meaning; None: not tested."""
+    if p_value is None:
+        return "not tested: the most probable noise is not the declared one"
     return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
 
 

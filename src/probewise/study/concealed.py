@@ -185,7 +185,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
         **accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
         "p_truth": round(left_out.probability.get(trial.right_answer, 0.0), 4),
         "credible": list(left_out.credible_set),
-        "noticed": bool(last.p_value < experiment.doubt_p or left_out.leading != CLEAN),
+        "noticed": experiment.fit_is_doubtful(last.p_value) or left_out.leading != CLEAN,
         "cpu_s": [round(float(np.quantile(cpu, q)), 3) for q in (0.5, 0.95)],
     }
 

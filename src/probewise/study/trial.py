@@ -114,8 +114,8 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     A dict for JSON. Search: whether the target precision was `reached`, number of `readings`, number of the first one
     on white (`first_white`, or None), `bits` gained in all and up to that one (`bits_at_white`). Result: largest error
     of a length (`error_mm`), its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 % interval
-    covers the truth (`held`), p-value of the fit (`p_value`), widest posterior sd after each reading (`widest_mm`).
-    Cost: arm time in seconds (`arm_s`), median processor time per decision in seconds (`cpu_s`).
+    covers the truth (`held`), p-value of the fit (`p_value`, None: not tested), widest posterior sd after each reading
+    (`widest_mm`). Cost: arm time in seconds (`arm_s`), median processor time per decision in seconds (`cpu_s`).
     """
     experiment = experiment_of_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
@@ -157,7 +157,7 @@ def timed_steps(
 def has_reached_target(last: Step, experiment: Experiment) -> bool:
     """Return whether a run reached the target precision with a posterior that fits its readings."""
     known = experiment.may_stop(last.sd, last.shapes, last.chance_off)
-    return bool(last.p_value >= experiment.doubt_p and known)
+    return known and not experiment.fit_is_doubtful(last.p_value)
 
 
 def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:

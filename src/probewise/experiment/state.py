@@ -58,7 +58,8 @@ class Step(ShowsItself):
     next_pose
         Next pose; None when the run is over.
     bits
-        Information gained so far: prior minus posterior differential entropy of all parameters.
+        Information gained so far: prior minus posterior differential entropy of all parameters. With `trust` below 1,
+        the information about the effect left out and its parameters is added, so this exceeds that about the shape.
     p_value
         p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
         None where the most probable noise is not the declared one, of which this test is.

@@ -329,7 +329,7 @@ def page_html(
                 ),
                 figure(
                     png(information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()})),
-                    "Information about the shape: prior minus posterior differential entropy.",
+                    _information_caption(run.experiment.trust),
                 ),
                 steps_table(run, unit),
             ),
@@ -353,6 +353,12 @@ def page_html(
     return page(
         "The robot's search", answer=summary_sentence(run), key_figure=figure(frames[-1], caption), sections=sections
     )
+
+
+def _information_caption(trust: float) -> str:
+    """Describe the information gained; with `trust` below 1 it includes that about the effect left out."""
+    more = "" if trust == 1 else " Information about what the sensor model leaves out is included."
+    return f"Information about the shape: prior minus posterior differential entropy.{more}"
 
 
 def _fit_in_words(p_value: float | None) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from probewise.arm.uncertainty import (
 from probewise.errors import FileError, ParameterError
 from probewise.experiment import FittedArm, explore, found_shape, result_json, run, samples_csv
 from probewise.experiment.arm_error import arm_error_in_posterior
+from probewise.inquiry import Grid
 
 ARM = dataclasses.replace(read_geometry(shipped_geometry_path()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0))
 LEVELS = DARK, WHITE = 10.0, 60.0
@@ -121,6 +123,35 @@ def test_a_geometry_that_nobody_fitted_says_nothing_of_the_shape(found):
     far = dataclasses.replace(known_to(RULER_SDS / 10), axis_mm=(200.0, 2000.0))
     with pytest.raises(ParameterError, match="reach"):
         with_arm_error(found, far)
+
+
+ABOUT_ITS_BASE = dataclasses.replace(known_to(RULER_SDS / 10), axis_mm=(200.0, 150.0))
+"""It stands in the middle of its field, which it does not reach."""
+
+
+def test_an_arm_that_does_not_reach_where_it_was_calibrated_is_refused_when_a_run_begins():
+    allowed = r"calibrated_mm is \(200.0, 150.0\); allowed: a place within the arm's reach"
+    with pytest.raises(ParameterError, match=allowed):
+        FittedArm(ABOUT_ITS_BASE, LEVELS)
+
+
+def test_an_arm_that_does_not_reach_the_middle_was_calibrated_as_near_to_it_as_it_reaches(small_for_all):
+    levels = SimpleNamespace(mean=lambda: {"I_min": DARK, "I_max": WHITE})
+    arm = FittedArm.from_geometry_and_sensor(ABOUT_ITS_BASE, levels)
+    reached = ABOUT_ITS_BASE.reachable_grid_mm
+    away = np.hypot(*(reached - (200.0, 150.0)).T)
+    assert np.hypot(*(np.array(arm.calibration_place_mm) - (200.0, 150.0))) == away.min() > 100.0
+    assert FittedArm.from_geometry_and_sensor(known_to(RULER_SDS), levels).calibrated_mm is None
+    # Its error is known wherever it reads.
+    x_mm, y_mm = reached[0].tolist()
+    experiment = small_for_all.experiment(fitted_arm=arm, grid=Grid(x_mm, y_mm, 2, 2))
+
+    class There(small_for_all.arm):
+        def reachable(self, places_mm):
+            return np.array([False, False, False, True])
+
+    found = run(There(), experiment, rng=np.random.default_rng(4), max_readings=1)
+    assert np.isfinite(found.arm_error.sd).all()
 
 
 def test_light_that_falls_less_with_the_height_moves_the_shape_less(found):

@@ -70,10 +70,8 @@ def arm_error_in_posterior(
     geometry, accuracy = arm.geometry, arm.geometry.accuracy
     assert accuracy is not None
     recording = experiment.problem(readings).recording
-    width_mm, height_mm = geometry.field_mm
-    middle = (width_mm / 2, height_mm / 2) if arm.calibrated_mm is None else arm.calibrated_mm
     places = np.stack([recording.plan.x_mm, recording.plan.y_mm], axis=-1)
-    off = _pose_changes_per_error_sd(geometry, np.concatenate([places, [middle]]), accuracy)
+    off = _pose_changes_per_error_sd(geometry, np.concatenate([places, [arm.calibration_place_mm]]), accuracy)
     off[:, 2] -= off[-1, 2]
     off = off[:-1]
     dark, white = arm.levels

@@ -334,7 +334,8 @@ def explore(
         asked = replace(asked, fitted_arm=posing.FittedArm.from_geometry_and_sensor(arm.geometry, sensor))
     path = None if journal is None else checked_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
-    about = {**posing.sensor_entry(sensor), "arm": "simulated" if arm is None else type(arm).__name__}
+    geometry = posing.geometry_entry(arm.geometry if isinstance(arm, LegoArm) else None)
+    about = {**posing.sensor_entry(sensor), **geometry, "arm": "simulated" if arm is None else type(arm).__name__}
     taken = () if before is None else before.readings
     if arm is None:
         hidden = posing.HiddenShape.given_or_drawn(

@@ -2,17 +2,19 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, ParameterError
 from probewise.experiment import (
     HiddenShape,
     JournalWriter,
     PosteriorSummary,
+    geometry_entry,
     read_journal,
     recording_of,
     require_same_settings,
@@ -242,6 +244,21 @@ def test_what_a_journal_says_of_its_files_may_differ_when_the_run_goes_on(tmp_pa
     require_same_settings(journal, {**SETTINGS, "arm": "COM6", "sensor_file": "elsewhere/s.json"})
     with pytest.raises(FileError, match="sensor_sha256 None there, 'abc' here"):
         require_same_settings(journal, {**SETTINGS, "sensor_sha256": "abc"})
+
+
+def test_a_journal_that_names_the_geometry_is_not_resumed_with_another_and_an_older_one_is(tmp_path):
+    built = read_geometry(shipped_geometry_path())
+    here, there = (geometry_entry(geometry) for geometry in (built, replace(built, links_mm=(351.0, 350.0))))
+    assert geometry_entry(None) == {}
+    for name, settings in (("new", {**SETTINGS, **here}), ("old", SETTINGS)):
+        with JournalWriter.begin(tmp_path / name, settings):
+            pass
+    new, old = read_journal(tmp_path / "new"), read_journal(tmp_path / "old")
+    require_same_settings(new, {**SETTINGS, **here})
+    require_same_settings(old, {**SETTINGS, **there})
+    for other in (there, {}):
+        with pytest.raises(FileError, match=r"a run with other settings: geometry_sha256 .* there"):
+            require_same_settings(new, {**SETTINGS, **other})
 
 
 def test_a_reading_that_the_sensor_cannot_return_is_not_written(small, tmp_path):

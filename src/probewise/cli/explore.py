@@ -205,6 +205,7 @@ def run(arguments: argparse.Namespace) -> int:
                 journal=before or journal,
                 about={
                     **posing.sensor_entry(inputs.sensor, _path_relative_to_folder(out, arguments.sensor)),
+                    **posing.geometry_entry(inputs.geometry),
                     **site.about,
                     "arm": arguments.arm.partition(":")[0],
                 },

@@ -41,6 +41,8 @@ PATTERN = "field"
 _SUMMARY_KEY = ', "belief": '
 # Settings in which a resumed run may differ: files may have moved, and an arm may have another name.
 _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
+# Settings that journals of earlier versions lack.
+_LATER = frozenset({"geometry_sha256"})
 
 
 @dataclass(frozen=True)
@@ -268,10 +270,12 @@ def _pose_as_json(pose: Pose) -> dict[str, float]:
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
     """Raise FileError with every setting in which a journal differs from the run that would resume it.
 
-    Version, arm, spawn key and the name of the sensor's file may differ.
+    Version, arm, spawn key and the name of the sensor's file may differ. The arm's geometry is compared only if the
+    journal has it, since those of earlier versions do not.
     """
     there, here = _flattened_settings(journal.settings), _flattened_settings(json.loads(json.dumps(settings)))
-    different = sorted(name for name in {*there, *here} - _FREE if there.get(name) != here.get(name))
+    compared = {*there, *here} - _FREE - {name for name in _LATER if name not in there}
+    different = sorted(name for name in compared if there.get(name) != here.get(name))
     if different:
         had = "; ".join(f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
         raise FileError(

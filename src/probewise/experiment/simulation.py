@@ -15,12 +15,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import did_you_mean
-from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
+from probewise.arm import Geometry, Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
+from probewise.experiment.digest import value_digest
 from probewise.experiment.pace import DescribedEffect, FromRest
 from probewise.experiment.rivals import OF_MOTION
 from probewise.experiment.sensor_update import AdjustedMixture, sensor_prior
@@ -82,6 +83,11 @@ def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = Non
     require_fitted_sensor(sensor)
     named = {} if path is None else {"sensor_file": os.fspath(path)}
     return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
+
+
+def geometry_entry(geometry: Geometry | None) -> dict[str, str]:
+    """Return a journal's entry for the geometry of its arm, a digest; empty without a geometry."""
+    return {} if geometry is None else {"geometry_sha256": value_digest(geometry)}
 
 
 def entropy_bin_width_of(sensor: FittedSensor) -> float:

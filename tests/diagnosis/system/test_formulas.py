@@ -1,14 +1,17 @@
 """Formulas for what has no name: proposed where two names would stand in for one."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from probewise.diagnosis.judgement.global_test import run_global_test
 from probewise.diagnosis.search.formulas import needs_more_than_memoryless_noise
+from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Posterior
-from probewise.diagnosis.system.diagnose import diagnose_system
-from probewise.systems import RunTable, Simulator
+from probewise.diagnosis.system.diagnose import diagnose_system, prepare_system
+from probewise.systems import RunTable, Simulator, table_for
 
 SD = 0.05
 
@@ -74,3 +77,18 @@ def test_formulas_are_weighed_wherever_more_than_noise_without_a_memory_leads(me
     """A walk takes up what changes slowly, and one name part of what a formula does."""
     searched = SimpleNamespace(posterior=Posterior({(mean, noise): 0.95, (("drag",), ()): 0.05}, {}))
     assert needs_more_than_memoryless_noise(searched) is asked
+
+
+def test_a_formula_that_the_readings_proposed_is_no_test_of_them():
+    """A p-value that counts the best of hundreds of formulas, chosen by these readings, is too small."""
+    rng = np.random.default_rng(4)
+    x = rng.uniform(0.0, 1.0, 60)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 2.0 * u["x"])
+    table = table_for(simulator, {"x": x, "y": 1.0 + 2.0 * x + 0.4 * SD * np.cos(9 * x) + SD * rng.normal(size=60)})
+    prepared = prepare_system(simulator, table)
+    searched = search(prepared, depth=0)
+    formulas = prepared.apparatus.proposed_formulas()
+    assert len(formulas) > 5
+    more = replace(searched, prepared=replace(prepared, effects={**prepared.effects, **formulas}))
+    tests = [run_global_test(each, rng=np.random.default_rng(1)) for each in (searched, more)]
+    assert tests[0].p_value == tests[1].p_value

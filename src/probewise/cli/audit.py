@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "--out",
         "DIR",
-        "directory for audit.json, audit.png, report.html and cure_plan.csv; without it, only the text",
+        "directory for audit.json, audit.png, report.html and, without --simulator, cure_plan.csv; without it, only the "
+        "text",
     )
     add_quiet(parser)
 

@@ -98,7 +98,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ARM",
         help=f"where the readings come from: {ARMS} (default simulated)",
     )
-    add_geometry(parser, "the file that ships; the simulated arm has its reach, and a sensor that does not turn")
+    add_geometry(
+        parser,
+        "the file that ships; the simulated arm has its reach, and a sensor that turns with --orientations alone",
+    )
     add_count_option(
         parser, "--max-readings", f"largest number of readings (default {MAX_READINGS})", default=MAX_READINGS
     )
@@ -127,7 +130,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="P",
         help="prior probability that the sensor model leaves nothing out; below 1 the robot also infers which effects "
-        "it leaves out (default 0.9; 1 with --model naive, --learn-sensor, --utility or several shapes)",
+        "it leaves out (default 0.9; 1 with --model naive, --method paper, --learn-sensor, any --utility but "
+        "finishing, or several shapes)",
     )
     parser.add_argument(
         "--reference",

@@ -25,8 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "--out",
         "DIR",
-        "directory for audit.json, audit.png, report.html and, without --simulator, cure_plan.csv; without it, only the "
-        "text",
+        "directory for audit.json, audit.png, report.html and (without --simulator) cure_plan.csv; by default only the "
+        "text is printed",
     )
     add_quiet(parser)
 

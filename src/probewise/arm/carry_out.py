@@ -179,8 +179,7 @@ class _OwnRowMeasurer:
 
     def __init__(self, arm: OwnInstrument | SimulatedArm) -> None:
         self._arm = arm
-        self._lifts = _can_lift_sensor(arm)
-        self.by_hand = not _can_turn_sensor(arm)
+        self.by_hand = not arm.turns
 
     def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
         """Return the angle to which a person turns the sensor for each row, (n_points,): 0 if the instrument does."""
@@ -191,7 +190,7 @@ class _OwnRowMeasurer:
 
     def measure_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
         """Measure at a row's place, orientation and, if possible, height; place and reading are in the lab frame."""
-        height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._lifts else math.nan
+        height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._arm.lifts else math.nan
         up_mm = None if math.isnan(height_mm) else float(height_mm)
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
@@ -200,14 +199,6 @@ def _orientation_matters(plan: Plan, turns_rad: FloatArray) -> bool:
     """Return whether a sensor that is turned on its mount may read otherwise, or has to be turned for some row."""
     patterns = [plan.patterns.get(name) for name, _ in plan.rows_by_pattern()]
     return not all(isinstance(each, Uniform) for each in patterns) or bool((turns_rad > _SAME_TURN_RAD).any())
-
-
-def _can_turn_sensor(arm: OwnInstrument | SimulatedArm) -> bool:
-    return isinstance(arm, SimulatedArm) or arm.can_turn
-
-
-def _can_lift_sensor(arm: LegoArm | OwnInstrument | SimulatedArm) -> bool:
-    return isinstance(arm, SimulatedArm) or (isinstance(arm, OwnInstrument) and arm.can_lift)
 
 
 def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
@@ -273,7 +264,7 @@ def reachable_places_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Reachabl
 def _require_feasible_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -> None:
     """Raise ParameterError if the plan needs the LED off, or a height at which this arm does not read."""
     height_mm = arm.geometry.read_height_mm if isinstance(arm, LegoArm) else plan.instrumentation.height_mm
-    there = {"led": 1.0} | ({} if _can_lift_sensor(arm) else {"height_mm": height_mm})
+    there = {"led": 1.0} | ({} if arm.lifts else {"height_mm": height_mm})
     for name, value in there.items():
         wanted = plan.covariates.get(name, np.empty(0))
         wanted = wanted[np.isfinite(wanted)]

@@ -75,7 +75,11 @@ class LegoArm:
     first_down
         Function that the arm calls with the height, in mm, after each step of its first lowering; it returns when a
         person has confirmed that height. None: the first lowering is one move, like all later ones.
+    turns, lifts
+        Always False: a person turns the sensor, and it reads at one height.
     """
+
+    turns = lifts = False
 
     def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
         self._machine, self.geometry, self._clock = machine, geometry, clock

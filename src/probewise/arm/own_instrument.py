@@ -133,14 +133,14 @@ class OwnInstrument:
         """Whether the object turns its sensor to `pose.orientation_rad`: its attribute `turns`, by default False."""
         return bool(getattr(self._own, "turns", False))
 
-    turns = can_turn  # its old name
+    turns = can_turn  # as every instrument declares it
 
     @property
     def can_lift(self) -> bool:
         """Whether the object reads at a given `pose.height_mm`: its attribute `lifts`, by default False."""
         return bool(getattr(self._own, "lifts", False))
 
-    lifts = can_lift  # its old name
+    lifts = can_lift  # as every instrument declares it
 
     @property
     def read_height_mm(self) -> float | None:

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probewise.arm.geometry import wrapped_to_pi
 from probewise.errors import FileError, shown
-from probewise.recordings import Image
+from probewise.recordings.patterns import have_same_albedo
 
 if TYPE_CHECKING:
     from probewise.arm import Reading
     from probewise.recordings import Plan, Recording
-    from probewise.recordings.patterns import Pattern
 
 OFF_PLAN_MM = 5.0  # tolerance, since a user's own instrument may report the true place
 OFF_PLAN_RAD = math.radians(5.0)  # and the true orientation
@@ -75,7 +75,7 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
         yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
         return
     first = plan.take(np.arange(len(before)))
-    turned_rad = np.abs(np.angle(np.exp(1j * (before.orientation_rad - first.orientation_rad))))
+    turned_rad = np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad))
     rows = {
         "x_mm": np.abs(before.x_mm - first.x_mm) > OFF_PLAN_MM,
         "y_mm": np.abs(before.y_mm - first.y_mm) > OFF_PLAN_MM,
@@ -88,7 +88,7 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
             yield f"readings of another plan: the {name} of reading {1 + int(differs.argmax())} differs"
     for name in dict.fromkeys(_pattern_names_by_row(before)):
         there, here = before.patterns[name], plan.patterns[name]
-        if not _are_same_pattern(there, here):
+        if not have_same_albedo(there, here):
             yield f"readings of another plan: pattern {name!r} is {shown(there)} there, {shown(here)} here"
     for field in dataclasses.fields(plan.instrumentation):
         values = [getattr(each.instrumentation, field.name) for each in (before, plan)]
@@ -98,11 +98,3 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
 
 def _pattern_names_by_row(plan: Plan) -> list[str]:
     return [plan.pattern_names[code] for code in plan.pattern]
-
-
-def _are_same_pattern(one: Pattern, other: Pattern) -> bool:
-    """Return whether two patterns are equal; of images, the pixels count and not the file's name."""
-    if not (isinstance(one, Image) and isinstance(other, Image)):
-        return one == other
-    places = [(image.pixel_mm, image.origin_mm) for image in (one, other)]
-    return places[0] == places[1] and np.array_equal(one.albedo, other.albedo, equal_nan=True)

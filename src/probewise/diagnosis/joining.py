@@ -5,13 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import fields
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.recordings.patterns import Pattern
+from probewise.recordings.patterns import Pattern, have_same_albedo
 from probewise.recordings.plan import Plan, Recording, require_recording
 from probewise.sensor import COMMANDED, with_declared_height_commanded
 from probewise.systems.joining import unused_name
@@ -167,9 +166,8 @@ def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str
 
 
 def _is_same_pattern(one: Pattern, other: Pattern) -> bool:
-    """Return whether two patterns have the same kind and values; all pixels of an image count."""
-    own = (field.name for field in fields(one))
-    return type(one) is type(other) and all(np.array_equal(getattr(one, k), getattr(other, k)) for k in own)
+    """Return whether two patterns have the same kind and values; of an image, the name of its file too."""
+    return have_same_albedo(one, other) and getattr(one, "file", None) == getattr(other, "file", None)
 
 
 def _is_same_recording(one: Recording, other: Recording) -> bool:

@@ -154,5 +154,14 @@ class Image(_CheckedPattern):
 
 Pattern: TypeAlias = Uniform | HalfPlane | Quadrant | Disc | Polygon | Stripes | Ramp | Image
 
+
+def have_same_albedo(one: Pattern, other: Pattern) -> bool:
+    """Return whether two patterns have the same kind and values; of images all pixels count, but no file's name."""
+    own = (field.name for field in dataclasses.fields(one) if field.name != "file")
+    return type(one) is type(other) and all(
+        np.array_equal(getattr(one, k), getattr(other, k), equal_nan=k == "albedo") for k in own
+    )
+
+
 PATTERNS: tuple[type, ...] = (Uniform, HalfPlane, Quadrant, Disc, Polygon, Stripes, Ramp, Image)
 """The classes of the patterns."""

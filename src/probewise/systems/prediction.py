@@ -332,19 +332,16 @@ def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]
     assert fitted.known is not None
     columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
     in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
-    targets = {
-        target
+    of_column = [
+        name.removesuffix(AGAIN)
         for name, form in forms.items()
         if form.stage is Stage.INPUT or name.startswith(_OF_A_COLUMN)
-        for target in _possible_targets(name.removesuffix(AGAIN))
+    ]
+    return {
+        name
+        for name in columns
+        if covariate_of_column(name) in in_formulas or any(own.endswith(f":{name}") for own in of_column)
     }
-    return {name for name in columns if name in targets or covariate_of_column(name) in in_formulas}
-
-
-def _possible_targets(name: str) -> list[str]:
-    """Return what an effect's name may end with after a colon; names of columns may contain colons."""
-    parts = name.split(":")
-    return [":".join(parts[k:]) for k in range(1, len(parts))]
 
 
 def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -138,8 +138,9 @@ class NoiseModel:
         sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
         lost_share = value_at_node(noise.lost_share)
         value = value_at_node(noise.lost_value)
-        alike = np.isclose(self._usable_readings, value, rtol=1e-9, atol=1e-9 * float(np.ptp(self._usable_readings)))
-        lost = far & alike & (lost_share > 0)
+        lost = np.zeros_like(far)
+        if lost_share > 0:
+            lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * (self._span + abs(value)))
         carry = np.where(
             self._n_rows_since_previous_in_scan > 0,
             value_at_node(noise.rho) ** np.maximum(self._n_rows_since_previous_in_scan, 1),
@@ -155,7 +156,7 @@ class NoiseModel:
         if lost_share > 0:
             n_lost, cells = (
                 int(lost.sum()),
-                max(float(np.ptp(self._usable_readings)) / self._lost_value_resolution, 1.0),
+                max(self._span / self._lost_value_resolution, 1.0),
             )
             # Each lost reading has that value to within a cell.
             log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
@@ -187,6 +188,11 @@ class NoiseModel:
     @cached_property
     def _usable_readings(self) -> FloatArray:
         return self.recording.readings[self.recording.usable]
+
+    @cached_property
+    def _span(self) -> float:
+        """Range of the usable readings."""
+        return float(np.ptp(self._usable_readings))
 
     @cached_property
     def _n_rows_since_previous_in_scan(self) -> IntArray:

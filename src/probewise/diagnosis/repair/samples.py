@@ -19,6 +19,7 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
+from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.repair.annealing import Density, draw_by_annealing, importance_resample
 from probewise.diagnosis.repair.linear_amplitudes import LinearAmplitudes
 from probewise.diagnosis.repair.profiled import ProfiledDensity
@@ -153,8 +154,7 @@ def sample_model(
     # Samples that are not annealed serve for the effects only: their noise is that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
     residuals = recording.readings[recording.usable] - predicted
-    sigma = law.likeliest_sigma(law(residuals.T))
-    noise_sd = sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, n_samples))
+    noise_sd = draw_noise_sd(law, residuals, rng=rng)
     largest = float(np.abs(recording.readings[recording.usable]).max()) or 1.0
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + largest * 1e-12)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
@@ -179,8 +179,7 @@ def sample_model(
         theta[:, i] += sd * rng.standard_normal(n_samples)
     rounding = theta[:, of_lattice].sum(axis=1)
     if law.flat:  # sd at each noise node, without rounding if that is an effect, else including it
-        each = [own.sigma * (1.0 if of_lattice else own.sd_factor_of_rounding) for own in noise.nodes.laws]
-        noise_sd = np.array(each)[nodes]
+        noise_sd = noise_sd_by_node(noise, with_rounding=not of_lattice)[nodes]
     else:
         noise_sd = _sd_without_rounding(noise_sd, rounding, law.n_kept)
     return ModelSamples(
@@ -192,6 +191,17 @@ def sample_model(
         nuisance=null.nuisance_names,
         has_exchangeable_gaussians=null.has_exchangeable_gaussians,
     )
+
+
+def draw_noise_sd(law: NoiseLaw, residuals: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+    """Draw the sd of the noise, rounding included, for each sample: residuals (1 or 500, n_usable) -> (500,)."""
+    sigma = law.likeliest_sigma(law(residuals.T))
+    return np.asarray(sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, N_SAMPLES)))
+
+
+def noise_sd_by_node(noise: NoiseEvidence, *, with_rounding: bool) -> FloatArray:
+    """Return the sd of the noise at each node of a rounding noise model, (n_nodes,), with the rounding or without."""
+    return np.array([own.sigma * (own.sd_factor_of_rounding if with_rounding else 1.0) for own in noise.nodes.laws])
 
 
 def _posterior_draws(

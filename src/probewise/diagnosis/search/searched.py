@@ -331,9 +331,11 @@ class Searched:
         Formulas are left out: of hundreds, the search keeps those that these readings favour, and draws under the null
         would favour others. With them a p-value would be too small.
         """
-        given = {name: e for name, e in self.prepared.effects.items() if not name.startswith(PROPOSAL)}
-        on_mean = [effect for effect in given.values() if effect.stage is not Stage.NOISE]
-        missing = [effect for effect in on_mean if effect.name not in found.model.names]
+        missing = [
+            effect
+            for name, effect in self.prepared.effects.items()
+            if effect.stage is not Stage.NOISE and not name.startswith(PROPOSAL) and name not in found.model.names
+        ]
         return [
             self.misfit_templates.templates.coarse_bank(self.misfit_templates.about, missing),
             self.misfit_templates.unknown_bases,

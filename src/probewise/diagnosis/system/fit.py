@@ -20,7 +20,7 @@ from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
+from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node, sample_model
 from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls
 from probewise.diagnosis.search.refits import Refits
@@ -221,10 +221,9 @@ def _nested_samples_and_evidence(
     residuals = prepared.recording.readings[usable] - null.found.model.predict(z)[:, usable]
     if law.flat:
         nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
-        noise_sd = np.array([own.sigma * own.sd_factor_of_rounding for own in noise.nodes.laws])[nodes]
+        noise_sd = noise_sd_by_node(noise, with_rounding=True)[nodes]
     else:
-        sigma = law.likeliest_sigma(law(residuals.T))
-        noise_sd = sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, N_SAMPLES))
+        noise_sd = draw_noise_sd(law, residuals, rng=rng)
     theta = cast(Any, null.found.model.sensor).theta(z)
     evidence = Evidence(found.log_z + null.log_prior_factor, found.log_z_error, method)
     return replace(samples, theta=theta, noise_sd=noise_sd), evidence

@@ -35,10 +35,11 @@ class Stage(IntEnum):
     RESPONSE = 7
     GAIN = 8
     OFFSET = 9
-    BEND = 10
-    LAG = 11
-    SATURATION = 12
-    NOISE = 13
+    HYSTERESIS = 10
+    BEND = 11
+    LAG = 12
+    SATURATION = 13
+    NOISE = 14
 
 
 @dataclass(frozen=True, eq=False)

@@ -103,6 +103,15 @@ def test_the_code_of_an_error_beyond_the_declared_range_is_no_end_of_the_reading
     np.testing.assert_array_equal(levels[0][1], levels[1][1])
 
 
+def test_hysteresis_goes_by_the_way_in_which_the_reading_moves_with_all_that_is_added_to_it():
+    """An offset that rises faster than the reading ever falls: it rises throughout, and hysteresis is one sign."""
+    chain = ABOUT.system.chain(TABLE, [FORMS["hysteresis"], FORMS["offset_drift"]])
+    amplitudes = {"hysteresis": 0.05, "offset_drift": 100.0}
+    theta = np.concatenate([ABOUT.theta[0], [amplitudes[effect.name] for effect in chain.effects]])[None, :]
+    found = chain.predict(theta, TABLE)[0]
+    np.testing.assert_allclose(found - NOTHING - 100.0 * _T, 0.05, atol=1e-9)
+
+
 def test_a_gain_counts_from_the_reading_of_nothing():
     about = _about(Simulator(
         reading="y", unit="V", parameters={"gain": (0, 4)}, simulate=lambda p, u: 1.0 + p["gain"] * u["drive"],

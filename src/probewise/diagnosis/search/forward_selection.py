@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_bayes_factors_of_pairs, log_mean_exp
 from probewise.diagnosis.names import Names
@@ -82,10 +84,8 @@ def _proposals_to_refit(
     if size == 2:
         proposals = _with_larger_pair_scores(state, proposals)
     chosen = promising_combinations(state, proposals, width=BEAM, behind=STEERING)
-    chosen += [
-        names for names in _pairs_of_repeatable_effects(state, null) if names in proposals and names not in chosen
-    ]
-    return [proposals[names] for names in chosen]
+    more = [*_leading_under_simplest_noise(state, proposals), *_pairs_of_repeatable_effects(state, null)]
+    return [proposals[names] for names in dict.fromkeys([*chosen, *more]) if names in proposals]
 
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
@@ -205,6 +205,25 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
     }
     ranked = sorted(odds, key=lambda name: -odds[name])[:LEADING_PLAINLY]
     return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_prior_on_mean(())]
+
+
+def _leading_under_simplest_noise(state: SearchState, proposals: Mapping[Names, Proposal]) -> list[Names]:
+    """Choose the proposed combinations that lead under the simplest noise, where noise with memory leads; else none.
+
+    Beside a first effect, noise with memory absorbs the second one, and screening sees no gain in it.
+    """
+    best = max(state.candidates.values(), key=state.log_posterior)
+    if not state.refits.likeliest_law(best).has_memory:
+        return []
+    plain = state.noises.certain
+    missing = -np.inf
+    odds = {
+        names: max(known.get((names, plain), missing) for known in (state.about_null, state.about_parts))
+        + state.prior.log_prior_on_mean(names)
+        for names in proposals
+        if not effects_out_of_vocabulary(names)
+    }
+    return sorted(odds, key=lambda names: -odds[names])[:LEADING_PLAINLY]
 
 
 def _with_larger_pair_scores(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:

@@ -283,7 +283,7 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     unit, reading = about.reading_unit, about.system.simulator.reading
     yield Form(
         "hysteresis",
-        Stage.OFFSET,
+        Stage.HYSTERESIS,
         marginals={"a": about.amplitude_prior(about.sd)},
         units=(unit,),
         covariates=("previous",),

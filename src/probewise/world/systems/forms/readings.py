@@ -14,7 +14,7 @@ from probewise.world.systems.forms.modulations import Modulation
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.table import SystemTable
 
-GAIN, OFFSET, _BEND, _LAG, _CEILING = range(5)
+GAIN, OFFSET, _HYSTERESIS, _BEND, _LAG, _CEILING = range(6)
 _N_WAVES = 240
 
 
@@ -96,7 +96,7 @@ def _hysteresis_bend_and_saturation_forms(true: TrueSystem) -> Iterator[Form]:
         first=sd,
         limit=1e3 * sd,
         covariates=("previous",),
-        order=OFFSET,
+        order=_HYSTERESIS,
     )
 
     def bend(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:

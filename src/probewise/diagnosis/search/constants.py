@@ -34,11 +34,10 @@ EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to 
 # Nats behind the best: an SSF order so far back is not searched. An effect may look like another Gaussian, and be
 # explained better by its name at fewer of them.
 ORDERS_WITHIN = 100.0
-PAIRED_FROM = 2.0  # nats of the best effect alone, below which no pair stands out either
-# Effects that pairs are screened of, the best alone. Twelve before: where a walk of the noise hides two effects, each of
-# them alone explains less than a dozen steps and drifts (a backlash and a temperature, 19th and 17th of 33 by themselves,
-# lead every other pair).
-PAIRED = 24
+REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
+# Effects that pairs are screened of, the best alone. A difference of two columns may explain what neither does. Of the
+# best twelve, as before, the pair was found in 1 of 6 recordings with seven other columns; of the best sixty in all.
+PAIRED = 60
 MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
 # Share of a template that a null leaves, below which a large effect may show in another way than to first order. The
 # width of the SSF takes up all but a tenth of a scale of positions, yet not of one a third off, and screening missed it

@@ -19,8 +19,8 @@ from probewise.diagnosis.search.constants import (
     MOST_OUT_OF_VOCABULARY,
     ORDERS_WITHIN,
     PAIRED,
-    PAIRED_FROM,
     REFITTED_WITHIN,
+    REPEATED_FROM,
     SHARES,
     SINGLES,
     STEERING,
@@ -62,6 +62,8 @@ def select_forward(state: SearchState, *, depth: int) -> None:
             refitted.append(found)
             if size == 1 and found is not None and state.refits.sensor is not None:
                 state.refit_subset_from(found, proposal.added)
+        if size == 2:
+            refitted += _refit_leading_pairs(state)
         state.share = 1.0
         kept = list({c.names: c for c in refitted if c is not None}.values())
         if not kept:
@@ -94,8 +96,6 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
         singles = state.log_bayes_factors_by_effect(null, evidence.likeliest_law, null)
         alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:PAIRED]
-        if not ranked or log_mean_exp(singles[ranked[0]]) < PAIRED_FROM:
-            continue
         singles = {name: singles[name] for name in ranked}
         templates = {name: state.templates.templates_of(null.found, state.effects[name]) for name in ranked}
         for pair, value in log_bayes_factors_of_pairs(
@@ -140,6 +140,13 @@ def promising_combinations(
     they compete with are left out.
     """
     odds = {names: proposal.score + state.prior.log_prior_on_mean(names) for names, proposal in proposals.items()}
+    return _leading_and_not_far_behind(state, odds, width=width, behind=behind)
+
+
+def _leading_and_not_far_behind(
+    state: SearchState, odds: Mapping[Names, float], *, width: int, behind: float
+) -> list[Names]:
+    """Choose combinations by their log posterior `odds`, as `promising_combinations` does."""
     ranked = sorted(odds, key=lambda names: -odds[names])
     named, rest = (
         [n for n in ranked if not effects_out_of_vocabulary(n)],
@@ -182,7 +189,7 @@ def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[N
         (first, again)
         for first, again in pairs
         if any(
-            c.evidence[plain].log_z > null.evidence[plain].log_z + PAIRED_FROM
+            c.evidence[plain].log_z > null.evidence[plain].log_z + REPEATED_FROM
             for c in state.candidates_of_combination((first,))
         )
     ]
@@ -205,6 +212,21 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
     }
     ranked = sorted(odds, key=lambda name: -odds[name])[:LEADING_PLAINLY]
     return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_prior_on_mean(())]
+
+
+def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
+    """Refit the pairs that lead by screening about the null and extend no refitted effect; return their candidates.
+
+    Of a difference of two columns, neither column alone need explain anything.
+    """
+    odds: dict[Names, float] = {}
+    for (names, _), value in state.about_null.items():
+        if len(names) == 2 and names not in state.refitted_combinations | state.undetected:
+            odds[names] = max(odds.get(names, -np.inf), value + state.prior.log_prior_on_mean(names))
+    # All against what was best before: equal pairs are refitted, or none.
+    for names in _leading_and_not_far_behind(state, odds, width=BEAM, behind=STEERING):
+        state.refit_stepwise(names)
+    return [c for names in odds for c in state.candidates_of_combination(names)]
 
 
 def _leading_under_simplest_noise(state: SearchState, proposals: Mapping[Names, Proposal]) -> list[Names]:

@@ -192,19 +192,37 @@ class SearchState:
     def refit_stepwise(self, names: Names) -> None:
         """Refit a combination by adding its effects one by one to its largest refitted subset.
 
-        If one of them is insignificant, the combination is recorded as undetected.
+        An effect that is insignificant by itself is tried together with the next one: two may explain what neither
+        does, such as the difference of two columns. If that fails, the combination is recorded as undetected.
         """
         parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
         held = max(parts, key=lambda c: (len(c.names), c.log_z))
-        for added in [n for n in names if n not in held.names]:
+        missing = [n for n in names if n not in held.names]
+        while missing:
+            added = missing.pop(0)
             extended = self.refit_with_effect(held, added)
+            if extended is None and missing:
+                extended = self._refit_with_both(held, added, missing.pop(0))
             if extended is None:
                 self.undetected.add(names)
                 for noise, evidence in held.evidence.items():
                     known = self.about_parts.get((names, noise), np.inf)
                     self.about_parts[names, noise] = min(known, evidence.log_z)
-                break
+                return
             held = extended
+
+    def _refit_with_both(self, held: WeighedFit, first: str, second: str) -> WeighedFit | None:
+        """Refit a candidate with two more effects, and store the fit if it is significantly better; else None."""
+        if self.share_is_spent(self.share):
+            return None
+        against = 0.0 if held.names else self.complexity_penalty(held.ssf_degrees_of_freedom)
+        try:
+            between, _ = self.refits.refit_with_effect(held, self.effects[first], against)
+            both, _ = self.refits.refit_with_effect(between, self.effects[second])
+        except NotConvergedError:
+            return None
+        self.undetected.discard(both.names)
+        return self.store_candidate(both) if is_significantly_better(both, between) else None
 
     def screened_log_evidences(self) -> dict[tuple[Names, Names], float]:
         """Return the log evidence of (mean, noise) by screening, for combinations that were not refitted.

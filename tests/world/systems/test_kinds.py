@@ -10,6 +10,7 @@ from probewise.world.challenge import Stratum
 from probewise.world.systems import KINDS, SystemCase, draw_system, simulator_file_text, write_system_case
 from probewise.world.systems.formulas import FLOW
 from probewise.world.systems.noise import noise_of_size
+from probewise.world.systems.vocabulary import forms_of
 
 
 def _case(kind, said='noise = {"sd": 0.5}', seed=5):
@@ -66,3 +67,10 @@ def test_what_is_kept_back_is_two_runs_and_the_last_goes_further():
     drawn = draw_system(FLOW, rng=np.random.default_rng(2))
     flow = drawn.table.columns["flow_lpm"]
     assert flow[drawn.table.run == drawn.table.n_runs - 1].max() > 1.2 * flow[drawn.diagnosed_row_numbers].max()
+
+
+def test_nothing_settles_in_runs_that_a_table_does_not_name():
+    (kind,) = [kind for kind in KINDS if kind.run is None]
+    names = {form.name for form in forms_of(draw_system(kind, rng=np.random.default_rng(4)).true_system)}
+    assert "interference" in names
+    assert "settling" not in names

@@ -40,7 +40,8 @@ def forms_out_of_vocabulary(true: TrueSystem, rng: np.random.Generator) -> Itera
     if true.table.time is not None:
         yield _square_wave_form(true, rng)
         yield _chirp_form(true)
-        yield _two_settlings_form(true)
+        if true.kind.run is not None:
+            yield _two_settlings_form(true)
     if true.kind.law is not None and true.states:
         state = str(rng.choice(list(true.states)))
         yield _one_sided_spring_form(true, state)

@@ -144,6 +144,28 @@ def test_any_executor_will_do_and_gets_even_parts() -> None:
     assert sum(pool.sizes) <= together.n_calls
 
 
+def test_the_check_too_evaluates_its_batches_in_the_executor() -> None:
+    """The search for missed hills is a part of the run: a likelihood may work in the workers alone."""
+    inside, here = [False], list[int]()
+
+    class Within(AtOnce):
+        def submit(self, fn, /, *args, **kwargs):  # type: ignore[no-untyped-def]
+            inside[0] = True
+            future = super().submit(fn, *args, **kwargs)
+            inside[0] = False
+            return future
+
+    def function(theta: np.ndarray) -> np.ndarray:
+        if not inside[0]:
+            here.append(len(theta))
+        return np.asarray(-0.5 * np.sum(((theta - 0.3) / 0.05) ** 2, axis=1))
+
+    problem = problems.Known(problems.box(2, 0, 1), function, 0.0)
+    result = run(problem, rng=rng(), n_live=50, executor=Within(), n_workers=4)
+    assert result.check is not None
+    assert set(here) <= {1}  # a single hypothesis is not worth sending
+
+
 def test_parts_of_a_batch_are_evaluated_at_the_same_time() -> None:
     """The first three parts wait for one another: were they evaluated in turn, none would ever go on."""
     meeting, lock = threading.Barrier(3, timeout=60), threading.Lock()

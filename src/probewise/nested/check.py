@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -165,12 +167,14 @@ def check_and_repeat(
     max_calls: int | None,
     least_live: int,
     rng: np.random.Generator,
+    executor: Executor | None = None,
+    n_workers: int | None = None,
 ) -> NestedResult:
     """Check a run that its stopping rule ended; repeat it with longer chains where the second estimate disagrees.
 
     `search` runs nested sampling once, without a check. Limits on all evaluations, those of `first` included:
     `max_cost` times those of `first`, and `max_calls`, if not None. `least_live`: fewest live points allowed for the
-    problem.
+    problem. `executor` and `n_workers` are for the search of missed hills; `search` brings its own.
 
     Return the first run, or a repetition: with hops between modes where `first` lost one, or with longer chains if only
     that agrees with the second estimate. `check` holds the second estimate; None if it failed or did not end, which
@@ -179,8 +183,9 @@ def check_and_repeat(
     limit = max_cost * first.n_calls if max_calls is None else min(max_cost * first.n_calls, max_calls)
     budget = _CallBudget(search, limit, first.n_calls, rng)
     now, missing, notes = first, MissedHills(), tuple[str, ...]()
+    find = partial(find_missed_hills, problem=problem, rng=rng, executor=executor, n_workers=n_workers)
     try:
-        missing = find_missed_hills(first, problem, max_calls=budget.calls_left, rng=rng)
+        missing = find(first, max_calls=budget.calls_left)
         budget.spent += missing.n_calls
         modes = None
         if log_z_rise_in_errors(first, log_evidence_of_unmet_hills(missing.lost, first)) > _MATTERS:
@@ -189,7 +194,7 @@ def check_and_repeat(
             again = budget.run_route(_EvidenceRoute(problem, first.n_live, chain, "the run with hops", modes=modes))
             if again is not None:
                 now = again
-                more = find_missed_hills(now, problem, max_calls=budget.calls_left, rng=rng, lost=missing.lost)
+                more = find(now, max_calls=budget.calls_left, lost=missing.lost)
                 budget.spent += more.n_calls
                 missing = replace(more, n_calls=missing.n_calls + more.n_calls)
         route, second = _route_and_second_estimate(now, problem, move, least_live, budget)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Executor
 from dataclasses import dataclass, field
@@ -120,15 +121,15 @@ class Evaluator:
 
     Evaluations beyond `most_calls` in all, if not None, are refused with OutOfCallsError.
 
-    With an `executor` (any `concurrent.futures.Executor`) a batch is split into `n_parts` parts; the
-    problem must then be picklable. Results come back in order, so the run does not depend on the executor
-    if a hypothesis' likelihood does not depend, to the last bit, on the rest of its batch.
+    With an `executor` (any `concurrent.futures.Executor`) a batch is split into `n_parts` parts, by default the number
+    of processors; the problem must then be picklable. Results come back in order, so the run does not depend on the
+    executor if a hypothesis' likelihood does not depend, to the last bit, on the rest of its batch.
     """
 
     problem: Samplable
     n_calls: int = 0
     executor: Executor | None = None
-    n_parts: int = 1
+    n_parts: int | None = None
     most_calls: int | None = None
     names: tuple[str, ...] = field(init=False)
     space: Space = field(init=False)
@@ -192,7 +193,8 @@ class Evaluator:
         if self.most_calls is not None and self.n_calls + len(theta) > self.most_calls:
             raise OutOfCallsError
         shared = self.executor is not None and len(theta) > 1
-        parts = np.array_split(theta, min(self.n_parts, len(theta))) if shared else [theta]
+        n_parts = self.n_parts or os.cpu_count() or 1
+        parts = np.array_split(theta, min(n_parts, len(theta))) if shared else [theta]
         answers: list[object] = []
         try:
             for answer in self._likelihoods_of_parts(parts):

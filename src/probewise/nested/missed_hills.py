@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,15 +87,18 @@ def find_missed_hills(
     max_calls: float,
     rng: np.random.Generator,
     lost: tuple[HillEstimate, ...] | None = None,
+    executor: Executor | None = None,
+    n_workers: int | None = None,
 ) -> MissedHills:
     """Look for parts of the posterior that a run has missed; nothing is found for a prior without an inverse.
 
     `max_calls`: limit of evaluations; about a third of the run's are used. `lost`: parts that are known already, from
-    the run that this one repeats; no others are then looked for. NotConvergedError if the likelihood fails.
+    the run that this one repeats; no others are then looked for. `executor` evaluates batches of the likelihood in
+    `n_workers` parts, as for `run`. NotConvergedError if the likelihood fails.
     """
     if not run.names or not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
         return MissedHills()
-    evaluate = Evaluator(problem)
+    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers)
 
     def calls_left(share: float = math.inf) -> int:
         return int(min(max_calls - evaluate.n_calls, share * run.n_calls))

@@ -142,6 +142,8 @@ def run(
                 max_calls=max_calls,
                 least_live=least_live(len(result.names)),
                 rng=checking,
+                executor=executor,
+                n_workers=n_workers,
             )
         except KeyboardInterrupt:
             if not return_interrupted:

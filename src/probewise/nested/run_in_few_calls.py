@@ -14,7 +14,6 @@ used.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -144,7 +143,7 @@ def run_in_few_calls(
     if not checked_finite_number("error", error) > 0:
         raise ParameterError("error", error, "greater than 0")
     max_calls = checked_whole("max_calls", max_calls, least=_LEAST_CALLS)
-    evaluate = Evaluator(posed, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
+    evaluate = Evaluator(posed, executor=executor, n_parts=n_workers)
     report = progress or (lambda n_calls: None)
     n_params = len(evaluate.names)
     least = 2 * _n_first_draws(n_params) + max(least_live(n_params), _N_LIVE_ALONE)

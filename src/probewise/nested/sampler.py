@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -141,7 +140,7 @@ def run_once(
     )
     if n_workers is not None:
         n_workers = checked_whole("n_workers", n_workers)
-    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1, most_calls=max_calls)
+    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers, most_calls=max_calls)
     n_params = len(evaluate.names)
     n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)
     rule = RemainingEvidence() if stop is None else stop

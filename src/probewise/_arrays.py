@@ -55,6 +55,34 @@ def frozen_int(values: ArrayLike) -> IntArray:
     return array
 
 
+def rounding_error(values: FloatArray) -> float:
+    """Return the difference up to which values are taken for equal, since they are the results of arithmetic.
+
+    It is 1e-12 of their range, or a few steps of the floating-point grid where they lie far from 0.
+    """
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0
+    return max(1e-12 * float(np.ptp(finite)), 4 * float(np.spacing(np.abs(finite).max())))
+
+
+def distinct_values(values: FloatArray, within: float | None = None) -> FloatArray:
+    """Return the distinct finite values, sorted, (n_distinct,); of those within `within` of each other, the least.
+
+    By default these are the values that differ by no more than the rounding error of arithmetic, as places of a forward
+    and a backward scan do.
+    """
+    ordered = np.unique(values[np.isfinite(values)])
+    apart = rounding_error(ordered) if within is None else within
+    return np.asarray(ordered[np.diff(ordered, prepend=-np.inf) > apart])
+
+
+def varies(values: FloatArray) -> bool:
+    """Return whether finite values differ by more than the rounding error of arithmetic."""
+    finite = values[np.isfinite(values)]
+    return finite.size > 1 and float(np.ptp(finite)) > rounding_error(finite)
+
+
 def require_finite(name: str, values: FloatArray) -> None:
     """Raise ParameterError if a value is not finite; the message gives index and value of the first."""
     bad = ~np.isfinite(values)

@@ -501,6 +501,33 @@ def test_a_slide_that_sticks_lags_ever_more_and_jumps_once_a_period():
     assert np.abs(off).max() < 1.05 * amp_mm
 
 
+def plan_along(x_mm: np.ndarray, y_mm: np.ndarray, scan: np.ndarray | None = None) -> Plan:
+    """Readings at these places, a second apart."""
+    n = len(x_mm)
+    return Plan(
+        x_mm=x_mm,
+        y_mm=y_mm,
+        orientation_rad=np.zeros(n),
+        time_s=np.arange(float(n)),
+        scan=np.zeros(n, dtype=int) if scan is None else scan,
+        scan_names=("out", "back")[: 1 if scan is None else 2],
+        pattern=np.zeros(n, dtype=int),
+        pattern_names=("edge",),
+        patterns={"edge": HalfPlane(0.0, 0.0)},
+    )
+
+
+def test_places_that_differ_in_the_last_digit_are_one_place():
+    """A forward and a backward scan of one line may compute the same places in two ways."""
+    out = -50 + 0.1 * np.arange(1001)
+    back = np.nextafter(out[::-1], np.inf)
+    both = Extent(0.0, 1.0, plan_along(np.append(out, back), np.zeros(2002), np.repeat([0, 1], 1001)))
+    for kind in (PeriodicPositionError, StickSlip):
+        assert kind.for_extent(both).shortest_mm == pytest.approx(0.3)
+    alone = MissingTooth.for_extent(Extent(0.0, 1.0, plan_along(out, np.zeros(1001))))
+    np.testing.assert_allclose(MissingTooth.for_extent(both).places_mm[0], alone.places_mm[0], atol=1e-12)
+
+
 def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():
     step = AmbientStep.for_extent(Extent(0.0, 1.0, there_and_back()))
     theta = np.full((4000, 2), [1.5, 5.0])

@@ -1,11 +1,18 @@
-"""Direction of motion, scans and mountings of a plan, for the effects that depend on them."""
+"""Positions, direction of motion, scans and mountings of a plan, for the effects that depend on them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, distinct_values
 from probewise.recordings.plan import Plan
+
+_SAME_PLACE_MM = 1e-6
+
+
+def distinct_positions_mm(axis_mm: FloatArray) -> FloatArray:
+    """Return the distinct positions along one axis, sorted, (n_distinct,); of those within 1e-6 mm, the least."""
+    return distinct_values(axis_mm, within=_SAME_PLACE_MM)
 
 
 def sign_of_motion(plan: Plan) -> FloatArray:

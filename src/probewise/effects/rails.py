@@ -13,6 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
+from probewise.effects.motion import distinct_positions_mm
 from probewise.effects.origin import CountsPlaceFromOrigin
 from probewise.effects.vocabulary import NamedEffect, value_with_sd
 from probewise.priors import Product, Uniform
@@ -113,6 +114,6 @@ class MissingTooth(NamedEffect[Poses]):
 
 def _thinned_positions(axis_mm: FloatArray) -> tuple[float, ...]:
     """Return the distinct positions of one axis, sorted and thinned to at most 160."""
-    places = np.unique(np.round(axis_mm, 6))
+    places = distinct_positions_mm(axis_mm)
     stride = -(-len(places) // _MOST_PLACES)
     return tuple(places[::stride].tolist())

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
+from probewise.effects.motion import distinct_positions_mm
 from probewise.effects.origin import CountsPlaceFromOrigin, CountsTimeFromOrigin
 from probewise.effects.vocabulary import NamedEffect, V, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
@@ -204,5 +205,5 @@ class StickSlip(CountsPlaceFromOrigin, _PeriodicEffect[Poses]):
 
 def _shortest_period_and_range_mm(plan: Plan) -> tuple[float, float]:
     """Return three times the median step of X and the range of X, mm; 0 and 0 for fewer than eight positions."""
-    x_mm = np.unique(plan.x_mm)
+    x_mm = distinct_positions_mm(plan.x_mm)
     return (3 * float(np.median(np.diff(x_mm))), float(np.ptp(x_mm))) if len(x_mm) >= 8 else (0.0, 0.0)

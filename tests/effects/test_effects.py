@@ -604,11 +604,25 @@ def test_correlated_noise_sets_the_memory_and_not_the_sd():
 
 def test_a_battery_that_is_not_known_changes_nothing():
     effect = VOCABULARY["battery_sag"].for_extent(EXTENT)
-    plan = replace(PLAN, covariates={"battery_mv": np.where(np.arange(len(PLAN)) % 2, np.nan, 7500.0)})
-    out = effect.apply(np.full((1, len(PLAN)), 40.0), np.array([[0.1]]), plan)
-    np.testing.assert_allclose(out[0, :4], [38.0, 40.0, 38.0, 40.0])
-    bare = replace(PLAN, covariates={})
-    np.testing.assert_allclose(effect.apply(np.full((1, len(PLAN)), 40.0), np.array([[0.1]]), bare), 40.0)
+    for covariates in ({}, {"battery_mv": np.full(len(PLAN), np.nan)}):
+        plan = replace(PLAN, covariates=covariates)
+        np.testing.assert_allclose(effect.apply(np.full((1, len(PLAN)), 40.0), np.array([[0.1]]), plan), 40.0)
+
+
+def test_a_missing_voltage_of_the_battery_is_that_of_the_readings_around_it():
+    """At 8 V the gain would jump where the logging stops, and that jump would be the range of the voltages."""
+    plan = plan_along(np.arange(8.0), np.zeros(8))
+    with_gaps = np.array([np.nan, 7500.0, np.nan, 7400.0, np.nan, np.nan, 7100.0, np.nan])
+    plan = replace(plan, covariates={"battery_mv": with_gaps})
+    effect = VOCABULARY["battery_sag"].for_extent(Extent(0.0, 1.0, plan))
+    assert effect.typical_per_volt == pytest.approx(0.02 / 0.4)
+    below = np.array([0.5, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 0.9])
+    out = effect.apply(np.full((1, 8), 40.0), np.array([[0.1]]), plan)
+    np.testing.assert_allclose(out[0], 40 * (1 - 0.1 * below))
+    backwards = plan.take(np.arange(8)[::-1])
+    np.testing.assert_allclose(effect.apply(np.full((1, 8), 40.0), np.array([[0.1]]), backwards), out[:, ::-1])
+    constant = replace(plan, covariates={"battery_mv": np.where(np.isnan(with_gaps), np.nan, 7500.0)})
+    assert VOCABULARY["battery_sag"].for_extent(Extent(0.0, 1.0, constant)) is None
 
 
 def test_the_extent_of_a_recording_is_its_range_length_and_duration():

@@ -66,7 +66,7 @@ class GainDrift(CountsTimeFromOrigin, NamedEffect[FloatArray]):
 class BatterySag(LinearEffect[FloatArray]):
     """A lamp that dims with its battery: signal x (1 + per_volt (V - V0)), V from `battery_mv`, V0 = 8 V.
 
-    Readings without a recorded voltage are taken to be at V0.
+    Between recorded voltages V is interpolated in time, and beyond them it is the nearest one; V0 where none is recorded.
     """
 
     typical_per_volt: float = 0.05
@@ -82,8 +82,9 @@ class BatterySag(LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical change to 2 % over the recorded voltages; None if there are none or all are equal."""
-        above = _volts_above_reference(extent.plan)
-        fall = float(np.ptp(above))
+        millivolts = extent.plan.covariates.get(_BATTERY, np.empty(0))
+        recorded = (millivolts[np.isfinite(millivolts)] - _REFERENCE_MV) / 1000
+        fall = float(np.ptp(recorded)) if recorded.size else 0.0
         return cls(typical_per_volt=0.02 / fall) if fall > 0 else None
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -98,6 +99,12 @@ class BatterySag(LinearEffect[FloatArray]):
 
 
 def _volts_above_reference(plan: Plan) -> FloatArray:
-    """Return the battery voltage minus V0 in V, (n_points,); 0 where none is recorded."""
-    millivolts = plan.covariates.get(_BATTERY, np.full(len(plan), _REFERENCE_MV))
-    return np.where(np.isfinite(millivolts), (millivolts - _REFERENCE_MV) / 1000, 0.0)
+    """Return the battery voltage minus V0 in V, (n_points,), interpolated where it is missing; 0 if all are."""
+    millivolts = plan.covariates.get(_BATTERY, np.full(len(plan), np.nan))
+    known = np.flatnonzero(np.isfinite(millivolts))
+    if not known.size:
+        return np.zeros(len(plan))
+    above = (millivolts - _REFERENCE_MV) / 1000
+    known = known[np.argsort(plan.time_s[known], kind="stable")]
+    # A missing voltage is no other voltage: at V0 the gain would jump where the logging stops.
+    return np.where(np.isfinite(above), above, np.interp(plan.time_s, plan.time_s[known], above[known]))

@@ -68,6 +68,22 @@ def there_and_back() -> Plan:
     )
 
 
+def plan_along(x_mm: np.ndarray, y_mm: np.ndarray, scan: np.ndarray | None = None) -> Plan:
+    """Readings at these places, a second apart."""
+    n = len(x_mm)
+    return Plan(
+        x_mm=x_mm,
+        y_mm=y_mm,
+        orientation_rad=np.zeros(n),
+        time_s=np.arange(float(n)),
+        scan=np.zeros(n, dtype=int) if scan is None else scan,
+        scan_names=("out", "back")[: 1 if scan is None else 2],
+        pattern=np.zeros(n, dtype=int),
+        pattern_names=("edge",),
+        patterns={"edge": HalfPlane(0.0, 0.0)},
+    )
+
+
 def base() -> Chain:
     return Chain(
         FixedMixture([1.0], [[0.5, 1.5]], [[[16.0, 1.0], [1.0, 9.0]]]), FixedLevels(10, 60), KnownScene(PLAN.patterns)
@@ -165,6 +181,27 @@ def test_lines_are_found_whichever_way_they_were_scanned():
     assert (found.angle_rad, found.offset_mm, found.length_mm) == pytest.approx((0.4, 7.0, 100.0))
     x, y = found.lab_coordinates_mm(np.array([3.0]), np.array([-2.0]))
     np.testing.assert_allclose(found.line_coordinates_mm(x, y), [[3.0], [-2.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("jitter_mm", [1e-13, 0.05])
+@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 90.0])
+def test_a_line_is_found_once_where_the_places_scatter_about_it(angle_deg, jitter_mm):
+    """Sorted by X, the first and the last place of a scan along Y are any two of its places."""
+    rng = np.random.default_rng(0)
+    along, angle = np.linspace(-50, 50, 60), np.radians(angle_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    for _ in range(20):
+        along_both, beside = np.append(along, along[::-1]), 5 + jitter_mm * rng.standard_normal(120)
+        plan = plan_along(c * along_both - s * beside, s * along_both + c * beside, np.repeat([0, 1], 60))
+        (line,) = distinct_scan_lines(plan)
+        assert line.angle_rad == pytest.approx(angle, abs=1e-3)
+        assert line.offset_mm == pytest.approx(5.0, abs=0.05)
+        assert line.length_mm == pytest.approx(100.0, abs=0.1)
+
+
+def test_a_scan_at_rest_has_no_line_whatever_the_last_digit_of_its_places():
+    y_mm = 5.0 + np.spacing(5.0) * np.arange(60)
+    assert distinct_scan_lines(plan_along(np.full(60, 3.0), y_mm)) == ()
 
 
 def test_a_spot_shows_alike_on_its_line_however_far_beside_it_lies():
@@ -499,22 +536,6 @@ def test_a_slide_that_sticks_lags_ever_more_and_jumps_once_a_period():
     once_more = off[x_mm <= 10.0], off[x_mm >= -10.0]  # a period apart
     np.testing.assert_allclose(*once_more, atol=1e-9)
     assert np.abs(off).max() < 1.05 * amp_mm
-
-
-def plan_along(x_mm: np.ndarray, y_mm: np.ndarray, scan: np.ndarray | None = None) -> Plan:
-    """Readings at these places, a second apart."""
-    n = len(x_mm)
-    return Plan(
-        x_mm=x_mm,
-        y_mm=y_mm,
-        orientation_rad=np.zeros(n),
-        time_s=np.arange(float(n)),
-        scan=np.zeros(n, dtype=int) if scan is None else scan,
-        scan_names=("out", "back")[: 1 if scan is None else 2],
-        pattern=np.zeros(n, dtype=int),
-        pattern_names=("edge",),
-        patterns={"edge": HalfPlane(0.0, 0.0)},
-    )
 
 
 def test_places_that_differ_in_the_last_digit_are_one_place():

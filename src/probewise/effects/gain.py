@@ -66,7 +66,8 @@ class GainDrift(CountsTimeFromOrigin, NamedEffect[FloatArray]):
 class BatterySag(LinearEffect[FloatArray]):
     """A lamp that dims with its battery: signal x (1 + per_volt (V - V0)), V from `battery_mv`, V0 = 8 V.
 
-    Between recorded voltages V is interpolated in time, and beyond them it is the nearest one; V0 where none is recorded.
+    Between recorded voltages V is interpolated in time, and beyond them it is the nearest one; it is V0 if there is
+    none.
     """
 
     typical_per_volt: float = 0.05

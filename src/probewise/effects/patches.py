@@ -15,6 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
+from probewise.effects.motion import distinct_positions_mm
 from probewise.effects.vocabulary import NamedEffect, V, single_column_bank
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -23,6 +24,8 @@ _RADII = (0.04, 0.1, 0.25)  # of the line's length, for the bank; the prior reac
 _MARGIN = 0.1  # of the line's length: a patch may lie beyond its ends
 _STRAIGHT = 0.02  # of a scan's length: the largest deviation from a straight line
 _LEAST_PLACES = 8
+_LEAST_ANGLE_RAD = np.radians(-89.5)
+_ONE_DIRECTION_RAD = np.radians(1.0)
 
 
 def gaussian_bump(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
@@ -65,23 +68,40 @@ ALONG_X = ScanLine(0.0, 0.0, -50.0, 50.0)
 
 def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
     """Return the distinct lines of the plan's straight scans that have eight distinct places or more."""
-    found: dict[tuple[float, float], ScanLine] = {}
+    found: list[ScanLine] = []
     for rows in plan.rows_by_scan():
         places = np.unique(np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1), axis=0)
         if len(places) < _LEAST_PLACES:
             continue
-        t = places[-1] - places[0]  # sorted by X, then Y: never against X
-        angle = float(np.arctan2(t[1], t[0]))
+        angle = _principal_angle_rad(places)
         along, across = ScanLine(angle, 0.0, 0.0, 1.0).line_coordinates_mm(*places.T)
-        if np.ptp(across) > _STRAIGHT * np.ptp(along):
+        if len(distinct_positions_mm(along)) < _LEAST_PLACES or np.ptp(across) > _STRAIGHT * np.ptp(along):
             continue
         line = ScanLine(angle, float(across.mean()), float(along.min()), float(along.max()))
-        key = (round(angle, 3), round(line.offset_mm / (_STRAIGHT * line.length_mm)))
-        other = found.get(key, line)
-        found[key] = ScanLine(
-            other.angle_rad, other.offset_mm, min(line.low_mm, other.low_mm), max(line.high_mm, other.high_mm)
-        )
-    return tuple(found.values())
+        for k, other in enumerate(found):
+            if _are_one_line(line, other):
+                low_mm, high_mm = min(line.low_mm, other.low_mm), max(line.high_mm, other.high_mm)
+                found[k] = replace(other, low_mm=low_mm, high_mm=high_mm)
+                break
+        else:
+            found.append(line)
+    return tuple(found)
+
+
+def _are_one_line(line: ScanLine, other: ScanLine) -> bool:
+    """Return whether two lines have one direction and, as shares of their lengths, one offset."""
+    apart = line.offset_mm / line.length_mm - other.offset_mm / other.length_mm
+    return abs(line.angle_rad - other.angle_rad) < _ONE_DIRECTION_RAD and abs(apart) < 0.5 * _STRAIGHT
+
+
+def _principal_angle_rad(places_mm: FloatArray) -> float:
+    """Return the angle to X of the principal axis of places, (n_places, 2), above -89.5 and up to 90.5 degrees.
+
+    So places that scatter about a line along Y have an angle of about 90 degrees, and never one of -90.
+    """
+    x_mm, y_mm = (axis - axis.mean() for axis in (places_mm - places_mm[0]).T)  # exactly 0 for an axis that rests
+    angle = 0.5 * float(np.arctan2(2 * x_mm @ y_mm, x_mm @ x_mm - y_mm @ y_mm))
+    return angle + np.pi if angle < _LEAST_ANGLE_RAD else angle
 
 
 @dataclass(frozen=True)

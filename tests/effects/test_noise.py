@@ -121,6 +121,23 @@ def test_a_lattice_shows_through_printing(digits):
     assert missed <= 1  # a step that happens to be nearly a round number
 
 
+@pytest.mark.parametrize("unit", [1e-12, 1e-6, 1e-3])
+def test_the_error_of_a_step_does_not_depend_on_the_unit(unit):
+    """Readings of some 1e-12 A are all within 1e-6 of the integer 0, which is not their last digit."""
+    printed = np.round(0.37 * np.arange(3, 60), 2)
+    expected = sd_of_estimated_lattice_step(printed, 0.37)
+    assert expected == pytest.approx(0.01 / np.sqrt(12) / np.linalg.norm(np.arange(57) - 28))
+    assert sd_of_estimated_lattice_step(unit * printed, unit * 0.37) == pytest.approx(unit * expected)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e9])
+def test_the_bank_of_lost_readings_lies_within_their_prior_in_any_unit(unit):
+    lost = Dropouts.for_extent(Extent(10.0 * unit, 60.0 * unit, PLAN))
+    values = lost.bank()[:, 0, 1]
+    assert np.isfinite(lost.prior.log_prob(lost.bank()[:, 0])).all()
+    np.testing.assert_allclose(np.unique(values), [9.50510 * unit, 60.49490 * unit])
+
+
 def test_a_printing_lattice_and_a_declared_one_are_no_effect():
     rows = FittedReadings(np.zeros(300), SD)
     printed = np.round(np.random.default_rng(2).normal(0, 1, (300, 2)) * SD, 2) / SD

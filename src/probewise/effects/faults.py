@@ -17,6 +17,7 @@ from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage
 
 _FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
+_NEAR_END = 1e-4  # of the range of a lost reading's value: distance of the bank's values from its ends
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ class Dropouts(NoiseEffect):
         return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
 
     def bank(self) -> FloatArray:
-        ends = (self.lowest + 0.01, self.highest - 0.01)
+        near = _NEAR_END * (self.highest - self.lowest)
+        ends = (self.lowest + near, self.highest - near)
         return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
 
     def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:

@@ -85,7 +85,12 @@ def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
     millionth of the step.
     """
     values = np.unique(readings[np.isfinite(readings)])
-    digits = (10.0**-n for n in range(10) if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n))
+    first = max(math.floor(-math.log10(step)), 0)  # the digits are no coarser than the step, which may be tiny
+    digits = (
+        10.0**-n
+        for n in range(first, first + 10)
+        if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n)
+    )
     reach = float(np.linalg.norm(values - values.mean())) / step
     return max(next(digits, 0.0) / math.sqrt(12) / reach, _DIGITS * step)
 

@@ -1,5 +1,6 @@
 """Forms of the vocabulary: each does what its name says, by a route of its own."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -250,6 +251,37 @@ def test_an_input_is_cut_off_below_as_well_as_above():
     said = [form.sentence(np.array([level]), np.array([0.01])) for level in (0.7, -0.6)]
     assert "rises no further" in said[0]
     assert "falls no further" in said[1]
+
+
+def _names_in_units(of_law, time, column, reading):
+    """Names of the forms and proposals of one system, whose table is in other units, without their numbers."""
+    table = TABLE.with_columns({"t_s": time * _T, "room_c": column * TABLE.covariates["room_c"]}).take(
+        np.arange(0, 60, 2)
+    )
+    if of_law:
+        parameters = {"k": (0.5 * reading / time, 1.5 * reading / time), "r": (0.1 / time, 1 / time)}
+        law = Law(
+            {"y": 2 * reading}, lambda s, p, u: {"y": p["k"] * u["drive"] - p["r"] * s["y"]}, max_step_s=0.2 * time
+        )
+        how = {"law": law}
+    else:
+        parameters = {"offset": (-5 * reading, 5 * reading), "gain": (0, 4 * reading)}
+        how = {"simulate": lambda p, u: p["offset"] + p["gain"] * u["drive"]}
+    simulator = Simulator(
+        reading="y", unit="V", parameters=parameters, time="t_s", run="run", noise=Noise(sd=SD * reading), **how
+    )
+    system = System.of(simulator, table)
+    about = ReferenceFit(system, table, np.zeros(system.n_params), SD * reading)
+    names = [*bind_forms(about), *(form.name for form in formula_forms(about))]
+    return {re.sub(r"-?\d[\d.e+-]*", "#", name) for name in names}
+
+
+@pytest.mark.parametrize("of_law", [False, True])
+def test_what_may_be_missing_does_not_depend_on_the_units_of_the_columns(of_law):
+    """Nanoseconds in seconds, picoamperes in amperes, and readings of a million million of their unit."""
+    usual = _names_in_units(of_law, 1.0, 1.0, 1.0)
+    for units in ((1e-9, 1.0, 1.0), (1.0, 1e-12, 1.0), (1.0, 1.0, 1e12)):
+        assert _names_in_units(of_law, *units) == usual
 
 
 def test_no_form_has_the_name_of_an_effect_out_of_vocabulary():

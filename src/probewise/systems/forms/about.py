@@ -20,6 +20,7 @@ from probewise.systems.table import RunTable
 _ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
 _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
+_GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings change
 _TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in noise sds
 _NUDGE = 1e-3  # of a state's range
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
@@ -186,17 +187,26 @@ class ReferenceFit:
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
         return np.asarray(chain.predict(theta, self.table) - self.predicted)
 
-    def typical_amplitude(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
+    def typical_amplitude(
+        self, stage: Stage, act: Act, entries: FloatArray, guess: float, amplitudes: tuple[int, ...] = (0,)
+    ) -> float | None:
         """Find the amplitude at which the readings change by one sd (median over entries); None if they do not change.
 
-        `entries` (n_entries, n_columns, n_params) have the amplitude `guess`, to which the change is proportional.
+        `entries` (n_entries, n_columns, n_params) have the amplitude `guess`, to which the change is proportional;
+        `amplitudes` are the indices of the parameters with that amplitude.
         """
         settings = entries.reshape(-1, entries.shape[-1])
-        rms = self.rms_change_in_sds(stage, act, settings[:: max(len(settings) // 16, 1)])
-        rms = rms[np.isfinite(rms)]
-        if not rms.size or rms.max() <= _UNSEEN:
-            return None
-        return _TYPICAL * guess / float(np.median(rms[rms > _UNSEEN]))
+        settings = settings[:: max(len(settings) // 16, 1)]
+        # In the unit of a column or a time a term may be minute. What is added to a reading, or to its gain, is
+        # proportional at any amplitude; elsewhere a larger one could act where a small one does not.
+        for times in _GROWTH if stage in (Stage.OFFSET, Stage.GAIN) else (1.0,):
+            larger = settings.copy()
+            larger[:, list(amplitudes)] *= times
+            rms = self.rms_change_in_sds(stage, act, larger)
+            rms = rms[np.isfinite(rms)]
+            if rms.size and rms.max() > _UNSEEN:
+                return _TYPICAL * times * guess / float(np.median(rms[rms > _UNSEEN]))
+        return None
 
     def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
         """Return the heavy-tailed prior of an amplitude of this typical size; a misfit above 1 widens its tails."""

@@ -19,6 +19,7 @@ from probewise.systems.table import RunTable
 
 _AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
 _FIXED = 1e-9  # width of its prior
+_QUARTILES = np.array([0.25, 0.75])
 _FAR = 0.3  # change of a parameter by its own size, as large as the misfit asks for, at which the variants differ
 _MOST_NATS = 50.0  # largest logarithm of a factor
 
@@ -34,7 +35,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     over["steps"] = modulations.change_point_step_modulation(table, about.time_unit, gated=False)
     columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and np.nanstd(v) > 0]
     for name in own.parameters:
-        guess = 1e-4 * (float(np.abs(values[name]).max()) or 1.0)
+        guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(own.parameters[name].from_unit(_QUARTILES))))
         each = dict(over)
         if name not in own.per_run and about.can_fit_value_per_run:
             each["differs"] = modulations.value_per_run_modulation(table)

@@ -21,11 +21,13 @@ from probewise.systems.forms.form import Act, ChangePoints, Form, mean_with_sd
 from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
 from probewise.systems.forms.proposals_in_time import formula_forms_in_time
 from probewise.systems.forms.proposals_of_columns import formula_forms_of_columns
+from probewise.systems.forms.rates import rms_rate
 from probewise.systems.motion import LawWithEffects
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
 _THRESHOLDS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of a state beyond which a term may act
+_GUESS = 1e-5  # of a state's rate: a trial term, too small to change the course of a law
 _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter one is kept
 
 
@@ -118,15 +120,22 @@ def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
     known: list[FloatArray] = []
     for term in _terms_of_variables([*variables, level]):
 
-        def act(value: FloatArray, theta: FloatArray, table: RunTable, term: _Term = term) -> FloatArray:
+        def value_at_rows(value: FloatArray, table: RunTable, term: _Term = term) -> FloatArray:
             def look_up(name: str) -> Any:
                 return value if name == own.reading else table.time_s if name == table.time else table.covariates[name]
 
-            return np.asarray(value + theta[:, :1] * term.evaluate(look_up))
+            return np.asarray(term.evaluate(look_up))
 
-        shape = act(about.predicted[None, :], np.ones((1, 1)), about.table)[0] - about.predicted
-        if _add_if_new(shape, known):
-            yield from _single_term_form(about, "reading", own.reading, Stage.OFFSET, act, term)
+        def act(
+            value: FloatArray,
+            theta: FloatArray,
+            table: RunTable,
+            term_of: Callable[[FloatArray, RunTable], FloatArray] = value_at_rows,
+        ) -> FloatArray:
+            return np.asarray(value + theta[:, :1] * term_of(value, table))
+
+        if _add_if_new(value_at_rows(about.predicted, about.table), known):
+            yield from _single_term_form(about, "reading", own.reading, Stage.OFFSET, act, term, about.sd)
 
 
 def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -179,8 +188,9 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
             sizes = f"a = {mean_with_sd(mean[0], sd[0], '')}, at = {mean_with_sd(mean[1], sd[1], '')}"
             return f"the rate of {state} lacks a {text}, {sizes}: a proposal, not a known effect"
 
-        entries = np.array([[[1e-6, at]] for at in np.quantile(values, _THRESHOLDS)])
-        typical = about.typical_amplitude(Stage.RATE, act, entries, 1e-6)
+        guess = _GUESS * rms_rate(about, state) / (high - low)
+        entries = np.array([[[guess, at]] for at in np.quantile(values, _THRESHOLDS)])
+        typical = about.typical_amplitude(Stage.RATE, act, entries, guess)
         if typical is None or not np.isfinite(typical):
             continue
         entries[:, :, 0] = typical
@@ -216,7 +226,8 @@ def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
 
         shape = np.asarray(term.evaluate(lambda name: states.get(name, about.table.covariates.get(name))))
         if _add_if_new(shape, known):
-            yield from _single_term_form(about, "rate", state, Stage.RATE, act, term)
+            guess = _GUESS * rms_rate(about, state) / float(np.sqrt(np.mean(shape**2)))
+            yield from _single_term_form(about, "rate", state, Stage.RATE, act, term, guess)
 
 
 def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
@@ -241,9 +252,8 @@ def _covariate_name_of_variable(about: ReferenceFit, side: str, name: str) -> st
 
 
 def _single_term_form(
-    about: ReferenceFit, side: str, target: str, stage: Stage, act: Act, term: _Term
+    about: ReferenceFit, side: str, target: str, stage: Stage, act: Act, term: _Term, guess: float
 ) -> Iterator[Form]:
-    guess = about.sd if stage is Stage.OFFSET else 1e-6
     typical = about.typical_amplitude(stage, act, np.full((1, 1, 1), guess), guess)
     if typical is None or not np.isfinite(typical):
         return

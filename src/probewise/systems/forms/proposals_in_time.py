@@ -141,7 +141,7 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
             for j in range(i + _APART, _N_SETTLING)
         ]
     )
-    typical = about.typical_amplitude(Stage.OFFSET, act, entries, 1.0)
+    typical = about.typical_amplitude(Stage.OFFSET, act, entries, 1.0, (0, 1))
     if typical is None:
         return
     entries[:, :, :2] *= typical

@@ -43,7 +43,7 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
         return np.asarray(value + (a + b * z + c * z**2) * (rows.covariates[name] - centre) / spread)
 
     entries = np.eye(3)[None, :, :]
-    typical = about.typical_amplitude(Stage.OFFSET, act, about.sd * entries, about.sd)
+    typical = about.typical_amplitude(Stage.OFFSET, act, about.sd * entries, about.sd, (0, 1, 2))
     if typical is None:
         return
     scaled = f"({name} - {text_rounded_to_spread(centre, spread)}) / {spread:.4g}"

@@ -35,7 +35,7 @@ def modulated_form(
 ) -> Iterator[Form]:
     """Yield the form by which a quantity varies over the rows as `how`, applied by `act`; none if without effect."""
     entries = how.entries(guess)
-    typical = about.typical_amplitude(stage, act, entries, guess)
+    typical = about.typical_amplitude(stage, act, entries, guess, how.amplitudes)
     if typical is not None and np.isfinite(typical) and typical > 0:
         form = Form(
             name,

@@ -67,7 +67,9 @@ class _StoredReferenceFit(ReferenceFit):
     def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         return np.ones(len(settings))
 
-    def typical_amplitude(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
+    def typical_amplitude(
+        self, stage: Stage, act: Act, entries: FloatArray, guess: float, amplitudes: tuple[int, ...] = (0,)
+    ) -> float | None:
         return guess
 
     def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:

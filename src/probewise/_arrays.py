@@ -55,15 +55,17 @@ def frozen_int(values: ArrayLike) -> IntArray:
     return array
 
 
-def rounding_error(values: FloatArray) -> float:
+def rounding_error(values: FloatArray, axis: int | None = None) -> FloatArray:
     """Return the difference up to which values are taken for equal, since they are the results of arithmetic.
 
-    It is 1e-12 of their range, or a few steps of the floating-point grid where they lie far from 0.
+    It is 1e-12 of the range of the finite ones, or a few steps of the floating-point grid where they lie far from 0. It
+    is that of all values, or of those along `axis`, which is kept with length 1.
     """
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0
-    return max(1e-12 * float(np.ptp(finite)), 4 * float(np.spacing(np.abs(finite).max())))
+    finite, kept = np.isfinite(values), axis is not None
+    high = np.max(values, axis=axis, keepdims=kept, initial=-np.inf, where=finite)
+    low = np.min(values, axis=axis, keepdims=kept, initial=np.inf, where=finite)
+    largest = np.max(np.abs(values), axis=axis, keepdims=kept, initial=0.0, where=finite)
+    return np.asarray(np.maximum(1e-12 * (high - low), 4 * np.spacing(largest)))
 
 
 def distinct_values(values: FloatArray, within: float | None = None) -> FloatArray:
@@ -73,14 +75,14 @@ def distinct_values(values: FloatArray, within: float | None = None) -> FloatArr
     and a backward scan do.
     """
     ordered = np.unique(values[np.isfinite(values)])
-    apart = rounding_error(ordered) if within is None else within
+    apart = float(rounding_error(ordered)) if within is None else within
     return np.asarray(ordered[np.diff(ordered, prepend=-np.inf) > apart])
 
 
 def varies(values: FloatArray) -> bool:
     """Return whether finite values differ by more than the rounding error of arithmetic."""
     finite = values[np.isfinite(values)]
-    return finite.size > 1 and float(np.ptp(finite)) > rounding_error(finite)
+    return finite.size > 1 and float(np.ptp(finite)) > float(rounding_error(finite))
 
 
 def require_finite(name: str, values: FloatArray) -> None:

@@ -88,6 +88,17 @@ def test_rows_without_a_reading_say_nothing_of_what_the_scans_resolve(lost: str)
     assert scan_geometry(with_gaps) == scan_geometry(without)
 
 
+def test_scans_at_rest_say_nothing_of_what_the_others_resolve() -> None:
+    """Their places differ in the last digit alone, and they are more than the scans that move."""
+    moving = _edge_recording()
+    plan = moving.plan
+    rests = plan.scan >= 1
+    rest_mm = np.where(np.arange(len(plan)) % 2, 7.1, np.nextafter(7.1, 8.0))
+    some = replace(plan, x_mm=np.where(rests, rest_mm, plan.x_mm), y_mm=np.where(rests, 0.0, plan.y_mm))
+    g = scan_geometry(_recording(some, moving.readings))
+    assert (g.span_mm, g.step_mm) == (100.0, 1.0)
+
+
 def test_a_recording_that_is_usable_at_one_place_alone_is_refused() -> None:
     plan = paper_plan().take([0, 50, 100])
     plan = replace(plan, x_mm=np.array([5.0, 5.0, 90.0]))

@@ -39,7 +39,7 @@ from probewise.effects import (
     ScanMisplacement,
     StickSlip,
 )
-from probewise.effects.motion import orientation_deg
+from probewise.effects.motion import orientation_deg, sign_of_motion
 from probewise.effects.origin import CountsFromOrigin, Origin
 from probewise.effects.patches import distinct_scan_lines
 from probewise.effects.vocabulary import sentence_from_samples, value_with_sd
@@ -547,6 +547,28 @@ def test_places_that_differ_in_the_last_digit_are_one_place():
         assert kind.for_extent(both).shortest_mm == pytest.approx(0.3)
     alone = MissingTooth.for_extent(Extent(0.0, 1.0, plan_along(out, np.zeros(1001))))
     np.testing.assert_allclose(MissingTooth.for_extent(both).places_mm[0], alone.places_mm[0], atol=1e-12)
+
+
+def test_rest_is_rest_whatever_the_last_digit_of_a_place():
+    """Y wavers in its last digit while X goes forth and back; then nothing moves but last digits."""
+    y_mm = 0.3 + np.tile([0.0, np.spacing(0.3)], 20)
+    exact, x_mm = np.full(40, 0.3), np.append(np.arange(20.0), np.arange(20.0)[::-1])
+    moving, exactly = (plan_along(x_mm, y, np.repeat([0, 1], 20)) for y in (y_mm, exact))
+    np.testing.assert_array_equal(moving.direction_of_motion, exactly.direction_of_motion)
+    along_y = plan_along(y_mm, x_mm, np.repeat([0, 1], 20))
+    np.testing.assert_array_equal(sign_of_motion(along_y), np.repeat([1.0, -1.0], 20))
+    at_rest = Extent(0.0, 1.0, plan_along(exact, y_mm))
+    assert at_rest.length_mm == 1.0
+    assert AmbientGradient.for_extent(at_rest) is None
+
+
+def test_times_that_differ_in_the_last_digit_are_one_time():
+    plan = there_and_back()
+    time_s = np.repeat([0.1, 0.2, 0.3], 2)
+    time_s[1::2] = np.nextafter(time_s[1::2], np.inf)
+    extent = Extent(0.0, 1.0, replace(plan, time_s=time_s))
+    assert AmbientStep.for_extent(extent).times_s == (0.1, 0.2, 0.3)
+    assert extent.gap_s == pytest.approx(0.1)
 
 
 def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():

@@ -37,6 +37,14 @@ def test_the_chance_is_that_of_one_arrangement_of_each_group_or_its_reverse():
     assert _chance(tied) == pytest.approx(2 / (math.factorial(4) / 2) ** 12)
 
 
+def test_rows_are_equal_whatever_the_last_digits_of_their_columns():
+    last_digits = np.where(np.arange(48) % 3 == 0, np.nextafter(_SPEED, np.inf), _SPEED)
+    assert _chance(_sorted_within(_SPEED), last_digits) == pytest.approx(2 / math.factorial(4) ** 12)
+    part = np.repeat([1.0, np.nan], 24)  # a missing cell is equal to other missing ones
+    way = np.tile(np.sort(np.random.default_rng(0).standard_normal(24)), 2)
+    assert _chance(way, np.full(48, 3.0), part=part) == pytest.approx(2 / math.factorial(24) ** 2)
+
+
 def test_rows_with_a_time_unsorted_ones_and_a_drift_keep_their_order():
     way = _sorted_within(_SPEED)
     assert _chance(way, t=np.arange(48.0), time="t") == 1.0

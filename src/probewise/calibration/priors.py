@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, rounding_error
 from probewise.calibration.coordinates import MomentCoordinates, view_by_kind_and_gaussian
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Uniform, checked_columns
@@ -237,16 +237,17 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
             named, f"all {readings.size} usable readings equal {low:g}", "readings that differ: scan an edge"
         )
     place = np.stack([plan.x_mm, plan.y_mm], axis=-1)
+    still = rounding_error(place)
     moves: list[FloatArray] = []
     lengths: list[float] = []
     for rows in plan.rows_by_scan():
         places = place[rows[usable[rows]]]
         steps = np.hypot(*np.diff(places, axis=0).T)
-        if (steps > 0).any():
-            moves.append(steps[steps > 0])
+        if (steps > still).any():
+            moves.append(steps[steps > still])
             lengths.append(float(np.hypot(*np.ptp(places, axis=0))))
     extent = float(np.hypot(*np.ptp(place[usable], axis=0)))
-    if not lengths and extent == 0:
+    if not lengths and extent <= still:
         raise ParameterError("recording", "every usable reading taken at one place", "scans that move over an edge")
     span = float(np.median(lengths)) if lengths else extent
     # Places far apart, such as those a robot chooses, do not bound the footprint from below: use a factor of 50.

@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, distinct_values
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.vocabulary import NamedEffect, V, VariantMasks
@@ -95,7 +95,7 @@ class ChangePointEffect(NamedEffect[V]):
 
 def candidate_change_times_s(extent: Extent) -> tuple[float, ...] | None:
     """Return the distinct times of a recording's readings, thinned to at most 512 intervals; None for one time."""
-    times = np.unique(extent.plan.time_s)
+    times = distinct_values(extent.plan.time_s)
     if len(times) < 2:
         return None
     stride = -(-(len(times) - 1) // _MOST_TIMES)

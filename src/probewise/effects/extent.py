@@ -8,6 +8,7 @@ from typing import Self
 
 import numpy as np
 
+from probewise._arrays import rounding_error
 from probewise.effects.origin import Origin
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
@@ -71,7 +72,8 @@ class Extent:
         """Diagonal of the X and Y ranges of the longest scan, mm; 1 if nothing moves."""
         plan = self.plan
         ends = [(plan.x_mm[rows], plan.y_mm[rows]) for rows in plan.rows_by_scan() if rows.size]
-        return max(float(np.hypot(np.ptp(x), np.ptp(y))) for x, y in ends) or 1.0
+        longest = max(float(np.hypot(np.ptp(x), np.ptp(y))) for x, y in ends)
+        return longest if longest > rounding_error(np.append(plan.x_mm, plan.y_mm)) else 1.0
 
     @cached_property
     def duration_s(self) -> float:
@@ -82,5 +84,5 @@ class Extent:
     def gap_s(self) -> float:
         """Median time between consecutive readings of a scan, s; 1 where no time passes."""
         gaps = np.diff(self.plan.time_s)[np.diff(self.plan.scan) == 0]
-        gaps = gaps[gaps > 0]
+        gaps = gaps[gaps > rounding_error(self.plan.time_s)]
         return float(np.median(gaps)) if gaps.size else 1.0

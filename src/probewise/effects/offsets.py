@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, varies
 from probewise.effects.change_points import ChangePointEffect, candidate_change_times_s
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
@@ -35,7 +35,7 @@ class AmbientGradient(CountsPlaceFromOrigin, LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical slope to 1 % of the readings' range over the longest scan; None where nothing moves."""
-        if np.ptp(extent.plan.x_mm) == np.ptp(extent.plan.y_mm) == 0:
+        if not (varies(extent.plan.x_mm) or varies(extent.plan.y_mm)):
             return None
         typical = 0.01 * extent.span / extent.length_mm
         return cls(typical_per_mm=typical, unit=extent.reading_unit, origin=extent.origin)

@@ -10,7 +10,15 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int, read_only_floats, require_finite
+from probewise._arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    frozen_int,
+    read_only_floats,
+    require_finite,
+    rounding_error,
+)
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise.errors import ParameterError, ShapeError
@@ -240,8 +248,10 @@ class Plan:
         """
         out = np.zeros((len(self), 2))
         place = np.stack([self.x_mm, self.y_mm], axis=-1)
+        still = rounding_error(place)
         for rows in self.rows_by_scan():
             moves = np.diff(place[rows], axis=0)
+            moves[np.abs(moves) <= still] = 0.0
             lengths = np.hypot(moves[:, 0], moves[:, 1])
             moved = np.flatnonzero(lengths > 0)
             if moved.size == 0:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from probewise._arrays import IntArray, distinct_values
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
@@ -22,7 +26,7 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
     if table.has_varying_time or readings is None or readings.dtype != np.float64:
         return 1.0
     inputs = [values for name, values in table.columns.items() if name not in (own.reading, own.noise.sd)]
-    codes = [np.unique(values, return_inverse=True)[1] for values in inputs]
+    codes = [_codes_of_equal_cells(values) for values in inputs]
     group = np.unique(np.stack([*codes, np.zeros(len(table), dtype=np.int64)]), axis=1, return_inverse=True)[1].ravel()
     there = np.flatnonzero(np.isfinite(readings))
     if (
@@ -38,6 +42,13 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
         if np.all(sign * along >= 0) and not np.all(sign * whole >= 0):
             return float(min(np.exp(log_chance), 1.0))
     return 1.0
+
+
+def _codes_of_equal_cells(values: NDArray[Any]) -> IntArray:
+    """Return a number for each cell of a column, (n_points,), the same for cells that are equal but for rounding."""
+    if values.dtype != np.float64:
+        return np.unique(values, return_inverse=True)[1]
+    return np.where(np.isfinite(values), np.searchsorted(distinct_values(values), values, side="right"), 0)
 
 
 def rows_are_in_order(simulator: Simulator, table: RunTable) -> bool:

@@ -12,7 +12,7 @@ from probewise.errors import ParameterError
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.proposals import formula_forms
-from probewise.systems.forms.readings import values_at_earlier_times
+from probewise.systems.forms.readings import sign_of_change, values_at_earlier_times
 from probewise.systems.motion import LawWithEffects
 
 SD = 0.01
@@ -282,6 +282,39 @@ def test_what_may_be_missing_does_not_depend_on_the_units_of_the_columns(of_law)
     usual = _names_in_units(of_law, 1.0, 1.0, 1.0)
     for units in ((1e-9, 1.0, 1.0), (1.0, 1e-12, 1.0), (1.0, 1.0, 1e12)):
         assert _names_in_units(of_law, *units) == usual
+
+
+def test_what_may_be_missing_does_not_depend_on_the_last_digits_of_the_columns():
+    """Two runs over the same settings, whose numbers were computed in two ways; and a column of one number."""
+    rng, half = np.random.default_rng(3), N_ROWS // 2
+    columns = {
+        "t_s": TABLE.time_s,
+        "drive": np.tile(TABLE.covariates["drive"][:half], 2),
+        "room_c": np.tile(rng.normal(20, 2, half), 2),
+        "lamp": np.where(np.arange(N_ROWS) % 3 == 0, 0.3, 0.7),
+        "load": np.full(N_ROWS, 0.7),
+    }
+    found = []
+    for last_digits in (False, True):
+        noisy = {name: np.append(v[:half], np.nextafter(v[half:], np.inf)) for name, v in columns.items()}
+        table = TABLE.with_columns(noisy if last_digits else columns)
+        system = System.of(_simulator(), table)
+        about = ReferenceFit(system, table, np.zeros(system.n_params), SD)
+        forms = [*bind_forms(about).values(), *formula_forms(about)]
+        found.append(
+            {re.sub(r"-?\d[\d.e+-]*", "#", form.name): (len(form.bank()), len(form.variants())) for form in forms}
+        )
+    assert found[1] == found[0]
+    assert not any("load" in name for name in found[0])
+
+
+def test_readings_that_stay_keep_the_direction_of_the_last_change():
+    """A settled law wavers in the last digits of its readings."""
+    readings = np.append(np.linspace(0, 1, 20), 1 + 1e-16 * np.tile([1.0, -1.0], 20))[None, :]
+    table = TABLE.take(np.arange(30)).with_columns({"t_s": np.arange(30.0), "run": np.ones(30)})
+    assert np.unique(np.diff(readings[0, :30])[19:]).size > 1
+    np.testing.assert_array_equal(sign_of_change(readings[:, :30], table), 1.0)
+    np.testing.assert_array_equal(sign_of_change(-readings[:, :30], table), -1.0)
 
 
 def test_no_form_has_the_name_of_an_effect_out_of_vocabulary():

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, rounding_error
 from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.effects import orientation_deg
@@ -180,5 +180,5 @@ def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
 def median_reading_interval_s(plan: Plan) -> float:
     """Return the median time between readings within scans, in seconds; 1 s if unknown."""
     gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
-    gaps = gaps[gaps > 0]
+    gaps = gaps[gaps > rounding_error(plan.time_s)]
     return float(np.median(gaps)) if gaps.size else 1.0

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
 from probewise.calibration.fields import choose_pixel_mm, gaussians_sorted_by_mass, posterior_mean_ssf_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
@@ -308,5 +308,5 @@ def _uniform_draws_about_nodes(
 def _median_step_mm(recording: Recording) -> float:
     plan = recording.plan
     moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
-    moves = moves[moves > 0]
+    moves = moves[moves > rounding_error(np.append(plan.x_mm, plan.y_mm))]
     return float(np.median(moves)) if moves.size else max(Extent.of(recording).length_mm / 100, 1e-6)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, rounding_error
 from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
@@ -147,7 +147,7 @@ class ReferenceFit:
     def median_gap(self) -> float:
         """Median time from a row to the next of its run, in the unit of time; 1 if no time passes."""
         gaps = np.concatenate([np.diff(self.table.time_s[rows]) for rows in self.table.rows_by_scan()])
-        gaps = gaps[gaps > 0]
+        gaps = gaps[gaps > rounding_error(self.table.time_s)]
         return float(np.median(gaps)) if gaps.size else 1.0
 
     def is_held_between_rows(self, column: str) -> bool:

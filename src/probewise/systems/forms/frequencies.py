@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, distinct_values
 from probewise.priors import LogUniform
 from probewise.systems.forms.about import ReferenceFit
 
@@ -35,7 +35,7 @@ def trial_frequencies(
     """
     reach = float(np.ptp(values))
     highest = _frequency_of_median_gap(values, groups, rows_each)
-    highest = min(highest, len(np.unique(values)) / (rows_each * reach))
+    highest = min(highest, len(distinct_values(values)) / (rows_each * reach))
     n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
     return np.asarray(np.linspace(least_waves / reach, max(highest, 2 * least_waves / reach), n))
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
@@ -38,9 +38,9 @@ def driving_columns(about: ReferenceFit) -> list[str]:
     own, table = about.system.simulator, about.table
     out = []
     for name, values in table.covariates.items():
-        spread = float(np.nanstd(values))
-        if name == own.reading or name == own.noise.sd or spread == 0:
+        if name == own.reading or name == own.noise.sd or not varies(values):
             continue
+        spread = float(np.nanstd(values))
         rms = about.rms_change_in_sds(
             Stage.INPUT, _column_changer(name, _column_with_offset), np.array([[_NUDGE * spread]])
         )
@@ -218,7 +218,7 @@ def _max_n_trial_frequencies(about: ReferenceFit) -> int:
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     column = about.table.covariates[name]
     values = column[np.isfinite(column) & about.has_reading]  # others resolve no wave: it would fit any readings
-    if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
+    if len(distinct_values(values)) < 3 * _ROWS_OF_A_WAVE:
         return
     origin = origin_of_column(column[np.isfinite(column)])
 
@@ -271,7 +271,7 @@ def mean_of_delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTabl
     for rows in table.rows_by_scan():
         time, own = table.time_s[rows], values[:, rows]
         gaps = np.diff(time)
-        there = gaps > 0
+        there = gaps > rounding_error(table.time_s)
         total = np.concatenate([np.zeros((len(own), 1)), np.cumsum(own[:, :-1] * gaps, axis=1)], axis=1)
         since = values_at_earlier_times(time, total, by) + own[:, :1] * np.minimum(time - by[:, None] - time[0], 0.0)
         out[:, rows[:-1][there]] = np.diff(since, axis=1)[:, there] / gaps[there]
@@ -288,7 +288,7 @@ def column_with_play(c: FloatArray, theta: FloatArray, table: RunTable) -> Float
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
         own = np.broadcast_to(values[:, rows[0]], half.shape).copy()
-        first = np.flatnonzero(np.diff(values[0, rows]))
+        first = np.flatnonzero(np.abs(np.diff(values[0, rows])) > rounding_error(values[0]))
         if first.size:  # assume the direction of arrival is that of the first motion
             own -= half * np.sign(values[0, rows[first[0] + 1]] - values[0, rows[first[0]]])
         for row in rows:
@@ -302,7 +302,8 @@ def _moves_both_ways(values: FloatArray, table: RunTable) -> bool:
     moves = np.concatenate([np.diff(values[rows]) for rows in table.rows_by_scan()])
     if not moves.size:
         return False
-    return bool((moves > 0).mean() > _FORTH_AND_BACK and (moves < 0).mean() > _FORTH_AND_BACK)
+    still = rounding_error(values)
+    return bool((moves > still).mean() > _FORTH_AND_BACK and (moves < -still).mean() > _FORTH_AND_BACK)
 
 
 WORDS = {

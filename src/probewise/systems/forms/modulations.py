@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, distinct_values
 from probewise.effects import HeavyTailedPrior
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
@@ -84,7 +84,7 @@ def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
 def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
     """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number."""
     by_row = not table.has_varying_time
-    along = np.unique(np.arange(float(len(table))) if by_row else table.time_s)
+    along = distinct_values(np.arange(float(len(table))) if by_row else table.time_s)
     stride = -(-(len(along) - 1) // _MOST_MOMENTS)
     at = tuple(np.append(along[:-1:stride], along[-1]).tolist())
     change_points, name = ChangePoints(at, by_row, gated), "at_row" if by_row else "at_s"

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, varies
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
@@ -33,7 +33,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     if table.has_varying_time:
         over["drifts"] = modulations.linear_drift_modulation(table, about.time_unit)
     over["steps"] = modulations.change_point_step_modulation(table, about.time_unit, gated=False)
-    columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and np.nanstd(v) > 0]
+    columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and varies(v)]
     for name in own.parameters:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(own.parameters[name].from_unit(_QUARTILES))))
         each = dict(over)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, distinct_values, varies
 from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
@@ -102,7 +102,7 @@ def _varying_columns_by_name(about: ReferenceFit) -> dict[str, FloatArray]:
     """Return the columns of numbers that vary and are never missing, except the reading and its declared sd."""
     own = about.system.simulator
     kept = {c: v for c, v in about.table.covariates.items() if c not in (own.reading, own.noise.sd)}
-    return {c: v for c, v in kept.items() if np.isfinite(v).all() and np.ptp(v) > 0}
+    return {c: v for c, v in kept.items() if np.isfinite(v).all() and varies(v)}
 
 
 def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _ScaledVariable:
@@ -140,7 +140,7 @@ def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
 
 def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     """Yield a shift of the reading where a column, of three values or more, exceeds an unknown threshold."""
-    own, values = about.system.simulator, np.unique(about.table.covariates[name])
+    own, values = about.system.simulator, distinct_values(about.table.covariates[name])
     if len(values) <= 2:
         return
     at = np.append(values[: -1 : -(-(len(values) - 1) // _MOST_SWITCHES)], values[-1]).tolist()
@@ -210,7 +210,7 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
 
 def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     states = about.states
-    variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if np.ptp(values) > 0]
+    variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if varies(values)]
     columns = {name: values for name, values in _varying_columns_by_name(about).items() if name not in states}
     variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
     known: list[FloatArray] = []

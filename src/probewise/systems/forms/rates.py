@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, rounding_error
 from probewise.effects import name_without_copy_suffix
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
@@ -281,7 +281,7 @@ def rms_rate(about: ReferenceFit, state: str) -> float:
     rates = []
     for rows in about.table.rows_by_scan():
         gaps = np.diff(time[rows])
-        there = gaps > 0
+        there = gaps > rounding_error(time)
         rates.append(np.diff(values[rows])[there] / gaps[there])
     joined = np.concatenate(rates)
     return float(np.sqrt(np.mean(joined**2))) or 1.0

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
@@ -106,7 +106,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         yield from _lag_form(about)
         yield from _delay_form(about)
     for name, values in table.covariates.items():
-        if name not in (reading, about.system.simulator.noise.sd) and np.nanstd(values) > 0:
+        if name not in (reading, about.system.simulator.noise.sd) and varies(values):
             how = modulations.column_proportional_modulation(name, table)
             yield from modulated_form(
                 about,
@@ -259,11 +259,12 @@ def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
 
     Where values do not change, the sign of the last change holds; before a run's first change, the sign of that one.
     """
-    out = np.zeros_like(values)
+    out, still = np.zeros_like(values), rounding_error(values, axis=1)
     for rows in table.rows_by_scan():
         if len(rows) < 2:
             continue
-        signs = np.sign(np.diff(values[:, rows], axis=1))
+        changes = np.diff(values[:, rows], axis=1)
+        signs = np.where(np.abs(changes) > still, np.sign(changes), 0.0)
         number = np.where(signs != 0, np.arange(signs.shape[1]), -1)
         last = np.maximum.accumulate(number, axis=1)
         first = np.argmax(signs != 0, axis=1)
@@ -306,7 +307,7 @@ def _expected_range_of_readings(about: ReferenceFit) -> tuple[float, float]:
     predicted, readings = about.predicted, about.table.columns[about.system.simulator.reading]
     low, high = float(predicted.min()), float(predicted.max())
     there = np.isfinite(readings)
-    degree = min(_BEND_DEGREE, np.unique(predicted[there]).size - 1)
+    degree = min(_BEND_DEGREE, distinct_values(predicted[there]).size - 1)
     if not low < high or degree < 1:
         return low, high
     level, residual = 2 * (predicted - low) / (high - low) - 1, readings - predicted

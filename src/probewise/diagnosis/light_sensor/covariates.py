@@ -58,9 +58,10 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
     out: list[Covariate] = []
     for name, values in pooled.items():
         there = np.flatnonzero(np.isfinite(values))
-        if there.size and _varies(values[there]):
+        if there.size and _varies(values[there], 1.0 if name == "edge_distance" else 0.0):
             out.append(Covariate(name, values[there], there))
-    if moving.size and _varies(slope[moving]):
+    # A slope or a distance that is about 0 everywhere is rounding error: of the level over 1 mm, of 1 mm.
+    if moving.size and _varies(slope[moving], float(np.abs(level).max(initial=0.0))):
         out.append(Covariate("slope", slope[moving], moving))
     if _varies(sign[moving]):
         out.append(Covariate("direction", sign[moving], moving, groups=True))
@@ -136,5 +137,6 @@ def _edge_distance_mm(plan: Plan) -> FloatArray:
     return out
 
 
-def _varies(values: FloatArray) -> bool:
-    return values.size > 1 and float(np.ptp(values)) > 1e-9 * max(1.0, float(np.abs(values).max()))
+def _varies(values: FloatArray, size: float = 0.0) -> bool:
+    """Return whether values differ by more than 1e-9 of the largest, or of `size` if that is larger."""
+    return values.size > 1 and float(np.ptp(values)) > 1e-9 * max(size, float(np.abs(values).max()))

@@ -131,6 +131,20 @@ def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
         sensor_from_posterior(("x",), np.zeros(1), np.eye(1))
 
 
+@pytest.mark.parametrize("unit", [1e-12, 1e9])
+def test_an_earlier_sensor_becomes_the_prior_of_the_same_spread_in_any_unit(unit):
+    """Levels in amperes are as well known as in picoamperes."""
+    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
+    mean, sd = (
+        np.array([0.02, 1, 2, 0.01, 0.012, 0.001, 10, 60]),
+        np.array([1e-3, 0.05, 0.05, 3e-4, 3e-4, 1e-4, 0.1, 0.2]),
+    )
+    in_unit = np.array([1.0] * 6 + [unit] * 2)
+    one, other = (sensor_from_posterior(names, size * mean, np.diag((size * sd) ** 2)) for size in (1.0, in_unit))
+    z = np.random.default_rng(0).normal(size=(100, 7))
+    np.testing.assert_allclose(other.theta(z), in_unit * one.theta(z), rtol=1e-6)
+
+
 def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
     free = FreeFormSensor.from_one_gaussian(default_sensor(EXTENT, 1))
     rng = np.random.default_rng(0)

@@ -334,7 +334,7 @@ def audit_plan_of_diagnosis(
     plan = diagnosis.recording.plan.take(usable[:: -(-len(usable) // _MOST_READINGS)])
     names, mean = list(known.chain.names), known.theta.mean(axis=0)
     low, high = (float(mean[names.index(name)]) for name in ("I_min", "I_max"))
-    low, high = min(low, high), max(low, high, low + 1e-9)
+    low, high = _in_order(low, high)
     extent = Extent.of(diagnosis.recording)
     own = mean[None, : 6 * known.n_gaussians + 2]
     null: CalibratedSensor
@@ -352,6 +352,12 @@ def audit_plan_of_diagnosis(
     return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
 
 
+def _in_order(low: float, high: float) -> tuple[float, float]:
+    """Return two levels in rising order, apart by a little at least if they are equal."""
+    low, high = min(low, high), max(low, high)
+    return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
+
+
 def _expected_sensor_and_description(
     plan: Plan, sensor: SensorPrior | None, noise_sd: float | None
 ) -> tuple[ExpectedSensor, str]:
@@ -361,12 +367,13 @@ def _expected_sensor_and_description(
         null = sensor_from_samples(sensor)
         z = np.zeros(null.n_params)
         low, high = (float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
-        low, high = min(low, high), max(low, high, low + 1e-9)
+        low, high = _in_order(low, high)
         said = "the sensor as calibrated"
     else:
         inst = plan.instrumentation
         bottom, top = (0.0 if inst.min is None else inst.min), (100.0 if inst.max is None else inst.max)
-        low, high = (bottom + share * max(top - bottom, 1e-6) for share in _LEVELS)
+        span = top - bottom if top > bottom else 1e-6
+        low, high = (bottom + share * span for share in _LEVELS)
         null = default_sensor(Extent(low, high, plan), 2)
         z = _TYPICAL.copy()
         said = f"a typical sensor of {low:g} to {high:g}"

@@ -47,7 +47,9 @@ def sensor_from_posterior(
     down = natural_from_theta(mean - np.diag(steps))
     slope = ((up - down) / (2 * steps[:, None])).T
     natural_cov = slope @ cov @ slope.T
-    floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
+    least = np.full(len(center), 1e-8)
+    least[-2:] *= min(float(np.abs(center[-1] - center[-2])), 1.0) ** 2  # the levels, in a unit that may be large
+    floor = 1e-8 * np.maximum(np.diag(natural_cov), least)
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
     return (
         FreeFormSensor(center, factor, calibrated_height_mm=height_mm)

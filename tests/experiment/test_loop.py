@@ -211,6 +211,45 @@ def test_a_run_that_ended_is_replayed_without_asking_the_arm(small, tmp_path):
     assert all(same(a, b) for a, b in zip(first.steps, second.steps, strict=True))
 
 
+def holey(small, missing):
+    """Return an arm whose readings are missing at the poses that `missing` marks."""
+
+    class Holey(small.arm):
+        def measure(self, pose):
+            reading = super().measure(pose)
+            return replace(reading, value=math.nan) if missing(pose) else reading
+
+    return Holey()
+
+
+@pytest.mark.parametrize("changes", [{}, {"repeats": (3,), "noise_sd": 6.0}])
+def test_a_run_goes_elsewhere_after_a_missing_reading_also_when_resumed(small, tmp_path, changes):
+    """The first pose has no value, nor has any within 40 mm; the reading after it would be the best one there."""
+    first = run(small.arm(), small.experiment(**changes), rng=rng(), max_readings=1).readings[0].pose
+
+    def missing(pose):
+        return math.hypot(pose.x_mm - first.x_mm, pose.y_mm - first.y_mm) < 40.0
+
+    journal = tmp_path / "journal.jsonl"
+    whole = run(holey(small, missing), small.experiment(**changes), rng=rng(), max_readings=4, journal=journal)
+    lines = journal.read_bytes().splitlines(keepends=True)
+    assert [math.isnan(reading.value) for reading in whole.readings] == [True, False, False, False]
+    journal.write_bytes(b"".join(lines[:2]))
+    resumed = run(holey(small, missing), small.experiment(**changes), rng=rng(), max_readings=4, journal=journal)
+    assert resumed.readings[1:] == whole.readings[1:]
+
+
+def test_a_run_without_values_ends_and_goes_on_when_resumed_with_the_instrument_mended(small, tmp_path):
+    journal, experiment = tmp_path / "journal.jsonl", small.experiment(grid=COARSE)
+    lost = run(holey(small, lambda _: True), experiment, rng=rng(), journal=journal)
+    assert len(lost.steps) == 8
+    assert len({reading.pose for reading in lost.readings}) == 8
+    assert lost.stop_reason.startswith("the last 8 readings are all missing")
+    mended = run(small.arm(), experiment, rng=rng(), journal=journal, max_readings=10)
+    assert [info.stop_reason for info in mended.steps[:9]] == [None] * 9
+    assert np.isfinite([reading.value for reading in mended.readings[8:]]).all()
+
+
 @pytest.mark.slow
 def test_a_run_that_ended_at_max_readings_can_be_extended(small, found, tmp_path):
     journal = tmp_path / "journal.jsonl"

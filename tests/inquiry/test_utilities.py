@@ -137,6 +137,11 @@ def test_a_single_reading_chosen_together_is_the_best_one(made):
     assert choose_several(made.listed(APART), 1, rng=np.random.default_rng(7)) == (2,)
 
 
+def test_a_reading_chosen_is_the_best_one_that_is_likely_not_to_be_missing(made):
+    chance = np.array([1.0, 1.0, 1e-3])
+    assert choose_several(made.listed(APART), 1, rng=np.random.default_rng(7), chance=chance) == (1,)
+
+
 def test_a_flat_map_says_so(made):
     assert utility_map(made.listed([[3.0, 3.0], [3.0, 3.0]]), InformationGain()).is_flat
     assert not utility_map(made.listed(APART), InformationGain()).is_flat

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -14,6 +14,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
+from probewise.experiment.missing_readings import chance_of_value
 from probewise.inquiry import (
     Goal,
     Grid,
@@ -27,6 +28,8 @@ from probewise.inquiry import (
 )
 from probewise.inquiry.forecast import resampled_rows_and_weights
 from probewise.nested.importance import Weighted
+
+_MISSING_REACH = 0.1  # of the field's diagonal: from there on, a missing reading hardly counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,17 +124,34 @@ def predict_readings_and_utilities(
 
 
 def next_poses(
-    experiment: Experiment, utility_input: UtilityInput, utilities: UtilityMap, *, rng: np.random.Generator
+    experiment: Experiment,
+    utility_input: UtilityInput,
+    utilities: UtilityMap,
+    readings: Sequence[Reading] = (),
+    *,
+    rng: np.random.Generator,
 ) -> tuple[Pose, ...]:
     """Choose the next pose, or the experiment's `batch` of poses; each comes as often as its design repeats it.
 
     A batch is chosen for its joint information. Where the map shows another utility, as near the end of a run, only the
-    best design of the map is taken.
+    best design of the map is taken. If some of the `readings` so far are missing, the utility above the least of the
+    map counts by the chance that a reading is not missing.
     """
+    plan, grid = utility_input.plan, experiment.grid
+    chance = chance_of_value(
+        readings,
+        np.stack([plan.x_mm, plan.y_mm], axis=1),
+        reach_mm=_MISSING_REACH * math.hypot(grid.width_mm, grid.height_mm),
+    )
     if experiment.batch > 1 and utilities.label == InformationGain.label:
-        rows = choose_several(utility_input, experiment.batch, rng=rng)
+        weight = None if chance is None else chance[utility_input.rows]
+        rows = choose_several(utility_input, experiment.batch, rng=rng, chance=weight)
     else:
-        rows = (choose(utilities.values, utilities.reachable, rng=rng),)
+        values = utilities.values
+        if chance is not None:
+            least = values[utilities.reachable].min()
+            values = least + (values - least) * chance
+        rows = (choose(values, utilities.reachable, rng=rng),)
     orientation_rad = utility_input.plan.orientation_rad  # the orientation that the sensor will have there
     designs = [(experiment.designs[row], float(orientation_rad[row])) for row in rows]
     return tuple(

@@ -33,6 +33,7 @@ from probewise.experiment.journal import (
     read_journal,
     require_same_settings,
 )
+from probewise.experiment.missing_readings import MOST_MISSING, n_missing_at_end
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior, prior_posterior
 from probewise.experiment.reading_height import doubt_about_height, height_of_reading_mm
@@ -96,6 +97,7 @@ def step(
     prior_bits: float,
     rng: np.random.Generator,
     max_readings: int | None = None,
+    max_missing: int | None = MOST_MISSING,
 ) -> tuple[ExplorationState, Step]:
     """Update the posterior with one reading, and choose the next.
 
@@ -113,6 +115,8 @@ def step(
         Random generator of this step.
     max_readings
         Number of readings at which the run ends; None: no limit.
+    max_missing
+        Number of missing readings (NaN) in a row at which the run ends; None: no limit.
 
     Returns
     -------
@@ -165,7 +169,10 @@ def step(
             experiment, wary, utility_input, utilities, readings, rng=rng, known=known
         )
         asks = asks and (max_readings is None or len(readings) < max_readings)
-    if arm is None and (utilities.is_flat or (max_readings is not None and len(readings) >= max_readings)):
+    n_missing = n_missing_at_end(readings)
+    all_missing = max_missing is not None and n_missing >= max_missing
+    all_taken = max_readings is not None and len(readings) >= max_readings
+    if arm is None and (utilities.is_flat or all_missing or all_taken):
         arm = error_of_arm()
         known, off = _may_stop_and_chance_off(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
@@ -178,10 +185,12 @@ def step(
         n_readings=len(readings),
         max_readings=max_readings,
         arm_sd=arm_sd,
+        n_missing=n_missing if all_missing else 0,
     )
-    # A reading for which the run goes on, though the shape is known, is not one of those planned before.
-    planned_before = () if asks else state.planned
-    pose, *planned = planned_before or next_poses(experiment, utility_input, utilities, rng=rng)
+    # A reading for which the run goes on, though the shape is known, is not one of those planned before. Nor is one
+    # after a missing reading, since those planned may be at the same place.
+    planned_before = () if asks or n_missing else state.planned
+    pose, *planned = planned_before or next_poses(experiment, utility_input, utilities, readings, rng=rng)
     info = Step(
         number=len(readings),
         reading=reading,
@@ -387,6 +396,8 @@ def _yield_steps(
                 prior_bits=prior_bits,
                 rng=_rng_of_reading(seed, number),
                 max_readings=max_readings,
+                # A run that ended for want of values goes on when it is resumed, with the instrument mended.
+                max_missing=MOST_MISSING if entry is None else None,
             )
             if writer is not None and (entry is None or entry.summary is None):
                 writer.write_summary(_posterior_summary(info, state))

@@ -104,11 +104,13 @@ def stop_reason(
     n_readings: int,
     max_readings: int | None,
     arm_sd: FloatArray | None = None,
+    n_missing: int = 0,
 ) -> str | None:
     """Return the reason why a run ends, or None if it continues.
 
     `p_value` is that of the best hypothesis, None if it was not tested. `arm_sd` is the part of the shape's sds that
-    comes from the arm, (n_params,), which no reading lowers; `sd` is that of the readings alone.
+    comes from the arm, (n_params,), which no reading lowers; `sd` is that of the readings alone. `n_missing`: missing
+    readings in a row, if they are too many, else 0.
     """
     names = experiment.shape.prior.names
     included = "" if arm_sd is None else ", the arm's own error included"
@@ -125,6 +127,11 @@ def stop_reason(
             f"the readings know every length to better than {experiment.stop_sd_mm:g} mm, but the arm's own error "
             f"leaves {largest_sd_mm(names, arm_sd):.1f} mm, which no reading lowers: `probewise arm fit-geometry` "
             "does, with more marks or with marks met more closely"
+        )
+    if n_missing:
+        return (
+            f"the last {n_missing} readings are all missing: does the instrument still return values, and can it read "
+            f"there? The widest length is known to {widest:.1f} mm{included}; a journal can be resumed"
         )
     if utilities.is_flat:
         promise = (

@@ -16,7 +16,9 @@ _OUTCOMES = 16  # simulated outcomes of the readings chosen so far
 _FEW = 600  # hypotheses used to simulate them
 
 
-def choose_several(utility_input: UtilityInput, n: int, *, rng: np.random.Generator) -> tuple[int, ...]:
+def choose_several(
+    utility_input: UtilityInput, n: int, *, rng: np.random.Generator, chance: FloatArray | None = None
+) -> tuple[int, ...]:
     """Choose readings with large joint information, greedily one after another.
 
     Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + ..., within 1 - 1/e of the best set
@@ -31,6 +33,9 @@ def choose_several(utility_input: UtilityInput, n: int, *, rng: np.random.Genera
         Number of readings, 1 or more; else ParameterError.
     rng
         Source of randomness.
+    chance
+        Probability that a reading at each of `utility_input.rows` returns a value, (n,), by which its information
+        counts; None: all do.
 
     Returns
     -------
@@ -39,14 +44,15 @@ def choose_several(utility_input: UtilityInput, n: int, *, rng: np.random.Genera
     if n < 1:
         raise ParameterError("n", n, "1 or more")
     everywhere = np.ones(len(utility_input.rows), dtype=np.bool_)
-    chosen = [choose(utility_input.information(utility_input.weight), everywhere, rng=rng)]
+    weighing = np.ones(1) if chance is None else chance
+    chosen = [choose(utility_input.information(utility_input.weight) * weighing, everywhere, rng=rng)]
     rows, share = resampled_rows_and_weights(utility_input.weight, _FEW)
     few = replace(utility_input, theta=utility_input.theta[rows], weight=share / share.sum())
     weights = [few.weight] * _OUTCOMES
     for _ in range(n - 1):
         weights = _weights_after_simulated_reading(few, chosen[-1], weights, rng)
         gain = np.mean([few.information(weight) for weight in weights], axis=0)
-        chosen.append(choose(gain, everywhere, rng=rng))
+        chosen.append(choose(gain * weighing, everywhere, rng=rng))
     return tuple(int(utility_input.rows[row]) for row in chosen)
 
 

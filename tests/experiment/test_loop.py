@@ -28,8 +28,10 @@ from probewise.experiment import (
     run,
     step,
 )
+from probewise.experiment.stopping_rule import p_value_and_worst_reading
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, UtilityMap, prior_entropy
+from probewise.inquiry.any_settings.posterior import prior_samples
 from probewise.recordings import Disc
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 from probewise.scene.scenes import HypothesisScene
@@ -395,6 +397,29 @@ def test_readings_that_no_hypothesis_allows_are_flagged_and_never_nan(small):
 
 def test_a_fitting_run_is_not_flagged(found):
     assert all(info.p_value > 1e-6 for info in found[0].steps)
+
+
+@pytest.mark.parametrize(
+    ("reading_range", "step", "value", "fits"),
+    [
+        ((1.0, 50.0), 1.0, 50.0, True),
+        ((1.0, 50.3), 1.0, 50.0, True),
+        ((1.0, 50.0), None, 50.0, True),
+        ((1.0, 50.0), 1.0, 49.0, False),  # of 60, where 50 would have been read
+        ((-math.inf, math.inf), None, 50.0, False),
+        ((50.0, 99.0), 1.0, 50.0, False),
+        ((72.0, 99.0), 1.0, 72.0, True),
+        ((70.0, 99.0), 1.0, 99.0, False),
+    ],
+)
+def test_a_reading_at_an_end_of_the_scale_fits_what_is_predicted_beyond(small, reading_range, step, value, fits):
+    """Ten noise sds lie between the 60 that is predicted on white and a reading of 50."""
+    experiment = small.experiment(reading_range=reading_range, step=step)
+    problem = experiment.problem([Reading(value, Pose(250.0, 140.0), 0.0)])
+    posterior = prior_samples(experiment.prior, 1, rng=rng())
+    posterior = replace(posterior, theta=np.array([[250.0, 140.0, 60.0]]))
+    p_value, _ = p_value_and_worst_reading(experiment, posterior, problem)
+    assert (p_value > 0.01) == fits
 
 
 def test_a_space_that_excludes_the_reading_altogether_is_an_error(small):

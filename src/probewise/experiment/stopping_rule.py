@@ -11,6 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
 from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
+from probewise.inference.rounded import ScaleEnds
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.scene.any_of import AnyOf
@@ -76,12 +77,19 @@ def sensor_moments(experiment: Experiment, posterior: Weighted) -> dict[str, tup
 def p_value_and_worst_reading(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
     """Return the p-value of the most likely hypothesis, and the index of the reading that it predicts worst.
 
-    The p-value is the upper tail of chi-square with one degree of freedom per reading, so that it is conservative.
+    The p-value is the upper tail of chi-square with one degree of freedom per reading, so that it is conservative. A
+    reading at an end of the scale fits every prediction beyond.
     """
     recording = problem.recording
     best = posterior.theta[[int(posterior.log_likelihood.argmax())]]
     sd = np.hypot(experiment.noise_sd, (experiment.step or 0.0) / np.sqrt(12.0))
     z = (recording.readings - problem.model.predict(best, recording.plan)[0]) / sd
+    # A reading at an end of the scale stands for every value beyond.
+    ends = ScaleEnds.from_range(
+        *experiment.reading_range, experiment.step or experiment.noise_sd, whole_steps=experiment.step is not None
+    )
+    z = np.where(ends.highest_reading_mask(recording.readings), np.maximum(z, 0.0), z)
+    z = np.where(ends.lowest_reading_mask(recording.readings), np.minimum(z, 0.0), z)
     z = np.where(recording.usable, z, 0.0)
     return float(chdtrc(max(int(recording.usable.sum()), 1), float(z @ z))), int(np.argmax(np.abs(z)))
 

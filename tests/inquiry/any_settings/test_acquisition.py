@@ -7,6 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 from probewise.inquiry import Predictive, ReadingNoise
+from probewise.priors import LogUniform
 
 
 def linear(slopes, *, n=4000, seed=1, noise_sd=1.0, **law):
@@ -62,6 +63,39 @@ def test_information_is_that_of_adding_up_all_hypotheses(noise):
     assert Predictive(predicted, scale, noise).information()[0] == pytest.approx(
         mean, abs=3 * error + 0.02 * mean + 0.01
     )
+
+
+UNKNOWN = LogUniform(0.1, 10.0)
+
+
+def unknown_noise(slope, *, dof=math.inf, n=1000):
+    """Predictions slope * x of standard normal x, and sds from 0.1 to 10: (x, predicted, scale, noise)."""
+    rng = np.random.default_rng(3)
+    x, sd = rng.standard_normal(n), UNKNOWN.from_unit(rng.random(n))
+    return x, slope * x[:, None], sd[:, None], ReadingNoise(UNKNOWN, dof=dof)
+
+
+@pytest.mark.parametrize(("slope", "dof"), [(0.0, math.inf), (0.3, math.inf), (2.0, math.inf), (2.0, 4.0)])
+def test_information_with_an_unknown_sd_of_the_noise_is_that_of_adding_up_all_hypotheses(slope, dof):
+    """The information about the sd counts too; within 3 sds of the Monte Carlo and 5 %."""
+    _, predicted, scale, noise = unknown_noise(slope, dof=dof)
+    mean, error = by_adding_up(predicted[:, 0], scale[:, 0], noise, 4000, 4)
+    found = Predictive(predicted, scale, noise).information()[0]
+    assert found == pytest.approx(mean, abs=3 * error + 0.05 * mean)
+
+
+@pytest.mark.parametrize("slope", [0.3, 2.0])
+def test_the_expected_nats_above_the_goal_with_an_unknown_sd_are_those_of_adding_up(slope):
+    """The mean of ln sd of the reweighted samples, over 2,000 readings of drawn hypotheses; within 0.03 nats."""
+    x, predicted, scale, noise = unknown_noise(slope)
+    rng = np.random.default_rng(5)
+    truth = rng.integers(len(x), size=2000)
+    readings = noise.draw(predicted[truth, 0], scale[truth, 0], rng=rng)
+    weight = np.exp(noise.log_density(readings[:, None], predicted[None, :, 0], scale[None, :, 0]))
+    weight /= weight.sum(axis=1, keepdims=True)
+    variance = weight @ x**2 - (weight @ x) ** 2
+    found = Predictive(predicted, scale, noise).expected_nats_above_goal(x[:, None], np.array([1e-3]))[0]
+    assert found == pytest.approx(0.5 * np.log(variance).mean() - math.log(1e-3), abs=0.03)
 
 
 def test_the_expected_fall_of_a_gaussians_sd_is_the_closed_form():

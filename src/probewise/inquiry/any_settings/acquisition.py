@@ -1,9 +1,10 @@
 """Acquisition functions of a setting: expected information, and expected distance of the sds from a goal.
 
-At each setting the posterior samples are sorted by the reading that they predict, and divided into groups. The
-predictive density is a mixture with one component per group, whose variance is that of the noise plus that within the
-group; means over the density are sums over groups and nodes of a quadrature over the noise. Nothing is binned, so a
-hundredth of a bit is resolved as well as ten bits.
+At each setting the posterior samples are sorted by the reading that they predict, and divided into groups; if the sd of
+the noise is unknown, first by that sd, so that the noise of each group has its own scale. The predictive density is a
+mixture with one component per group, whose variance is that of the noise plus that within the group; means over the
+density are sums over groups and nodes of a quadrature over the noise. Nothing is binned, so a hundredth of a bit is
+resolved as well as ten bits.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from probewise._arrays import FloatArray
 from probewise.inquiry.any_settings.noise import ReadingNoise
 
 _N_GROUPS = 32
+_N_GROUPS_BY_SD, _N_GROUPS_EACH = 8, 5  # where the sd of the noise is unknown
 _N_OUTLIERS = 32
 _BLOCK = 2_000_000  # densities held at a time
 _LEAST_SHARE = 1e-9  # of the variance that rounding may leave
@@ -29,11 +31,15 @@ class Predictive:
     """
 
     def __init__(self, predicted: FloatArray, scale: FloatArray, noise: ReadingNoise) -> None:
-        n_groups = min(_N_GROUPS, len(predicted))
+        n_sds, each = (_N_GROUPS_BY_SD, _N_GROUPS_EACH) if noise.is_sd_inferred else (1, _N_GROUPS)
+        n_sds = min(n_sds, len(predicted))
+        n_groups = n_sds * min(each, len(predicted) // n_sds)
         n = len(predicted) // n_groups * n_groups
         self.noise = noise
         self._shape = (n_groups, n // n_groups)
-        self._order = np.argsort(predicted[:n], axis=0)
+        by_sd = np.argsort(scale[:n, 0]) if n_sds > 1 else np.arange(n)
+        by_prediction = np.argsort(predicted[by_sd].reshape(n_sds, n // n_sds, -1), axis=1)
+        self._order = np.take_along_axis(by_sd.reshape(n_sds, -1, 1), by_prediction, axis=1).reshape(n, -1)
         sorted_, scales = (np.take_along_axis(a[:n], self._order, axis=0) for a in (predicted, scale))
         grouped = self._grouped = sorted_.reshape(*self._shape, -1)
         self._centre = grouped.mean(axis=1)

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
-from scipy.special import gammaln, ndtr, stdtr, stdtrit
+from scipy.special import gammaln, ndtr, ndtri, stdtr, stdtrit
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_number
@@ -148,11 +148,13 @@ class ReadingNoise:
     @cached_property
     def nodes_and_weights(self) -> tuple[FloatArray, FloatArray]:
         """Nodes in sds, and their weights, of a quadrature over the noise without its outliers, (n_nodes,) each."""
-        if math.isinf(self.dof):
+        if math.isinf(self.dof) and not self.is_sd_inferred:
             node, weight = np.polynomial.hermite_e.hermegauss(_N_GAUSSIAN)
             return node, weight / weight.sum()
+        # A mixture of Gaussians of several sds has a narrow peak, which few nodes of one of them would miss.
         node, weight = np.polynomial.legendre.leggauss(_N_HEAVY)
-        return np.asarray(stdtrit(self.dof, (node + 1) / 2)), weight / 2
+        below = (node + 1) / 2
+        return np.asarray(ndtri(below) if math.isinf(self.dof) else stdtrit(self.dof, below)), weight / 2
 
     def outlier_nodes(self, n: int) -> FloatArray:
         """Return `n` evenly spaced outliers, (n,); empty if the noise has none."""

@@ -238,6 +238,28 @@ def test_a_file_may_say_n_a_too_and_other_words_stay_texts(tmp_path):
     assert "column lamp is text, ignored" in recording.notes
 
 
+@pytest.mark.parametrize(
+    ("name", "values", "allowed"),
+    [
+        ("led", ["on", "off", "off"], r"0 or false \(off\), 1 or true \(on\)"),
+        ("height_mm", ["14 mm"] * 3, "a number, without its unit"),
+        ("speed", ["slow", "fast", "fast"], "a number"),
+        ("session", ["mon", "tue", "tue"], "a whole number from 0"),
+    ],
+)
+def test_what_was_commanded_is_not_left_out_of_a_table_because_it_is_text(name, values, allowed):
+    table = columns_of(made()) | {name: values}
+    with pytest.raises(ParameterError, match=f"{name} is .*; allowed: {allowed}"):
+        Recording.from_table(table, patterns={"edge": EDGE}, unit="V", controls=("speed",))
+
+
+def test_the_led_of_a_table_may_be_true_or_false():
+    for values in ([True, False, False], ["True", "false", "0"]):
+        table = columns_of(made()) | {"led": values}
+        plan = Recording.from_table(table, patterns={"edge": EDGE}, unit="V").plan
+        assert plan.covariates["led"].tolist() == [1.0, 0.0, 0.0]
+
+
 def test_a_scan_with_a_name_that_no_file_can_hold_is_refused_where_it_is_made():
     """Else a calibration of hours ends in an error, when its recording's fingerprint is taken."""
     with pytest.raises(ParameterError, match=r"scan is 'b.*printable"):

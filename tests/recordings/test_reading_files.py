@@ -86,6 +86,31 @@ def test_other_numbers_are_covariates_and_other_texts_are_noted(tmp_path):
     assert recording.notes == ("column who is text, ignored", "column blank is empty, ignored")
 
 
+def test_the_led_may_be_true_or_false(tmp_path):
+    """As data frames write it."""
+    recording = read_recording(put(tmp_path, "x_mm,y_mm,reading,led\n0,0,1,True\n1,0,2,false\n2,0,2,\n3,0,2,0.5\n"))
+    np.testing.assert_array_equal(recording.plan.covariates["led"], [1.0, 0.0, np.nan, 0.5])
+    assert recording.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "fragments"),
+    [
+        ("led", ("on", "off"), ["row 2, column led: 'on'", "0 or false (off), 1 or true (on)"]),
+        ("height_mm", ("14 mm", "20 mm"), ["row 2, column height_mm: '14 mm'", "without its unit"]),
+        ("speed", ("3", "fast"), ["row 3, column speed: 'fast'", "a number"]),
+        ("session", ("mon", "tue"), ["row 2, column session: 'mon'", "a whole number from 0"]),
+    ],
+)
+def test_what_was_commanded_is_not_left_out_because_it_is_text(tmp_path, name, cells, fragments):
+    """Readings with the lamp off would count as readings with it on."""
+    csv = f"x_mm,y_mm,reading,{name}\n0,0,1,{cells[0]}\n1,0,2,{cells[1]}\n2,0,2,{cells[1]}\n"
+    with pytest.raises(FileError) as caught:
+        read_recording(put(tmp_path, csv, controls=["speed", "orientation_deg"]))
+    for fragment in fragments:
+        assert fragment in str(caught.value)
+
+
 def test_every_pattern_kind_is_read(tmp_path):
     level = {"inside": 0.25, "outside": 0.75}
     kinds = {

@@ -23,6 +23,7 @@ KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan"
 SESSION = "session"
 """Name of the column of `Plan.sessions`."""
 A_SESSION = "a whole number from 0, the same throughout a scan"
+_LED_WORDS = {"true": "1", "false": "0"}
 
 
 class TableLike(Protocol):
@@ -35,6 +36,22 @@ class TableLike(Protocol):
     def __getitem__(self, name: Any, /) -> Any:
         """Values of a column."""
         ...
+
+
+def is_commanded(name: str, controls: Sequence[str]) -> bool:
+    """Return whether a column holds what the apparatus was told: the readings mean something else without it."""
+    return name not in KNOWN and name in ("led", "height_mm", *controls)
+
+
+def led_cell(cell: str) -> str:
+    """Return a cell of the column `led` with true and false, in any case, as 1 and 0."""
+    return _LED_WORDS.get(cell.lower(), cell)
+
+
+def a_command(name: str) -> str:
+    """Return, for an error message, what is allowed in the cell of a commanded column."""
+    number = "0 or false (off), 1 or true (on)" if name == "led" else "a number, without its unit"
+    return f"{number}, or empty where it is not known; under another name, a column of text is ignored"
 
 
 def columns_by_name(table: TableLike) -> dict[str, Any]:
@@ -147,17 +164,36 @@ def selected_row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
     return np.asarray(asked, dtype=np.int64)
 
 
-def numeric_covariates_and_notes(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    """Return the numeric columns by name, without a recording's own but for `session`, and notes on the others."""
+def numeric_covariates_and_notes(
+    columns: Mapping[str, ArrayLike], controls: Sequence[str] = ()
+) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Return the numeric columns by name, without a recording's own but for `session`, and notes on the others.
+
+    Raises ParameterError if a column that was commanded, `led`, `height_mm` or one of `controls`, or a `session` that
+    differs between readings, is text.
+    """
     out, notes = {}, []
     for name, values in columns.items():
         if name in KNOWN:
             continue
+        if name == "led":
+            values = _led_words_to_numbers(values)
         try:
             out[name] = numbers_per_reading(name, texts_to_numbers(values))
-        except ParameterError:
+        except ParameterError as error:
+            if is_commanded(name, controls):
+                raise ParameterError(name, values, a_command(name)) from error
+            if name == SESSION and len({str(value) for value in np.ravel(np.asarray(values, dtype=object))}) > 1:
+                raise ParameterError(name, values, A_SESSION) from error
             notes.append(f"column {name} holds no numbers, ignored")
     return out, tuple(notes)
+
+
+def _led_words_to_numbers(values: ArrayLike) -> ArrayLike:
+    cells = np.asarray(values, dtype=object)
+    if cells.ndim != 1 or not any(isinstance(cell, str) for cell in cells):
+        return values
+    return np.array([led_cell(cell.strip()) if isinstance(cell, str) else cell for cell in cells], dtype=object)
 
 
 def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:

@@ -16,7 +16,15 @@ from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
-from probewise.recordings.columns import A_SESSION, SESSION, no_session_mask, sessions_of_scans
+from probewise.recordings.columns import (
+    A_SESSION,
+    SESSION,
+    a_command,
+    is_commanded,
+    led_cell,
+    no_session_mask,
+    sessions_of_scans,
+)
 from probewise.recordings.description import Description, description_text, read_description, shortest_degrees
 from probewise.recordings.images import image_bytes, is_file_name_without_path
 from probewise.recordings.patterns import Image, Pattern
@@ -229,7 +237,7 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     orientation_deg = (
         table.column_of_numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
     )
-    covariates = _covariate_columns(table, notes)
+    covariates = _covariate_columns(table, description.instrumentation.controls, notes)
     session = covariates.pop(SESSION, np.zeros(len(table)))
     if (wrong := no_session_mask(session, scan)).any():
         k = int(np.argmax(wrong))
@@ -305,12 +313,15 @@ def _pattern_codes_in_file(table: CSVTable, description: Description) -> IntArra
     return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
 
 
-def _covariate_columns(table: CSVTable, notes: list[str]) -> dict[str, FloatArray]:
+def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str]) -> dict[str, FloatArray]:
     """Return the numeric columns that are not the format's own but for `session`, by name; add `notes` on the rest.
 
-    A column is numeric if most of its cells hold numbers.
+    A column is numeric if most of its cells hold numbers. FileError if one that was commanded, `led`, `height_mm` or
+    one of `controls`, or a `session` that differs between rows, is not.
     """
     out: dict[str, FloatArray] = {}
+    if "led" in table.columns:
+        table = table.with_cells("led", map(led_cell, table.cells("led")))
     for name in table.columns:
         if name in _KNOWN:
             continue
@@ -321,6 +332,10 @@ def _covariate_columns(table: CSVTable, notes: list[str]) -> dict[str, FloatArra
             raise FileError(table.path, shown(name), f"{_A_NAME} for each column", row=1)
         elif not filled:
             notes.append(f"column {name} is empty, ignored")
+        elif is_commanded(name, controls):
+            out[name] = table.column_of_numbers(name, missing=True, allowed=a_command(name))
+        elif name == SESSION and len(set(filled)) > 1:
+            out[name] = table.column_of_numbers(name, missing=True, allowed=A_SESSION)
         elif 2 * count_numbers(filled) <= len(filled):
             notes.append(f"column {name} is text, ignored")
         else:

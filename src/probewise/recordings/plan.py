@@ -434,7 +434,7 @@ class Recording(ShowsItself):
         table
             Columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
             `scan`, `session`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are
-            ignored.
+            ignored, except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers.
         patterns, unit, min, max, step, sensor, height_mm, controls, source
             As in `Recording.from_arrays`.
 
@@ -464,7 +464,7 @@ class Recording(ShowsItself):
             if "orientation_rad" in columns:
                 raise ParameterError("columns", tuple(columns), "one of orientation_deg and orientation_rad")
             turn_rad = np.radians(numbers_per_reading("orientation_deg", turn_deg))
-        covariates, notes = numeric_covariates_and_notes(columns)
+        covariates, notes = numeric_covariates_and_notes(columns, controls)
         recording = cls.from_arrays(
             x_mm=columns["x_mm"],
             y_mm=columns["y_mm"],

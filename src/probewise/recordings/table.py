@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +53,10 @@ class CSVTable:
         """Return the cells of a column."""
         return self.columns[name].split(self.separator) if len(self) else []
 
+    def with_cells(self, name: str, cells: Iterable[str]) -> CSVTable:
+        """Return the table with other cells in one column."""
+        return replace(self, columns={**self.columns, name: self.separator.join(cells)})
+
     def row_number(self, k: int) -> int:
         """Return the row number of a record, the header being row 1."""
         return int(self.rows[k])
@@ -67,7 +71,9 @@ class CSVTable:
                     row=1, column=name,
                 )  # fmt: skip
 
-    def column_of_numbers(self, name: str, *, missing: bool = False, largest: float | None = LARGEST) -> FloatArray:
+    def column_of_numbers(
+        self, name: str, *, missing: bool = False, largest: float | None = LARGEST, allowed: str = ""
+    ) -> FloatArray:
         """Read a column as numbers, shape (n_rows,).
 
         Parameters
@@ -78,6 +84,8 @@ class CSVTable:
             Whether an empty cell, `nan`, `na` or `n/a` is allowed; it becomes NaN.
         largest
             Largest magnitude allowed; None: any finite number.
+        allowed
+            What is allowed, for the error; "": in words of the other arguments.
 
         Raises
         ------
@@ -91,8 +99,8 @@ class CSVTable:
             there = np.fromiter((cell not in MISSING for cell in cells), dtype=np.bool_, count=len(cells))
         values = _parsed_numbers(list(itertools.compress(cells, there)))
         if values is None or not (np.abs(values) <= most).all():
-            allowed = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
-            allowed += ", or empty, nan or n/a where it is missing" if missing else ""
+            number = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
+            allowed = allowed or number + (", or empty, nan or n/a where it is missing" if missing else "")
             k, cell = next(
                 (k, cell)
                 for k, cell in enumerate(cells)

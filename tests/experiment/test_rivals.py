@@ -556,6 +556,17 @@ def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
     assert lost.log_prob(shared, level)[0] > rounded.log_prob(shared, level)[0] + 2.0
 
 
+@pytest.mark.parametrize("read", [[10.0, 10.0, 10.0, 10.0, 10.0], [10.0, 5.0, 10.0, 10.0, 5.0]])
+def test_values_that_recur_are_rounded_where_a_step_is_only_the_width_of_a_cell(read):
+    """As `experiment_for` describes a sensor that declares no step."""
+    readings, level = np.array(read), np.full((1, 5), 9.0)
+    cells, lost = Rounded(1.0, 1.0 / 8.0, whole_steps=False), laws(LostReadingLikelihood)[0]
+    noise = DeclaredNoise.from_likelihood(cells)
+    rounded = CoarserRoundingLikelihood(noise).log_prob(readings, level)[0]
+    assert rounded > cells.log_prob(readings, level)[0] + 2.0
+    assert rounded > replace(lost, noise=noise).log_prob(readings, level)[0] + 2.0
+
+
 def test_readings_that_are_rounded_as_declared_recur_by_nature():
     law, level = CoarserRoundingLikelihood(DeclaredNoise(0.6, 1.0)), np.full((1, 6), 10.2)
     plain = Rounded(sd=0.6, step=1.0, low=1.0, high=100.0)

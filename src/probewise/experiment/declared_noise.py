@@ -19,6 +19,8 @@ from probewise.inference.rounded import ScaleEnds
 class DeclaredNoise:
     """Gaussian noise of sd `sd`, clipped to a scale and rounded to `step` within it (0: not rounded).
 
+    If not `whole_steps`, readings are not rounded, and `step` is only the width of a reading's cell.
+
     Methods return the log density of each reading, (n_samples, n_points); for rounded readings, the log probability of
     the rounding cell, and for a reading at an end of the scale, the log probability of all values beyond.
     """
@@ -26,12 +28,18 @@ class DeclaredNoise:
     sd: float
     step: float = 0.0
     ends: ScaleEnds | None = None
+    whole_steps: bool = True
+
+    @property
+    def is_rounded(self) -> bool:
+        """Whether readings are multiples of a step."""
+        return self.whole_steps and self.step > 0
 
     @classmethod
     def from_likelihood(cls, likelihood: Likelihood) -> Self | None:
         """Return the noise of a likelihood with one known sd; None for any other."""
         if isinstance(likelihood, Rounded):
-            return cls(likelihood.sd, likelihood.step, likelihood.ends)
+            return cls(likelihood.sd, likelihood.step, likelihood.ends, likelihood.whole_steps)
         if isinstance(likelihood, GaussianKnown) and np.ndim(likelihood.sd) == 0:
             return cls(float(np.asarray(likelihood.sd)))
         return None

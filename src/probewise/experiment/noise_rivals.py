@@ -189,7 +189,7 @@ class CoarserRoundingLikelihood:
     def _rounding_steps_and_n_determining(self, readings: FloatArray) -> tuple[list[float], int]:
         """Return possible rounding steps, equally weighted, and how many readings determine the step (are no test)."""
         values = np.unique(readings)
-        recur = not self.noise.step and len(values) < len(readings)
+        recur = not self.noise.is_rounded and len(values) < len(readings)
         if recur and len(values) == 1:
             return [times * self.noise.sd for times in _STEPS], 1
         if recur and len(values) == 2:

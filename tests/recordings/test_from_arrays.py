@@ -163,6 +163,7 @@ def test_two_columns_of_one_name_but_for_blanks_are_refused():
         ({"pattern": ["edge", None, "edge"]}, r"pattern\[1\] is None; allowed: a name in every row"),
         ({"pattern": ["edge", np.nan, "edge"]}, r"pattern\[1\] is nan; allowed: a name in every row"),
         ({"scan": ["a", "b", None]}, r"scan\[2\] is None; allowed: a name in every row"),
+        ({"scan": ["a", " ", "b"]}, r"scan\[1\] is ''; allowed: a name in every row, or in none"),
         ({"x_mm": [0, None, 1]}, r"x_mm\[1\] is nan; allowed: finite numbers"),
         ({"y_mm": [[0, 1, 2]]}, r"y_mm has shape \(1, 3\); allowed: \(3,\), one per reading"),
         ({"readings": 3.0}, r"readings has shape \(\); allowed: one number per place"),

@@ -63,6 +63,10 @@ def test_a_scan_name_that_returns_is_a_new_scan(tmp_path):
     assert plan.scan_names == ("a", "b", "a")
 
 
+def test_a_column_without_any_name_of_a_scan_is_one_scan(tmp_path):
+    assert read_plan(put(tmp_path, "x_mm,y_mm,scan\n0,0,\n1,0,\n")).scan.tolist() == [0, 0]
+
+
 def test_a_session_is_a_number_of_each_scan_and_one_session_is_none(tmp_path):
     csv = "x_mm,y_mm,reading,scan,session\n0,0,1,a,0\n1,0,1,a,0\n0,0,1,b,{0}\n1,0,1,c,{0}\n"
     assert read_plan(put(tmp_path, csv.format(3))).sessions == (0, 3, 3)
@@ -165,6 +169,7 @@ BAD_TABLES = {
     "NaN time": ("time_s," + HEAD + ",0,0,1\n", ["row 2", "column time_s"]),
     "text in a covariate": ("t_c," + HEAD + "1,0,0,1\n2,0,0,1\nx,0,0,1\n", ["row 4", "column t_c", "'x'"]),
     "infinite covariate": ("t_c," + HEAD + "1,0,0,1\n1e400,0,0,1\n", ["row 3", "column t_c"]),
+    "no scan": ("scan," + HEAD + "a,0,0,1\n,0,0,1\nb,0,0,1\n", ["row 3", "column scan", "the cell is empty", "in none"]),
     "unprintable scan": ("scan," + HEAD + "a,0,0,1\nb\0,0,0,1\n", ["row 3", "column scan", "b\\x00", "printable"]),
     "unprintable column": ("t\x07," + HEAD + "1,0,0,1\n", ["row 1", "t\\x07", "printable"]),
     "duplicate header": ("x_mm,y_mm,reading,x_mm\n0,0,1,2\n", ["row 1", "column x_mm", "twice"]),

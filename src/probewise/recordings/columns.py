@@ -23,6 +23,7 @@ KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan"
 SESSION = "session"
 """Name of the column of `Plan.sessions`."""
 A_SESSION = "a whole number from 0, the same throughout a scan"
+A_SCAN = "a name in every row, or in none; leave out rows without a scan"
 _LED_WORDS = {"true": "1", "false": "0"}
 
 
@@ -202,10 +203,19 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
     Returns
     -------
     The number of each reading's scan, (n_points,), and the scans' names.
+
+    Raises
+    ------
+    ShapeError
+        If there is neither a single name nor one per reading.
+    ParameterError
+        If a name is missing, or empty where others are not.
     """
     if names is None or isinstance(names, str):
         return np.zeros(n_points, dtype=np.int64), (_checked_name("scan", names or "scan"),)
     cells = _names_per_reading("scan", names, n_points)
+    if "" in cells and any(cells):
+        raise ParameterError(f"scan[{cells.index('')}]", "", A_SCAN)
     starts = [k for k in range(n_points) if k == 0 or cells[k] != cells[k - 1]]
     begins = np.zeros(n_points, dtype=np.int64)
     begins[starts[1:]] = 1

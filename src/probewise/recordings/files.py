@@ -17,6 +17,7 @@ from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
 from probewise.recordings.columns import (
+    A_SCAN,
     A_SESSION,
     SESSION,
     a_command,
@@ -281,10 +282,15 @@ def _readings_column(table: CSVTable, description: Description) -> FloatArray:
 
 
 def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
-    """Return each row's scan number and the scans' names; every change of name begins a new scan."""
+    """Return each row's scan number and the scans' names; every change of name begins a new scan.
+
+    FileError if the name is missing in some rows.
+    """
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)
     cells = table.cells("scan")
+    if "" in cells and any(cells):
+        raise FileError(table.path, "the cell is empty", A_SCAN, row=table.row_number(cells.index("")), column="scan")
     changes = np.fromiter(map(operator.ne, cells[1:], cells), dtype=np.int64, count=len(cells) - 1)
     scan = np.concatenate([[0], np.cumsum(changes)])
     return scan, tuple(cells[k] for k in (0, *(np.flatnonzero(changes) + 1)))

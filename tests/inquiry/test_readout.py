@@ -8,6 +8,7 @@ from scipy.stats import norm
 
 from probewise.errors import ParameterError
 from probewise.inquiry import Readout, entropy_bits
+from probewise.inquiry.given_reading import WeightsGivenReading
 
 
 def test_the_cells_of_a_rounding_sensor_are_its_readings():
@@ -33,6 +34,22 @@ def test_fine_cells_give_the_gaussians_entropy():
     """The entropy of cells of width w is the differential entropy less log2 w; Sheppard: 0.015 bits more."""
     bits = entropy_bits(Readout(2.0, 1.0).cell_probability(np.array([20.0])))[0]
     assert bits == pytest.approx(0.5 * math.log2(2 * math.pi * math.e * 2.0**2), abs=0.02)
+
+
+@pytest.mark.parametrize("sd", [0.1, 0.29, 0.4])
+@pytest.mark.parametrize("black", [10.0, 10.5])
+def test_the_information_of_a_reading_counts_the_noise_at_each_level(sd, black):
+    """Rounded, a level between two steps is noisier than one on a step; by the cells of every hypothesis apart."""
+    rng = np.random.default_rng(0)
+    weight = np.full(800, 1 / 800)
+    grey, few_white = rng.uniform(30.0, 33.0, 800), rng.choice([black, 59.5], 800, p=[0.95, 0.05])
+    answers = np.stack([np.full(800, black), few_white, grey, np.full(800, 59.5)], axis=1)
+    readout = Readout(sd, 1.0, 1.0, 100.0)
+    found = WeightsGivenReading(answers, weight, readout).information_bits
+    for column, bits in zip(answers.T, found, strict=True):
+        chance = readout.cell_probability(column)
+        exact = entropy_bits(weight @ chance) - weight @ entropy_bits(chance)
+        assert bits == pytest.approx(exact, abs=0.02)
 
 
 def test_what_is_certain_has_no_entropy():

@@ -169,7 +169,7 @@ BAD_TABLES = {
     "NaN time": ("time_s," + HEAD + ",0,0,1\n", ["row 2", "column time_s"]),
     "text in a covariate": ("t_c," + HEAD + "1,0,0,1\n2,0,0,1\nx,0,0,1\n", ["row 4", "column t_c", "'x'"]),
     "infinite covariate": ("t_c," + HEAD + "1,0,0,1\n1e400,0,0,1\n", ["row 3", "column t_c"]),
-    "no scan": ("scan," + HEAD + "a,0,0,1\n,0,0,1\nb,0,0,1\n", ["row 3", "column scan", "the cell is empty", "in none"]),
+    "no scan": ("scan," + HEAD + "a,0,0,1\n,0,0,1\nb,0,0,1\n", ["row 3, column scan: the cell is empty", "in none"]),
     "unprintable scan": ("scan," + HEAD + "a,0,0,1\nb\0,0,0,1\n", ["row 3", "column scan", "b\\x00", "printable"]),
     "unprintable column": ("t\x07," + HEAD + "1,0,0,1\n", ["row 1", "t\\x07", "printable"]),
     "duplicate header": ("x_mm,y_mm,reading,x_mm\n0,0,1,2\n", ["row 1", "column x_mm", "twice"]),

@@ -29,7 +29,7 @@ from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.stopping_rule import OFF_SDS
-from probewise.inquiry import UtilityInput, UtilityMap, entropy_bits
+from probewise.inquiry import UtilityInput, UtilityMap
 from probewise.inquiry.given_reading import WeightsGivenReading
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
@@ -229,13 +229,10 @@ def _expected_bits(
     weight: FloatArray, answers: FloatArray, n_repeats: IntArray, utility_input: UtilityInput
 ) -> FloatArray:
     """Return the expected information, (n_designs,), in bits, by predictions, (n, n_designs), and weights, (n,)."""
-    out, readout = np.empty(answers.shape[1]), utility_input.readout
+    out = np.empty(answers.shape[1])
     for n, own in _designs_by_repeats(n_repeats):
-        given = WeightsGivenReading(answers[:, own], weight, readout, repeats=n)
-        middle = np.array([0.5 * float(answers[:, own].min() + answers[:, own].max())])
-        of_noise = float(entropy_bits(readout.cell_probability(middle, repeats=n, fine=1.0))[0])
-        out[own] = entropy_bits(given.weight_by_cell) - of_noise
-    return np.maximum(out, 0.0)
+        out[own] = WeightsGivenReading(answers[:, own], weight, utility_input.readout, repeats=n).information_bits
+    return out
 
 
 def _probability_of_meeting_rule(

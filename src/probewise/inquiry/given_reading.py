@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.inquiry.forecast import MOST_LEVELS, evenly_spaced_levels, nearest_level_index, weight_by_level
-from probewise.inquiry.readout import Readout
+from probewise.inquiry.readout import Readout, entropy_bits
 
 _PER_SD = 2.0  # levels of the predicted reading per noise sd
 _LEAST = 1e-12
@@ -47,7 +47,18 @@ class WeightsGivenReading:
     @cached_property
     def weight_by_cell(self) -> FloatArray:
         """Total weight in each cell, (n_designs, n_cells); never 0."""
-        return np.maximum(self.weighted_sum_by_cell(np.ones(len(self._weight))), _LEAST)
+        return np.maximum(self._weight_by_level @ self._chance, _LEAST)
+
+    @cached_property
+    def information_bits(self) -> FloatArray:
+        """Expected information about the hypotheses, whose weights sum to one, in bits, (n_designs,)."""
+        of_noise = self._weight_by_level @ entropy_bits(self._chance)
+        return np.asarray(np.maximum(entropy_bits(self.weight_by_cell) - of_noise, 0.0))
+
+    @cached_property
+    def _weight_by_level(self) -> FloatArray:
+        """Total weight of the hypotheses at each level, (n_designs, n_levels)."""
+        return weight_by_level(self._index, self._weight, len(self._chance))
 
     def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:
         """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""

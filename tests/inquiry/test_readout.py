@@ -1,5 +1,6 @@
 """Noise, rounding and the ends of the scale."""
 
+import itertools
 import math
 
 import numpy as np
@@ -50,6 +51,24 @@ def test_the_information_of_a_reading_counts_the_noise_at_each_level(sd, black):
         chance = readout.cell_probability(column)
         exact = entropy_bits(weight @ chance) - weight @ entropy_bits(chance)
         assert bits == pytest.approx(exact, abs=0.02)
+
+
+@pytest.mark.parametrize(("noise_sd", "repeats"), [(0.1, 4), (0.29, 3), (0.7, 4)])
+def test_repeats_of_rounded_readings_are_those_of_all_outcomes(noise_sd, repeats):
+    """Each reading is rounded by itself, and clipped at 13: every sum of readings, by adding up all outcomes."""
+    levels, readings = np.array([10.0, 10.5, 11.3, 13.2]), np.arange(4, 14)
+    readout = Readout(noise_sd, 1.0, 4.0, 13.0)
+    upper = np.append(readings[:-1] + 0.5, np.inf)
+    one = np.diff(norm.cdf(upper, levels[:, None], noise_sd), axis=1, prepend=0.0)
+    expected = np.zeros((4, repeats * 13 + 1))
+    for outcome in itertools.product(range(10), repeat=repeats):
+        expected[:, readings[list(outcome)].sum()] += one[:, outcome].prod(axis=1)
+    found = readout.cell_probability(levels, repeats=repeats)
+    np.testing.assert_allclose(found.sum(axis=1), 1.0)
+    np.testing.assert_allclose(found, expected[:, -found.shape[1] :], atol=1e-5)
+    merged = readout.cell_probability(levels, repeats=repeats, most=5)
+    assert merged.shape[1] <= 5
+    np.testing.assert_allclose(merged.sum(axis=1), 1.0)
 
 
 def test_what_is_certain_has_no_entropy():

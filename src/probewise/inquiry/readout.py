@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
@@ -13,6 +14,8 @@ from probewise.errors import ParameterError
 
 _REACH = 5.0  # noise sds beyond the levels that the cells cover
 _FINE = 0.25  # width of a cell in noise sds, for unrounded readings: loses 0.3 % of a nat
+_WIDE = 2.0  # steps: of wider noise, a mean hardly depends on the rounding of each reading
+_MOST_SUMS = 3000  # values of a sum of readings
 _LEAST = np.float32(1e-30)
 
 
@@ -78,8 +81,14 @@ class Readout:
     ) -> FloatArray:
         """Return the probability of each cell given each level, (n_levels,) -> (n_levels, n_cells); see `cell_edges`.
 
-        For `repeats` readings it is that of their mean, with cells scaled to the mean's smaller noise.
+        For `repeats` readings it is that of their sum, each rounded by itself. If the noise is wider than two steps,
+        where rounding hardly matters, or a sum has too many values, it is that of their mean, with cells scaled to the
+        mean's smaller noise.
         """
+        if repeats > 1 and self.step is not None and self.noise_sd < _WIDE * self.step:
+            n_sums = repeats * len(self.cell_edges(levels)) + 1
+            if n_sums <= _MOST_SUMS:
+                return _merged(_probability_of_sum(self.cell_probability(levels), repeats), most)
         sd = self.noise_sd / math.sqrt(repeats)
         each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)
         below = ndtr((each.cell_edges(levels, fine=fine, most=most) - levels[:, None]) / sd)
@@ -87,6 +96,22 @@ class Readout:
         return np.diff(np.concatenate([ends[0], below, ends[1]], axis=1), axis=1)
 
     edges, probability = cell_edges, cell_probability  # their old names
+
+
+def _probability_of_sum(probability: FloatArray, n: int) -> FloatArray:
+    """Return the probability of the sum of `n` numbers, drawn alike: (n_levels, n_cells) -> (n_levels, n_sums)."""
+    n_sums = n * (probability.shape[1] - 1) + 1
+    size = next_fast_len(n_sums, real=True)
+    spectrum = rfft(probability, size, axis=1)
+    return np.maximum(irfft(spectrum**n, size, axis=1)[:, :n_sums], 0.0)
+
+
+def _merged(probability: FloatArray, most: int | None) -> FloatArray:
+    """Merge neighbouring cells to at most `most`, (n_levels, n_cells); None: all as they are."""
+    n_cells = probability.shape[1]
+    if most is None or n_cells <= most:
+        return probability
+    return np.asarray(np.add.reduceat(probability, np.arange(0, n_cells, math.ceil(n_cells / most)), axis=1))
 
 
 def entropy_bits(probability: FloatArray) -> FloatArray:

@@ -188,7 +188,8 @@ BAD_TABLES = {
     "negative session": ("session," + HEAD + "-1,0,0,1\n", ["row 2", "column session", "from 0"]),
     "missing session": ("session," + HEAD + "1,0,0,1\n1,0,0,1\n,0,0,1\n", ["row 4", "column session"]),
     "unknown pattern": ("pattern," + HEAD + "white,0,0,1\nred,0,0,1\n", ["row 3", "column pattern", "'red'", "white"]),
-    "semicolons": ("x_mm;y_mm;reading\n0;0;1\n", ["row 1", "column x_mm", "comma-separated"]),
+    "semicolons": ("x_mm;y_mm;reading\n0,5;0;1\n", ["row 1", "separated by semicolons", "commas", "1.5, not 1,5"]),
+    "tabs": ("x_mm\ty_mm\treading\n0\t0\t1\n", ["row 1", "separated by tabs", "commas"]),
 }  # fmt: skip
 
 

@@ -30,6 +30,7 @@ MISSING = frozenset(itertools.chain([""], *_SPELT))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 # On texts of these characters float() accepts exactly what _NUMBER does ('infinity' and '1_000' have others).
 _OF_NUMBERS = re.compile(r"[-+.0-9eE]*", re.ASCII)
+_OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
 
 
@@ -156,6 +157,7 @@ def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
         kept = np.delete(np.arange(len(records)), blank)
         if header is None and len(kept):
             header = [cell.strip() for cell in records[kept[0]]]
+            _require_commas(path, header, n_read + int(kept[0]) + 1)
             _require_distinct_columns(path, header, n_read + int(kept[0]) + 1)
             columns = [[] for _ in header]
             kept = kept[1:]
@@ -193,6 +195,17 @@ def _read_in_chunks(text: str) -> Iterator[tuple[list[list[str]], csv.Error | No
         if not records and failed is None:
             return
         yield records, failed
+
+
+def _require_commas(path: Path, header: Sequence[str], row: int) -> None:
+    """Raise FileError if a header of one cell has another separator, as spreadsheets of many countries write."""
+    other = next((name for mark, name in _OTHER_SEPARATORS.items() if mark in header[0]), None)
+    if len(header) == 1 and other is not None:
+        allowed = (
+            "cells separated by commas, numbers with a decimal point (1.5, not 1,5): in a spreadsheet, save as CSV "
+            "with these"
+        )
+        raise FileError(path, f"the header is separated by {other}", allowed, row=row)
 
 
 def _require_distinct_columns(path: Path, header: Sequence[str], row: int) -> None:

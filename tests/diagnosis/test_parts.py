@@ -299,7 +299,7 @@ def test_a_bank_weighs_as_blocks_do():
     residuals -= basis @ (basis.T @ residuals)
     problem = Linearised(basis, residuals[:, 0], law, 1.3, n)
     blocks = OrthonormalBlocks.of(problem, templates)
-    wanted = block_log_bayes_factors(blocks, residuals, n)
+    wanted = block_log_bayes_factors(blocks, residuals, problem.n_kept)
     np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4, n).log_bayes_factors(problem, residuals), wanted)
 
 

@@ -101,4 +101,4 @@ def _rival_with_undetected_effect(searched: Searched, null: WeighedFit, name: st
 def _covariance_root_of_fit(candidate: WeighedFit) -> FloatArray:
     """Return a square root of the covariance of a fit's coordinates under white noise, (n_params, n_params)."""
     slopes, sd = candidate.found.slopes, candidate.whitened_sd
-    return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd))
+    return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd, len(slopes)))

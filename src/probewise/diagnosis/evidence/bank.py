@@ -81,7 +81,7 @@ class TemplateBank:
         Log Bayes factors, (n_templates, n_draws).
         """
         own = problem.residual[:, None] if residuals is None else residuals
-        n = problem.n_points
+        n, n_kept = problem.n_points, problem.n_kept
         whitened = self._whitened_under(problem.law)
         taken = problem.basis[:n].T @ whitened.templates  # the part that the fit absorbs, (n_params, n_columns)
         along = whitened.templates.T @ own[:n]
@@ -92,10 +92,10 @@ class TemplateBank:
             absorbed = taken[:, at].transpose(1, 0, 2)
             left = products - absorbed.transpose(0, 2, 1) @ absorbed
             gain, axes = _gram_eigensystems(left)
-            gain = np.where(gain > _ABSENT * n, gain, 0.0)
+            gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
             turned = axes.transpose(0, 2, 1) @ along[at]
             explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
-            out[members] = average_over_amplitude_scales(explained, gain, n)
+            out[members] = average_over_amplitude_scales(explained, gain, n_kept)
         return out
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
@@ -122,7 +122,7 @@ class TemplateBank:
             whitened = law(self.columns)
             norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
             per_column = np.repeat(self.widths, self.widths)
-            whitened *= np.sqrt(len(whitened) / per_column) / np.where(norms > 0, norms, 1.0)
+            whitened *= np.sqrt(law.n_kept / per_column) / np.where(norms > 0, norms, 1.0)
             products = {}
             for width in map(int, np.unique(self.widths)):
                 blocks = whitened[:, self._template_and_column_indices(width)[1]].transpose(1, 0, 2)

@@ -198,8 +198,8 @@ class Linearised:
         turned, sigma = law(slopes), law.likeliest_sigma(whitened)
         known = bool(law.flat) or (law.least > 0 and float(sigma[0]) <= law.sigma_floor)
         sigma = np.where(sigma > 0, sigma, found.sd)
-        free = residual_degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.fisher_information))
-        sigma = sigma if known else sigma * math.sqrt(n_points / free)
+        free = residual_degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.fisher_information), law.n_kept)
+        sigma = sigma if known else sigma * math.sqrt(law.n_kept / free)
         sd = float(sigma[0]) / math.sqrt(law.fisher_information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
         augmented = np.concatenate([law.bounded_pseudo_residuals(whitened, sigma)[:, 0] / sd, -z])
@@ -214,6 +214,11 @@ class Linearised:
     def n_rows(self) -> int:
         """Number of rows."""
         return len(self.basis)
+
+    @property
+    def n_kept(self) -> int:
+        """Number of readings that are not lost; rows of lost ones are 0 and carry no information."""
+        return self.law.n_kept
 
     def project(self, columns: FloatArray) -> FloatArray:
         """Whiten columns of readings (n_points, k) and project the fit's parameters out: (n_rows, k)."""
@@ -251,7 +256,7 @@ class OrthonormalBlocks:
     """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, one for each template.
 
     Rows are those of `Linearised`. `gain` (n_columns,): squared lengths before normalisation, of templates scaled to
-    unit rms; their sum in a block is n_points if the fit absorbs nothing. `starts` (n_blocks,): first columns.
+    unit rms; their sum in a block is n_kept if the fit absorbs nothing. `starts` (n_blocks,): first columns.
     """
 
     u: FloatArray
@@ -280,7 +285,7 @@ def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> F
     whitened = problem.law(np.concatenate(templates, axis=1))
     per_column = np.repeat(widths, widths)
     norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-    whitened *= np.sqrt(problem.n_points / per_column) / np.where(norms > 0, norms, 1.0)
+    whitened *= np.sqrt(problem.n_kept / per_column) / np.where(norms > 0, norms, 1.0)
     return problem.project_whitened(whitened)
 
 
@@ -300,7 +305,7 @@ def orthonormalise_groups(
     return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
 
 
-def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_points: int) -> FloatArray:
+def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_kept: int) -> FloatArray:
     """Return the log Bayes factor of each block against the null, with amplitude and noise sd integrated out.
 
     The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
@@ -312,8 +317,8 @@ def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_
         The templates.
     residuals
         Projected residuals, shape (n_rows, n_draws).
-    n_points
-        Number of readings.
+    n_kept
+        Number of readings that are not lost.
 
     Returns
     -------
@@ -326,11 +331,11 @@ def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_
     for width in np.unique(widths):  # all blocks of one width at a time
         members = np.flatnonzero(widths == width)
         columns = blocks.starts[members, None] + np.arange(width)
-        out[members] = average_over_amplitude_scales(scores[columns], blocks.gain[columns], n_points)
+        out[members] = average_over_amplitude_scales(scores[columns], blocks.gain[columns], n_kept)
     return out
 
 
-def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatArray:
+def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_kept: int) -> FloatArray:
     """Average the Bayes factors of templates of one width over the `SCALES` at which each is detectable.
 
     At smaller scales the projected template has an rms lambda below `LEAST_VISIBLE`: the Bayes factor is near one
@@ -342,8 +347,8 @@ def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_poi
         Share of the residual's sum of squares along each axis, (n_templates, width, n_draws).
     gain
         Squared length of the projection along each axis, (n_templates, width).
-    n_points
-        Number of readings.
+    n_kept
+        Number of readings that are not lost.
 
     Returns
     -------
@@ -355,7 +360,7 @@ def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_poi
         ratio = scale**2 * gain
         of_all = np.einsum("bwd,bw->bd", explained, ratio / (1 + ratio))
         np.log1p(-np.minimum(of_all, 1 - 1e-12), out=terms[k])
-        terms[k] *= -0.5 * n_points
+        terms[k] *= -0.5 * n_kept
         terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
     terms[~visible] = _INVISIBLE
     top = terms.max(axis=0)

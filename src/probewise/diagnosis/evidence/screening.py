@@ -58,7 +58,7 @@ def log_bayes_factors_of_pairs(
     asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
     both = [_joined_templates(own[first], own[second]) for first, second in asked]
     blocks = OrthonormalBlocks.of_projected_templates(np.concatenate(both, axis=1), [c.shape[1] for c in both])
-    together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_points)[:, 0]
+    together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_kept)[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
     out: dict[Names, float] = {}
     at = 0

@@ -314,7 +314,7 @@ def _steps_along_valley(curvature: FloatArray, downhill: FloatArray) -> FloatArr
     return np.asarray((slope / (along + valley * _VALLEY_DAMPINGS[:, None])) @ axes.T)
 
 
-def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
+def residual_degrees_of_freedom(slopes: FloatArray, sd: float, n_kept: int) -> float:
     """Return the residual degrees of freedom: n minus the number of parameters that readings, not priors, determine.
 
     Parameters
@@ -323,9 +323,11 @@ def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
         Slopes of the whitened readings by the coordinates, (n_points, n_params).
     sd
         Noise of a whitened reading.
+    n_kept
+        Number of readings that are not lost; the slopes of the others are 0.
     """
     squares = np.linalg.svd(slopes / max(sd, 1e-150), compute_uv=False) ** 2
-    return max(len(slopes) - float(np.sum(squares / (1 + squares))), 1.0)
+    return max(n_kept - float(np.sum(squares / (1 + squares))), 1.0)
 
 
 def starts_of_one_gaussian(sensor: GaussianMixtureSensor) -> FloatArray:

@@ -173,8 +173,8 @@ def significant_places(
         Residuals under the null, (n_rows, n_draws).
     """
     out: list[Place] = []
-    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_points)
-    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_points) or 1.0
+    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_kept)
+    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_kept) or 1.0
     for covariate in covariates:
         columns, ends = window_columns_and_bounds(covariate, problem.n_points)
         if not ends:

@@ -186,7 +186,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
         return float(np.linalg.norm(cast(NoiseEffect, effect).change_of_readings(everywhere))) / found.sd
     if name in searched.certain:
         step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of_effect(name)]
-        return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
+        return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(law.n_kept)
     if name in prepared.noise_effect_names:
         # For noise effects: the size of an effect on the mean with equal evidence.
         without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]

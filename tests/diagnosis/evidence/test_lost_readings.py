@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.held_out import held_out_gain
 from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks, block_log_bayes_factors
-from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.noise.law import NoiseLaw, white_noise
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import significant_places
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.systems import Simulator, table_for
 
 N = 60
 TIME = np.arange(float(N))
@@ -62,3 +65,25 @@ def test_lost_readings_change_neither_the_noise_sd_nor_the_significance_of_a_win
     )
     assert (place.start, place.end) == (again.start, again.end)
     assert place.z == pytest.approx(again.z)
+
+
+def test_lost_readings_change_no_density_of_held_out_readings():
+    """A line predicts more than a constant, and as much more where lost readings are missing in the table instead."""
+    x = np.sin(0.7 * TIME)
+    y = 1.0 + 0.1 * x + 0.1 * np.random.default_rng(5).standard_normal(N)
+    simulators = (
+        Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 0 * u["x"]),
+        Simulator("y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"]),
+    )
+    gains = []
+    for readings, law in ((np.where(LOST, -20.0, y), LAW), (np.where(LOST, np.nan, y), WITHOUT)):
+        fits = []
+        for simulator in simulators:
+            prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": readings}), with_effects=False)
+            model = Model(prepared.null, (), prepared.recording.plan)
+            fits.append(fit(model, prepared.recording, np.zeros(model.n_params), law))
+        parts = (TIME[prepared.recording.usable] // 20).astype(int), ("1", "2", "3")
+        gain = held_out_gain(*fits, prepared.recording, law, parts, law_of_null=law)
+        gains.append(gain.per_reading * gain.n_readings)
+    assert gains[1] > 1
+    assert gains[0] == pytest.approx(gains[1], rel=1e-3)

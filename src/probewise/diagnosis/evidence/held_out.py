@@ -133,7 +133,7 @@ def _refit_log_densities(
     # readings may bound them on one side only, as for a ceiling.
     about = np.where(of_its_own, found.z, without.z)
     predicted, slopes = (part[recording.usable] for part in found.model.predict_and_differentiate(about))
-    free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information), len(turned))
+    free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information), rest.n_kept)
     sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
     curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
     miss = recording.readings[recording.usable] - predicted

@@ -21,7 +21,9 @@ from probewise.effects import NamedEffect, scan_indicator
 from probewise.sensor import Stage
 
 _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
-_ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none
+_ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none if it is insignificant,
+_LAST_DIGITS = 1e-12  # or, whatever the noise, no larger than rounding of predictions that are smooth to this share
+_INSIGNIFICANT = 0.01  # noise sds; readings by the epoch vary by less than `_ROUNDING`
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 
 
@@ -141,7 +143,9 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
         change[rows, inside] = read - before[inside]
     columns = change[:, usable].T
     columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + np.abs(before).max()))] = 0.0  # NaN too
-    columns[:, np.abs(columns).max(axis=0) < _ROUNDING * np.abs(before).max()] = 0.0
+    largest = np.abs(before).max()
+    none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
+    columns[:, np.abs(columns).max(axis=0) < none] = 0.0
     return np.split(columns, len(bank), axis=1)
 
 

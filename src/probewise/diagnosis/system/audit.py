@@ -101,7 +101,7 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
     never = np.ones(len(table), dtype=np.bool_)
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
-        if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-9 * max(float(np.abs(predicted).max()), 1e-300):
+        if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-12 * max(float(np.abs(predicted).max()), 1e-300):
             at = (
                 "the middle of the prior"
                 if k == 0

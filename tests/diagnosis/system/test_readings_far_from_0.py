@@ -7,7 +7,9 @@ from probewise.diagnosis import audit_system, diagnose_system
 from probewise.diagnosis.evidence.templates import templates_of_effect
 from probewise.diagnosis.fitting.fit import Model, fit
 from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.effects import Dropouts, Extent
 from probewise.systems import Simulator, table_for
 
 EPOCH = 1.7e9
@@ -51,3 +53,14 @@ def test_a_plan_of_readings_by_the_epoch_is_audited():
         "y", "s", {"a": (100 * EPOCH - 5, 100 * EPOCH + 5)}, simulate=lambda p, u: p["a"] + 40 * u["x"], time="t"
     )
     assert audit_system(simulator, {"t": np.arange(float(N)), "x": X}).effects
+
+
+def test_readings_lost_to_one_value_are_no_other_ones_near_it():
+    """Two rows read one value, one row is an outlier 0.7 away; all three are far from what is predicted."""
+    recording = prepare_system(clock(EPOCH), table_for(clock(EPOCH), table(EPOCH))).recording
+    readings = recording.readings.copy()
+    readings[[5, 20]], readings[30] = EPOCH - 6.0, EPOCH - 5.3
+    recording = recording.with_readings(readings)
+    lost = Dropouts.for_extent(Extent.of(recording))
+    nodes = NoiseModel((lost,), recording).nodes_for_predictions(EPOCH + 1.0 + 2.0 * X)
+    assert {tuple(np.flatnonzero(law.lost)) for law in nodes.laws} == {(5, 20)}

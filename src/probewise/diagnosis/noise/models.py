@@ -140,7 +140,7 @@ class NoiseModel:
         value = value_at_node(noise.lost_value)
         lost = np.zeros_like(far)
         if lost_share > 0:
-            lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * (self._span + abs(value)))
+            lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * self._span + 1e-14 * abs(value))
         carry = np.where(
             self._n_rows_since_previous_in_scan > 0,
             value_at_node(noise.rho) ** np.maximum(self._n_rows_since_previous_in_scan, 1),

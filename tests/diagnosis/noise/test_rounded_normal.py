@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from probewise.diagnosis import diagnose
+from probewise.diagnosis import diagnose, diagnose_system
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.noise.law import NoiseLaw, stacked_density
 from probewise.diagnosis.noise.models import NoiseModel, least_sd_given_rounding, rough_sd
@@ -22,6 +22,7 @@ from probewise.diagnosis.search.search import search
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import Stage
+from probewise.systems import Noise, Simulator
 from probewise.world import concealed as hidden
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -61,6 +62,47 @@ def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
     wanted = -np.log(cell[told, 0] / STEP) - 0.5 * np.log(2 * np.pi)
     np.testing.assert_allclose(misfit[told], wanted, rtol=1e-6, atol=1e-9)
     assert np.isfinite(misfit).all()
+
+
+def log_cells(residuals: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Return the log probability of each reading's cell over the step, from the tail in which it is exact."""
+    near = -np.abs(residuals)
+    cell = norm.cdf((near + STEP / 2) / sd) - norm.cdf((near - STEP / 2) / sd)
+    return np.log(np.maximum(cell, 1e-300) / STEP)
+
+
+SDS = np.tile([0.1, 1.0, 3.0], 20)
+
+
+@pytest.fixture
+def law_of_own_sds() -> NoiseLaw:
+    """Return rounded noise of readings with sds of their own, of which every tenth is lost."""
+    return NoiseLaw(SDS, np.zeros(60), np.arange(60) % 10 == 4, flat=0.5 * STEP / SIGMA, sigma=SIGMA)
+
+
+def test_a_reading_of_its_own_sd_has_the_probability_of_its_cell(law_of_own_sds):
+    law = law_of_own_sds
+    residuals = np.linspace(-1.0, 1.0, 60) * (STEP / 2 + 2 * SIGMA * SDS)
+    whitened = law(residuals)[:, None]
+    found = -law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0] - law.half_log_det()
+    wanted = log_cells(residuals, SIGMA * SDS)[~law.lost].sum()
+    assert found - 0.5 * law.n_kept * np.log(2 * np.pi) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_whitened_readings_of_their_own_sds_are_equally_informative(law_of_own_sds):
+    """Each tells of the mean as its own law does, and is drawn as such."""
+    law, rng = law_of_own_sds, np.random.default_rng(1)
+    kept, n_draws = ~law.lost, 40_000
+    drawn = law.draw_pseudo_residuals(n_draws, rng=rng)
+    noise = SIGMA * SDS[:, None] * rng.standard_normal((60, n_draws)) + STEP / 2 * rng.uniform(-1, 1, (60, n_draws))
+    pseudo = law.normal_pseudo_residuals(law(noise), np.array([SIGMA])) * np.sqrt(law.fisher_information) / SIGMA
+    # The scores of a narrow reading are rare and large, so that few draws carry their variance.
+    np.testing.assert_allclose(pseudo.std(axis=1)[kept], 1.0, rtol=0.06)
+    bounded = law.bounded_pseudo_residuals(law(noise), np.array([SIGMA])) * np.sqrt(law.fisher_information) / SIGMA
+    np.testing.assert_allclose(drawn.std(axis=1), bounded.std(axis=1), rtol=0.06)
+    own = [float(RoundedNormal(0.5 * STEP / SIGMA / sd, 1.0).fisher_information) / sd**2 for sd in SDS[kept]]
+    told = law(np.ones(60))[kept] ** 2 * law.fisher_information
+    np.testing.assert_allclose(told, own, rtol=5e-3)
 
 
 @pytest.mark.parametrize("half", [0.8, 2.0, 6.0])
@@ -164,10 +206,9 @@ def test_the_nodes_of_the_noise_beside_rounding_hold_its_likeliest_sd_where_read
     noise = 1.2 * spread * np.random.default_rng(0).standard_normal(len(plan))
     recording = OfDeclaredSds(plan, STEP * np.round((predicted + noise) / STEP))
     nodes = NoiseModel((), recording, rounding=STEP, least_sd=1e-3).nodes_for_predictions(predicted)
-    whitened = ((recording.readings - predicted) / spread)[:, None]
     halves = np.exp(np.arange(-3.0, 3.0, 0.05))
     sds = 0.5 * STEP / halves
-    misfit = RoundedNormal(halves, sds).minus_log_likelihood(whitened, sds, len(plan))
+    misfit = -log_cells(recording.readings - predicted, np.multiply.outer(sds, spread)).sum(axis=1)
     assert min(law.sigma for law in nodes.laws) < sds[np.argmin(misfit)] < max(law.sigma for law in nodes.laws)
 
 
@@ -254,3 +295,20 @@ def test_what_rivals_are_told_by_is_the_noise_of_a_reading_rounding_and_all():
     rms = np.sqrt(np.mean(null.found.residuals**2))
     assert null.whitened_sd == pytest.approx(rms, rel=0.15)
     assert null.found.sd < 0.5 * null.whitened_sd
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("declared", [None, 0.2])
+def test_a_column_of_sds_beside_coarse_rounding_is_no_physics(declared):
+    """Readings of a tenth of the others' noise had as narrow a flat top as they, so far too narrow a one."""
+    rng, n = np.random.default_rng(1), 120
+    x, sd = np.sin(np.arange(n) / 11), np.where(rng.random(n) < 0.5, 0.015, 0.15)
+    noise = Noise(sd="sd") if declared is None else Noise(sd="sd", step=declared)
+    line = Simulator(
+        "y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time="t", noise=noise
+    )
+    readings = 0.2 * np.round((1 + 2 * x + sd * rng.standard_normal(n)) / 0.2)
+    table = {"t": np.arange(float(n)), "x": x, "sd": sd, "y": readings}
+    found = diagnose_system(line, table, rng=np.random.default_rng(1))
+    assert found.combination == (("quantisation",) if declared is None else ())
+    assert found.p_value > 0.05

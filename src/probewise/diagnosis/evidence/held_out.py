@@ -145,8 +145,8 @@ def _refit_log_densities(
     miss, slopes, own = miss[out], slopes[out], law.take_readings(out)
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     narrow, wide = (
-        _log_normal_density(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
-        for times, share in ((law.sd_factor_of_rounding, 1 - law.share), (law.times, law.share))
+        _log_normal_density(miss, sigma_2 * sd**2 + spread) + math.log(max(share, 1e-300))
+        for sd, share in ((own.sd_with_rounding, 1 - law.share), (law.times * own.sd, law.share))
     )
     return np.asarray(np.logaddexp(narrow, wide) * own.kept)
 
@@ -182,13 +182,13 @@ def sequential_log_densities(
     whitened, sd = innovations_given_rest(law, np.concatenate([slopes, miss[:, None]], axis=1), out)
     turned, innovations, kept = whitened[:, :-1], whitened[:, -1], law.kept[out]
     mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
-    noise_2 = sigma_2 * (law.sd_factor_of_rounding**2 if law.flat else 1.0)
+    noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
     shares = np.array([1 - law.share, law.share])
     for k in np.flatnonzero(kept):
         row = turned[k]
         gain = covariance @ row
         left, spread = innovations[k] - row @ mean, max(float(row @ gain), 0.0)
-        parts = np.array([noise_2 + spread, noise_2 * law.times**2 + spread])
+        parts = np.array([noise_2[k] + spread, noise_2[k] * law.times**2 + spread])
         density = _log_normal_density(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
         densities[k] = np.logaddexp(*density)
         variance = float(np.exp(density - densities[k]) @ parts)  # the most probable noise variance of this reading

@@ -70,7 +70,8 @@ class NoiseLaw:
     log_extra
         Log probability of the lost readings.
     flat, sigma
-        Rounding, if there is no tail: a uniform part of half width `flat` sigma, with known sigma.
+        Rounding, if there is no tail: a uniform part of half width `flat` sigma, with known sigma, in every reading
+        whatever its relative sd.
     least
         Least sd of a reading, given those before it; not used if sigma is known.
     walk
@@ -105,7 +106,7 @@ class NoiseLaw:
     @property
     def whitening_key(self) -> tuple[bytes, ...]:
         """Key of the whitening: distributions with the same key differ only in tails or rounding."""
-        arrays = self.sd, self.carry, self.lost, self.walk, self.before
+        arrays = self._whitening_sd, self.carry, self.lost, self.walk, self.before
         return tuple(values.tobytes() for values in arrays)
 
     def is_practically_equal(self, other: NoiseLaw) -> bool:
@@ -159,7 +160,7 @@ class NoiseLaw:
         if self.walk.size:
             y = self._whiten_with_walk(y)
             return y[:, 0] if flat else y
-        y = y * (self.kept / self.sd)[:, None]
+        y = y * (self.kept / self._whitening_sd)[:, None]
         if self.before.size:
             carry = self.carry[:, None]
             y = (y - carry * y[self.before]) / np.sqrt(1 - carry**2)
@@ -206,6 +207,19 @@ class NoiseLaw:
         return stacked_density([self])
 
     @cached_property
+    def sd_beside_rounding(self) -> float | FloatArray:
+        """Relative sds as `RoundedNormal` takes them: (n_points, 1), 1 for lost readings; 1.0 if all are equal."""
+        return np.where(self.lost, 1.0, self.sd)[:, None] if np.any(self.sd != 1) else 1.0
+
+    @cached_property
+    def _whitening_sd(self) -> FloatArray:
+        """Relative sd by which each reading is divided, (n_points,); rounding tells less the smaller the own sd."""
+        density = self.whitened_density
+        if isinstance(density, RoundedNormal) and np.ndim(density.sd):
+            return np.asarray(density.whitening_sd)[:, 0]
+        return self.sd
+
+    @cached_property
     def sigma_floor(self) -> float:
         """Least sigma for which every reading's sd, given those before it, is at least `least`."""
         return self.least / self._smallest_innovation_sd if self.least else 0.0
@@ -225,8 +239,13 @@ class NoiseLaw:
 
     @property
     def sd_factor_of_rounding(self) -> float:
-        """Sd of a whitened reading in units of sigma, including rounding but not a tail."""
+        """Sd of a reading of relative sd 1 in units of sigma, including rounding but not a tail."""
         return math.sqrt(1 + self.flat**2 / 3)
+
+    @property
+    def sd_with_rounding(self) -> FloatArray:
+        """Sd of each reading in units of sigma, including rounding but not a tail, (n_points,)."""
+        return np.asarray(np.sqrt(self.sd**2 + self.flat**2 / 3))
 
     def without_tail_or_rounding(self) -> NoiseLaw:
         """Return normal noise with the same whitening, its sd free, without tail or rounding."""
@@ -258,8 +277,8 @@ class NoiseLaw:
         eps = rng.standard_normal((len(self.sd), n_draws))
         if not self.whitened_density.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
-            if self.flat:
-                eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
+            if isinstance(self.whitened_density, RoundedNormal):
+                eps = self.whitened_density.add_rounding(eps, rng=rng)
             eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.fisher_information)
         return eps * self.kept[:, None]
 
@@ -348,12 +367,16 @@ class Tail:
 
 
 def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
-    """Return one density for the k distributions, all with a tail or all rounded; its parameters are (k,)."""
+    """Return one density for the k distributions that whiten alike, all with a tail or all rounded.
+
+    Its parameters are (k,).
+    """
     one = len(laws) == 1
     if laws[0].flat:
+        sd = laws[0].sd_beside_rounding
         if one:
-            return RoundedNormal(laws[0].flat, laws[0].sigma)
-        return RoundedNormal(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]))
+            return RoundedNormal(laws[0].flat, laws[0].sigma, sd)
+        return RoundedNormal(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]), sd)
     if one:
         return Tail(laws[0].share, laws[0].times)
     return Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))

@@ -103,7 +103,7 @@ class NoiseModel:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
             halves, beside = _sd_nodes_with_rounding(
-                law(self._usable_readings - predicted), 0.5 * self.rounding, law.n_kept
+                law(self._usable_readings - predicted), 0.5 * self.rounding, law.n_kept, law.sd_beside_rounding
             )
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
             return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
@@ -229,16 +229,20 @@ def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -
     return math.log(0.5 * at_end / len(ends) + 0.5 / cells)
 
 
-def _sd_nodes_with_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
+def _sd_nodes_with_rounding(
+    residuals: FloatArray, half_step: float, n_points: int, sd: float | FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return nodes for the noise sd of rounded readings, as half steps per sd, and log weights, (n,) both.
 
+    `residuals` are over the relative sds, (n_readings,), and `sd` those sds as `RoundedNormal` takes them.
     Nodes are coarse, and refined about the best to the accuracy of log sigma without rounding. They extend to the
     residual rms, in case the mean is incomplete.
     """
 
     def log_likelihood(halves: FloatArray) -> FloatArray:
         sigma = half_step / halves
-        return -RoundedNormal(halves, sigma).minus_log_likelihood(residuals[:, None], sigma, n_points)
+        density = RoundedNormal(halves, sigma, sd)
+        return -density.minus_log_likelihood(residuals[:, None] * density.normal_sd, sigma, n_points)
 
     rms = math.sqrt(float(residuals @ residuals) / n_points)
     widest = math.floor(math.log(half_step / (2 * rms)) / _APART) if rms > 0 else _NARROWEST

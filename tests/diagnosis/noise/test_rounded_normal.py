@@ -18,11 +18,13 @@ from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.noises import NoiseModels
+from probewise.diagnosis.search.nulls import noise_sd_about_given_null
 from probewise.diagnosis.search.search import search
+from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import Stage
-from probewise.systems import Noise, Simulator
+from probewise.systems import Noise, Simulator, table_for
 from probewise.world import concealed as hidden
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -158,6 +160,42 @@ def test_rounding_that_hides_the_noise_is_in_its_law_declared_or_not(noise_sd, c
     for names, model in found.models.items():
         laws = model.nodes_for_predictions(recording.readings).laws
         assert all(bool(law.flat) == (coarse and names == found.certain) for law in laws)
+
+
+@pytest.mark.parametrize("order", ["sorted", "shuffled"])
+@pytest.mark.parametrize("spread", [1.0, 10.0])
+def test_rounding_is_found_in_whatever_order_readings_are_taken(order, spread):
+    """Successive readings may differ by the signal; of readings with declared sds, the most exact show the rounding."""
+    rng, n = np.random.default_rng(1), 100
+    x = rng.uniform(-1, 1, n)
+    x = np.sort(x) if order == "sorted" else x
+    sd = np.where(rng.random(n) < 0.5, 0.05, 0.05 * spread)
+    line = Simulator(
+        "y",
+        "V",
+        {"a": (-5, 5), "b": (-5, 5)},
+        simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        time="t",
+        noise=Noise(sd="sd"),
+    )
+    readings = 0.1 * np.round((1 + 2 * x + sd * rng.standard_normal(n)) / 0.1)
+    prepared = prepare_system(line, table_for(line, {"t": np.arange(float(n)), "x": x, "sd": sd, "y": readings}))
+    effects = {"quantisation": prepared.effects["quantisation"]}
+    prior, about = PriorOdds.for_effects(effects), noise_sd_about_given_null(prepared)
+    found = NoiseModels(prepared.recording, effects, prior, about)
+    assert found.certain == ("quantisation",)
+    assert found.models["quantisation",].rounding == pytest.approx(0.1)
+
+
+def test_a_lattice_of_printed_digits_is_no_rounding():
+    rng, x = np.random.default_rng(2), np.linspace(-1, 1, 100)
+    line = Simulator("y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"])
+    readings = np.round(1 + 2 * x + 0.05 * rng.standard_normal(100), 2)
+    prepared = prepare_system(line, table_for(line, {"x": x, "y": readings}))
+    effects = {"quantisation": prepared.effects["quantisation"]}
+    prior, about = PriorOdds.for_effects(effects), noise_sd_about_given_null(prepared)
+    assert about == pytest.approx(0.05, rel=0.3)
+    assert NoiseModels(prepared.recording, effects, prior, about).certain == ()
 
 
 @pytest.mark.parametrize("noise_sd", [0.5, 1.0, 3.0])

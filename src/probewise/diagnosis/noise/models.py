@@ -259,12 +259,9 @@ def _sd_nodes_with_rounding(
     return np.exp(x[likely]), log_weights[likely]
 
 
-def rounding_hides_noise(step: float, recording: Recording) -> bool:
-    """Return whether the noise sd is below 0.6 rounding steps: too coarse for a normal density of the readings.
-
-    False if no three readings are successive, which are needed to tell.
-    """
-    return 0 < rough_sd(recording) < _HIDDEN * step
+def rounding_hides_noise(step: float, sd: float) -> bool:
+    """Return whether a noise sd is below 0.6 rounding steps: too coarse for a normal density of the readings."""
+    return sd < _HIDDEN * step
 
 
 def least_sd_given_rounding(recording: Recording) -> float:

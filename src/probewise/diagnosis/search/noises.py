@@ -30,11 +30,15 @@ class NoiseModels:
 
     `models`: noise models by the names of their effects; `certain`: noise effects that the readings show beyond doubt,
     part of every model; `least_sd`: the least plausible sd of a reading.
+
+    `sd_about_fit` is the noise sd about a first fit, infinite without one. Rounding is judged by it too, since
+    successive readings tell the noise only if the signal varies little from one to the next.
     """
 
     recording: Recording
     effects: Mapping[str, NoiseEffect]
     prior: PriorOdds
+    sd_about_fit: float = math.inf
     least_sd: float = field(init=False)
     certain: Names = field(init=False)
     models: dict[Names, NoiseModel] = field(init=False)
@@ -43,7 +47,8 @@ class NoiseModels:
         self.least_sd = least_sd_given_rounding(self.recording)
         self._step = lattice_step(self.recording.readings[self.recording.usable])
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
-        seen = 0 < Quantisation.seen_above * rough_sd(self.recording) < self._step
+        sd = min(rough_sd(self.recording) or math.inf, self.sd_about_fit)
+        seen = Quantisation.seen_above * sd < self._step
         rounded = {Quantisation.name: np.array([self._step])} if Quantisation.name in self.effects and seen else {}
         shown = {
             name: effect.parameters_known_before_fit
@@ -52,7 +57,7 @@ class NoiseModels:
         }
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
         self.certain = tuple(sorted(self._known))
-        self._hidden = rounding_hides_noise(self._step, self.recording)
+        self._hidden = rounding_hides_noise(self._step, sd)
         others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
         single = [tuple(sorted({*names, *self.certain})) for names in combinations_up_to(others, 1)]
         self.models = {names: self._build_model(names) for names in single}

@@ -30,7 +30,7 @@ from probewise.diagnosis.search.constants import (
 )
 from probewise.diagnosis.search.forward_selection import select_forward
 from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import fit_nulls
+from probewise.diagnosis.search.nulls import fit_nulls, noise_sd_about_given_null
 from probewise.diagnosis.search.orders import refit_at_other_orders
 from probewise.diagnosis.search.pruning import prune_out_of_vocabulary
 from probewise.diagnosis.search.refits import Refits
@@ -80,7 +80,11 @@ def search(
     prior = prior or prepared.apparatus.prior_odds(effects)
     on_mean, on_noise = _effects_on_mean_and_noise(prepared)
     refits = (
-        Refits(prepared.null, NoiseModels(recording, on_noise, prior), TemplateCache(prepared.usable_rows))
+        Refits(
+            prepared.null,
+            NoiseModels(recording, on_noise, prior, noise_sd_about_given_null(prepared)),
+            TemplateCache(prepared.usable_rows),
+        )
         if after is None
         else after.refits
     )

@@ -22,7 +22,7 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node, sample_model
 from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import fit_nulls
+from probewise.diagnosis.search.nulls import fit_nulls, noise_sd_about_given_null
 from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
@@ -162,7 +162,8 @@ def fit_simulator(
 def _null_fit_and_evidence(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
     """Fit the simulator without effects under white noise; return the fit and its evidence."""
     prior = PriorOdds.for_effects({})
-    noises, templates = NoiseModels(prepared.recording, {}, prior), TemplateCache(prepared.usable_rows)
+    noises = NoiseModels(prepared.recording, {}, prior, noise_sd_about_given_null(prepared))
+    templates = TemplateCache(prepared.usable_rows)
     state = SearchState({}, prior, noises, templates, Refits(prepared.null, noises, templates), frozenset())
     fit_nulls(state, prepared, max_order=1)
     return state.null, state.null.evidence[()]

@@ -12,7 +12,6 @@ from probewise.effects import (
     CorrelatedNoise,
     Dropouts,
     Extent,
-    FittedReadings,
     Outliers,
     PredictiveMixture,
     Quantisation,
@@ -138,10 +137,7 @@ def test_the_bank_of_lost_readings_lies_within_their_prior_in_any_unit(unit):
     np.testing.assert_allclose(np.unique(values), [9.50510 * unit, 60.49490 * unit])
 
 
-def test_a_printing_lattice_and_a_declared_one_are_no_effect():
-    rows = FittedReadings(np.zeros(300), SD)
-    printed = np.round(np.random.default_rng(2).normal(0, 1, (300, 2)) * SD, 2) / SD
-    assert Quantisation().nodes(printed[:, 0], rows).shape == (0, 1)
+def test_a_declared_lattice_is_no_effect():
     declared = replace(PLAN, instrumentation=replace(PLAN.instrumentation, step=1.0))
     assert Quantisation.for_extent(Extent(10.0, 60.0, declared)) is None
 

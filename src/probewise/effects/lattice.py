@@ -11,7 +11,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
@@ -51,11 +50,6 @@ class Quantisation(NoiseEffect):
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, step=theta[:, :1])
-
-    def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
-        """Return the step of the readings' lattice as the only node, (1, 1); (0, 1) for a step below 0.3 noise sds."""
-        step = lattice_step(rows.with_residuals(residuals))
-        return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (

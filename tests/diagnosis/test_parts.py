@@ -159,6 +159,28 @@ def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
     np.testing.assert_allclose(drawn.std(axis=0)[spread > 1e-9], spread[spread > 1e-9], rtol=0.08)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e-15, 1e12])
+def test_the_prior_of_an_earlier_sensor_does_not_depend_on_the_unit(unit):
+    """The levels are as well known in any unit, and one that is the same in all samples stays so."""
+    names = (*mixture_parameter_names(1), "I_min", "I_max")
+    mean = np.array([0.01, 0.1, 1.5, 0.03, 0.05, 0.001, 10 * unit, 60 * unit])
+    sd = np.array([1e-4, 0.05, 0.05, 5e-4, 8e-4, 3e-4, 0.0, 0.15 * unit])
+    prior = sensor_from_posterior(names, mean, np.diag(sd**2))
+    drawn = prior.theta(np.random.default_rng(0).normal(size=(4000, prior.n_params)))
+    assert drawn[:, -1].std() == pytest.approx(sd[-1], rel=0.05)
+    assert drawn[:, -2].std() < 1e-6 * sd[-1]
+
+
+def test_the_prior_of_an_earlier_free_form_does_not_depend_on_the_unit():
+    free = FreeFormSensor.from_one_gaussian(default_sensor(EXTENT, 1))
+    theta = free.theta(0.02 * np.random.default_rng(0).normal(size=(4000, free.n_params)))
+    theta[:, -2:] *= 1e-12
+    names = (*mixture_parameter_names(free.n_gaussians), "I_min", "I_max")
+    prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
+    drawn = prior.theta(np.random.default_rng(1).normal(size=(4000, free.n_params)))
+    np.testing.assert_allclose(drawn[:, -2:].std(axis=0), theta[:, -2:].std(axis=0), rtol=0.06)
+
+
 def test_the_weight_of_a_variant_is_the_sum_over_its_settings():
     one = (np.zeros((5, 1)),) * 5
     templates = EffectTemplates(one, one, (Backlash(),) * 3, np.array([0, 0, 1, 2, 2]))

@@ -17,6 +17,9 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor import is_free_form
 
+_RIDGE = 1e-8  # of each variance, by which a covariance of samples is sure to be positive
+_LEAST_VARIANCE = 1e-16  # of a coordinate, relative to its size
+
 
 def sensor_from_posterior(
     names: Sequence[str], mean: FloatArray, cov: FloatArray, *, height_mm: float | None = None
@@ -47,9 +50,10 @@ def sensor_from_posterior(
     down = natural_from_theta(mean - np.diag(steps))
     slope = ((up - down) / (2 * steps[:, None])).T
     natural_cov = slope @ cov @ slope.T
-    least = np.full(len(center), 1e-8)
-    least[-2:] *= min(float(np.abs(center[-1] - center[-2])), 1.0) ** 2  # the levels, in a unit that may be large
-    floor = 1e-8 * np.maximum(np.diag(natural_cov), least)
+    # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
+    size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
+    size[levels] = np.abs(center[levels]).max() or 1.0
+    floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
     return (
         FreeFormSensor(center, factor, calibrated_height_mm=height_mm)

@@ -371,13 +371,15 @@ def test_windows_never_part_equal_values():
         np.testing.assert_array_equal(column > 0, (values >= low) & (values <= high))
 
 
-def test_a_bump_is_found_where_it_is():
+@pytest.mark.parametrize("unit", [1.0, 1e12])
+def test_a_bump_is_found_where_it_is(unit):
+    """In noise sds, whatever the unit of the readings."""
     n, rng = 200, np.random.default_rng(0)
     time = np.arange(n, dtype=float)
     r = rng.normal(size=n) + 2.0 * ((time >= 60) & (time < 75))
     basis, _ = np.linalg.qr(np.concatenate([np.ones((n, 1)) * 100, np.eye(1)]))
     augmented = np.concatenate([r, [0.0]])
-    problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white_noise(n), 1.0, n)
+    problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white_noise(n), unit, n)
     covariates = [Covariate("time", time, np.arange(n)), Covariate("level", rng.normal(size=n), np.arange(n))]
     found = significant_places(problem, covariates, ("s",), r, problem.draw_null_residuals(400, rng=rng))
     assert found[0].covariate == "time"

@@ -220,9 +220,13 @@ class Linearised:
         """Number of readings that are not lost; rows of lost ones are 0 and carry no information."""
         return self.law.n_kept
 
+    def whiten(self, columns: FloatArray) -> FloatArray:
+        """Whiten columns of readings and divide them by the noise sd, (n_points, k) both."""
+        return self.law(columns) / self.sd
+
     def project(self, columns: FloatArray) -> FloatArray:
         """Whiten columns of readings (n_points, k) and project the fit's parameters out: (n_rows, k)."""
-        return self.project_whitened(self.law(columns) / self.sd)
+        return self.project_whitened(self.whiten(columns))
 
     def project_whitened(self, whitened: FloatArray) -> FloatArray:
         """Project the fit's parameters out of columns in units of the noise sd: (n_points, k) -> (n_rows, k)."""

@@ -28,6 +28,7 @@ ALARM = 0.01
 _LARGEST_P = 0.05
 _LEAST_ROWS = 3
 _RUNS = ("scan", "run")  # covariates that number parts of the recording
+_ABSORBED = 1e-8  # of a window's length: below it, what the fit leaves is rounding
 _SIGNIFICANT = 0.05  # of the maximum of an effect: below it, it is negligible
 _PLAIN = 0.25  # p-value of the first draws above which more draws are not needed
 
@@ -179,12 +180,14 @@ def significant_places(
         columns, ends = window_columns_and_bounds(covariate, problem.n_points)
         if not ends:
             continue
-        projected = problem.project(columns)
+        whitened = problem.whiten(columns)
+        projected = problem.project_whitened(whitened)
         lengths = np.linalg.norm(projected, axis=0)
-        units = projected[:, lengths > 1e-6] / lengths[lengths > 1e-6]
-        kept = [e for e, length in zip(ends, lengths, strict=True) if length > 1e-6]
-        if not kept:
+        there = lengths > _ABSORBED * np.linalg.norm(whitened, axis=0)
+        if not there.any():
             continue
+        units = projected[:, there] / lengths[there]
+        kept = [ends[k] for k in np.flatnonzero(there)]
         scores = np.abs(units.T @ problem.residual) / own_norm
         null = np.max(np.abs(units.T @ draws) / norms, axis=0)
         best = int(np.argmax(scores))

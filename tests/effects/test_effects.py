@@ -9,6 +9,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from probewise.diagnosis.verdict_report.findings import parameters_found
 from probewise.effects import (
     UNNAMED,
     VOCABULARY,
@@ -18,6 +19,7 @@ from probewise.effects import (
     ArmKnock,
     Backlash,
     CorrelatedNoise,
+    Dropouts,
     EdgeMisplacement,
     EdgeShadow,
     Extent,
@@ -42,7 +44,7 @@ from probewise.effects import (
 from probewise.effects.motion import orientation_deg, sign_of_motion
 from probewise.effects.origin import CountsFromOrigin, Origin
 from probewise.effects.patches import distinct_scan_lines
-from probewise.effects.vocabulary import sentence_from_samples, value_with_sd
+from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples, value_with_sd
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
@@ -690,3 +692,17 @@ def test_a_value_with_a_tiny_sd_is_written_with_the_digits_of_the_sd():
     assert value_with_sd(0.25, 2.3e-9) == "0.25 ± 2.3e-09"
     assert value_with_sd(-0.0, 2.3e-10) == "0 ± 2.3e-10"
     assert value_with_sd(3.14e-6, 2.3e-7) == "0.00000314 ± 0.00000023"
+
+
+def test_what_all_samples_have_in_common_is_written_as_it_is():
+    """The mean of 500 times 0.1 is not 0.1 in the last digit, and their sd not 0."""
+    samples = np.stack([np.linspace(0.02, 0.04, 500), np.full(500, 0.1)], axis=1)
+    assert samples.std(axis=0)[1] > 0
+    mean, sd = mean_and_sd_of_samples(samples)
+    assert (mean[1], sd[1]) == (0.1, 0.0)
+    assert (mean[0], sd[0]) == (samples.mean(axis=0)[0], samples.std(axis=0)[0])
+    said = sentence_from_samples(Dropouts(unit="V"), samples)
+    assert said == "readings are lost: 3.00 ± 0.58 % of them read 0.1 V, whatever the true value"
+    (share, value) = parameters_found(Dropouts(unit="V"), samples, "V")
+    assert (value.mean, value.sd) == (0.1, 0.0)
+    assert share.sd == pytest.approx(sd[0])

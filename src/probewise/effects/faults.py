@@ -89,7 +89,7 @@ class Dropouts(NoiseEffect):
 
         There is no node, (0, 2), unless an outlying value occurs twice or is an end of the declared range.
         """
-        far = rows.with_residuals(residuals)[np.abs(residuals) > _FAR]
+        far = rows.readings[np.abs(residuals) > _FAR]
         # Floats differ in their last digits, so the value is one of the readings, not their mean.
         n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
         at_end = (np.abs(far[:, None] - np.array(self.ends)) <= 1e-6 * rows.sd).any(axis=1)
@@ -100,7 +100,7 @@ class Dropouts(NoiseEffect):
         return np.stack([shares, np.full(12, value)], axis=1)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"readings are lost: {value_with_sd(mean[0], sd[0], factor=100)} % of them read "
-            f"{value_with_sd(mean[1], sd[1], self.unit)}, whatever the true value"
-        )
+        exact = f"{mean[1]:z.12g} {self.unit}".rstrip()  # lost readings have one value, to the last digit
+        value = value_with_sd(mean[1], sd[1], self.unit) if sd[1] > 0 else exact
+        share = value_with_sd(mean[0], sd[0], factor=100)
+        return f"readings are lost: {share} % of them read {value}, whatever the true value"

@@ -16,19 +16,12 @@ _NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
 
 @dataclass(frozen=True, eq=False)
 class FittedReadings:
-    """A fit's predicted readings and the number of each one's run (scan), (n_points,), and the noise sd.
-
-    `relative_sd`: the declared sd of each reading relative to the others, (n_points,), or 1.
-    """
+    """A fit's predicted readings, the number of each one's run (scan), and what was read, (n_points,); the noise sd."""
 
     predicted: FloatArray
     sd: float
     run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    relative_sd: FloatArray | float = 1.0
-
-    def with_residuals(self, residuals: FloatArray) -> FloatArray:
-        """Return the readings, from residuals in units of each one's noise sd, (n_points,) both."""
-        return np.asarray(self.predicted + self.sd * self.relative_sd * residuals)
+    readings: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @renamed_arguments(level="noise")

@@ -219,8 +219,17 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
 
 def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
     """Describe an effect by samples of its parameters, (n_samples, n_params), and its origin, if that is not 0."""
-    sentence = effect.sentence(samples.mean(axis=0), samples.std(axis=0))
+    sentence = effect.sentence(*mean_and_sd_of_samples(samples))
     return f"{sentence} ({effect.counted_from})" if effect.counted_from else sentence
+
+
+def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and sd of samples (n_samples, n_params), (n_params,) each: exact for a value that all samples have.
+
+    The mean of equal numbers may differ from them in the last digit, and their sd from 0.
+    """
+    equal = np.all(samples == samples[0], axis=0)
+    return np.where(equal, samples[0], samples.mean(axis=0)), np.where(equal, 0.0, samples.std(axis=0))
 
 
 def single_column_bank(*parameters: ArrayLike) -> FloatArray:

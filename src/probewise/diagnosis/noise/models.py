@@ -88,7 +88,7 @@ class NoiseModel:
         sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12)) or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
-        rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._relative_sd)
+        rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._usable_readings)
         banks = [self._weighted_nodes(effect, residuals / sd, rows) for effect in self.effects]
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
         for bank, log_each in banks:

@@ -21,7 +21,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
 from probewise.diagnosis.verdict_report.words import substitute_reading_unit
 from probewise.effects import NamedEffect, NoiseEffect
-from probewise.effects.vocabulary import sentence_from_samples
+from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples
 from probewise.recordings.plan import Plan
 
 _LEAST_PROBABILITY = 1e-3
@@ -256,4 +256,5 @@ def _scan_numbers_found(effect: NamedEffect[Any], plan: Plan) -> tuple[Parameter
 
 def _parameter_found(name: str, unit: str, values: FloatArray) -> ParameterFound:
     low, high = np.quantile(values, [0.025, 0.975])
-    return ParameterFound(name, unit, float(values.mean()), float(values.std()), (float(low), float(high)))
+    mean, sd = mean_and_sd_of_samples(values[:, None])
+    return ParameterFound(name, unit, float(mean[0]), float(sd[0]), (float(low), float(high)))

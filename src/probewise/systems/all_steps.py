@@ -18,17 +18,18 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.systems.law_inputs import LawInputs
 from probewise.systems.motion import (
-    LawInputs,
     LawWithEffects,
-    RowsInRuns,
     Stepper,
     evaluations_per_step,
     initial_states,
     integrate_states,
     states_by_step,
+    step_in_part,
     time_gaps,
 )
+from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.runge_kutta import StepSchedule
 from probewise.systems.table import RunTable
 
@@ -334,6 +335,7 @@ class _NewtonState:
     states: FloatArray
     n_evaluated: int = 0
     _end: Callable[[FloatArray], FloatArray] = lambda begins: begins
+    _n_columns: int = 0
 
     def __post_init__(self) -> None:
         n_samples = self.states.shape[1]
@@ -352,8 +354,9 @@ class _NewtonState:
     def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
         """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
         if not np.array_equal(samples, self._chosen):
-            self._chosen, self._end = samples, _stepping_function(self.law_and_inputs, self.steps, samples)
-        self.n_evaluated += states[0, :, 1:].size
+            self._chosen = samples
+            self._end, self._n_columns = _stepping_function(self.law_and_inputs, self.steps, samples)
+        self.n_evaluated += len(samples) * self._n_columns
         return self._end(states[:, :, :-1])
 
     def step_residuals(self, samples: IntArray) -> FloatArray:
@@ -386,22 +389,36 @@ class _NewtonState:
 
 def _stepping_function(
     law_and_inputs: LawAndInputs, steps: Steps, samples: IntArray
-) -> Callable[[FloatArray], FloatArray]:
-    """Return a function from the states before each step to those after, (n_states, n, n_steps, n_runs) each."""
+) -> tuple[Callable[[FloatArray], FloatArray], int]:
+    """Return a function from the states before each step to those after, (n_states, n, n_steps, n_runs) each.
+
+    With it comes the number of steps and their parts that it takes of a sample, in all runs.
+    """
     motion, parameters, columns = law_and_inputs(samples)
     n_states = len(motion.law.states)
-    inputs = LawInputs.arranged_by_runs(motion.law, steps.places, parameters, columns)
-    between = inputs.interpolator_of_steps(steps.gap_of_step)
-    passing = time_gaps(steps.places, columns)[:, steps.gap_of_step]
-    stepper = Stepper(motion, steps.schedule.method, between, passing.reshape(len(passing), -1))
+    inputs = LawInputs.arranged_by_runs(motion.law, steps.places, parameters, columns, motion.between_rows)
+    gap, begin, length = steps.gap_of_step, steps.begin_share_of_gap, steps.length_share_of_gap
+    passing = time_gaps(steps.places, columns)[:, gap]
+    passing = passing.reshape(len(passing), -1)
+    parts = [
+        (part, Stepper(motion, steps.schedule.method, part.inputs, _of_columns(passing, part.columns)))
+        for part in inputs.parts_of_steps(inputs.of_steps(gap), gap, begin, length, whole=False)
+    ]
 
     def states_after_each_step(begins: FloatArray) -> FloatArray:
         shape = begins.shape
         s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
-        after = stepper.step(s, steps.begin_share_of_gap, steps.length_share_of_gap)
+        after: dict[str, Any] = s
+        for part, stepper in parts:
+            after = step_in_part(stepper, part, after)
         return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
 
-    return states_after_each_step
+    n_steps = len(gap) * steps.n_runs
+    return states_after_each_step, sum(n_steps if part.columns is None else len(part.columns) for part, _ in parts)
+
+
+def _of_columns(values: FloatArray, columns: IntArray | None) -> FloatArray:
+    return values if columns is None else np.asarray(values[:, columns])
 
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray
+from probewise.systems.law_inputs import BetweenRows, LawInputs, Pair, StepPart, values_at_rows
+from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
 from probewise.systems.simulator import Law
-from probewise.systems.table import RunTable
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -34,7 +35,7 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class LawWithEffects:
-    """A law with the contributions of effects: additional terms of rates, dry friction, bounds.
+    """A law with the contributions of effects: additional terms of rates, dry friction, bounds, inputs between rows.
 
     `friction` is, by state, the size of the force against its motion, (n_samples, 1): a state at rest sticks until the
     other terms of its rate exceed it.
@@ -44,6 +45,7 @@ class LawWithEffects:
     terms: tuple[tuple[str, Term], ...] = ()
     friction: Mapping[str, FloatArray] = field(default_factory=dict)
     limits: tuple[Limit, ...] = ()
+    between_rows: BetweenRows = field(default_factory=BetweenRows)
 
     def with_term(self, state: str, term: Term) -> LawWithEffects:
         """Return the law with a term added to the rate of a state."""
@@ -105,47 +107,6 @@ class LawWithEffects:
             for other, share in limit.spilt.items():
                 after[other] = after[other] + share * (before - after[limit.state])
         return after
-
-
-@dataclass(frozen=True, eq=False)
-class RowsInRuns:
-    """The rows of a table by position in its runs, for stepping all runs together; short runs repeat their last row.
-
-    Raises
-    ------
-    ParameterError
-        On first use, if time decreases within a run.
-    """
-
-    table: RunTable
-
-    @cached_property
-    def row_by_position_and_run(self) -> IntArray:
-        """Row of the table at each position of each run, (n_places, n_runs); after its end, a run's last row."""
-        self.table.require_rising_time()
-        by_run = self.table.rows_by_scan()
-        longest = max(len(rows) for rows in by_run)
-        return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
-
-    @cached_property
-    def gaps(self) -> FloatArray:
-        """Time from each position to the next, (n_places - 1, n_runs), in the unit of time."""
-        return np.diff(self.table.time_s[self.row_by_position_and_run], axis=0)
-
-    @cached_property
-    def position_and_run_by_row(self) -> tuple[IntArray, IntArray]:
-        """Position in its run, and number of its run, of each row, (n_points,) each."""
-        place = np.empty(len(self.table), dtype=np.int64)
-        for rows in self.table.rows_by_scan():
-            place[rows] = np.arange(len(rows))
-        return place, self.table.scan
-
-    def step_schedule(self, max_step: float) -> StepSchedule:
-        """Return the number of steps from each position to the next, and their method, for a largest step."""
-        longest = self.gaps.max(axis=1, initial=0.0)
-        return StepSchedule.from_fourth_order_steps(
-            np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
-        )
 
 
 def integrate_readings(
@@ -226,12 +187,17 @@ def states_by_step(
     gaps = time_gaps(places, columns)
     s = motion.clip_and_stop_states({}, dict(start))
     with np.errstate(all="ignore"):
-        given_there = LawInputs.arranged_by_runs(motion.law, places, parameters, columns)
+        given = LawInputs.arranged_by_runs(motion.law, places, parameters, columns, motion.between_rows)
         yield s
         for k, n in enumerate(schedule.n_steps.tolist()):
-            stepper = Stepper(motion, schedule.method, given_there.interpolator_of_gap(k), gaps[:, k])
+            inputs = given.of_gap(k)
+            stepper = Stepper(motion, schedule.method, inputs, gaps[:, k])
             for i in range(n):
-                s = stepper.step(s, i / n, 1 / n)
+                if given.has_breaks:
+                    for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n, whole=True):
+                        s = step_in_part(replace(stepper, between=part.inputs), part, s)
+                else:
+                    s = stepper.step(s, i / n, 1 / n)
                 yield s
 
 
@@ -252,7 +218,7 @@ def time_gaps(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatA
 
     An effect on the clock changes the time column, and so these gaps.
     """
-    return np.asarray(np.diff(_values_at_rows(columns[str(places.table.time)], places.row_by_position_and_run), axis=1))
+    return np.asarray(np.diff(values_at_rows(columns[str(places.table.time)], places.row_by_position_and_run), axis=1))
 
 
 def initial_states(
@@ -262,9 +228,7 @@ def initial_states(
     start = {}
     for state, given in law.states.items():
         first = places.row_by_position_and_run[:1]
-        at = (
-            _values_at_rows(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
-        )
+        at = values_at_rows(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
         start[state] = np.array(np.broadcast_to(at, (n_samples, first.shape[1])))
     return start
 
@@ -344,6 +308,17 @@ class Stepper:
         return _advanced_states(s, width, method.weights, rates)
 
 
+def step_in_part(stepper: Stepper, part: StepPart, s: dict[str, Any]) -> dict[str, Any]:
+    """Return the states, (n_samples, n_columns), after a part of some steps; other columns stay as they are."""
+    if part.columns is None:
+        return stepper.step(s, part.begin, part.length)
+    after = stepper.step({state: values[:, part.columns] for state, values in s.items()}, part.begin, part.length)
+    out = {state: values.copy() for state, values in s.items()}
+    for state, values in after.items():
+        out[state][:, part.columns] = values
+    return out
+
+
 def _advanced_states(
     s: Mapping[str, Any], width: Any, terms: Terms, rates: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
@@ -365,98 +340,3 @@ def _zero_of_straight_line(low: Any, at_low: Any, high: Any, at_high: Any) -> An
     """Return where a straight line through (low, at_low) and (high, at_high) is 0; `low` if it does not fall."""
     apart = at_low - at_high
     return low + (high - low) * np.where(apart > 0, at_low / np.where(apart > 0, apart, 1.0), 0.0)
-
-
-Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
-
-
-@dataclass(frozen=True, eq=False)
-class LawInputs:
-    """Parameters and columns of a law at the positions in runs: some held over a gap, some interpolated linearly.
-
-    `constant` and `moving` are parameters, `held` and `sloping` are columns, (1 or n_samples, n_places, n_runs); a
-    constant parameter has no axis of places.
-    """
-
-    constant: Mapping[str, Any]  # parameters
-    moving: Mapping[str, FloatArray]  # parameters
-    held: Mapping[str, NDArray[Any]]  # columns
-    sloping: Mapping[str, FloatArray]  # columns
-
-    @classmethod
-    def arranged_by_runs(
-        cls,
-        law: Law,
-        places: RowsInRuns,
-        parameters: Mapping[str, FloatArray],
-        columns: Mapping[str, NDArray[Any]],
-    ) -> LawInputs:
-        """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs."""
-        rows, time = places.row_by_position_and_run, places.table.time
-        constant: dict[str, Any] = {}
-        moving: dict[str, FloatArray] = {}
-        for name, values in parameters.items():
-            own = _values_at_rows(values, rows)
-            if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
-                constant[name] = own[:, 0]
-            else:
-                moving[name] = own
-        sloping: dict[str, FloatArray] = {}
-        held: dict[str, NDArray[Any]] = {}
-        for name, values in columns.items():
-            slopes = name == time or (law.hold == "linear" and values.dtype == np.float64)
-            (sloping if slopes else held)[name] = _values_at_rows(values, rows)
-        return cls(constant, moving, held, sloping)
-
-    def interpolator_of_gap(self, k: int) -> Callable[[Any], Pair]:
-        """Return a function from a share of the gap between positions k and k + 1 to parameters and columns."""
-        moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
-        sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
-        return _interpolator(self.constant, moving, {name: v[:, k] for name, v in self.held.items()}, sloping)
-
-    def interpolator_of_steps(self, gap: IntArray) -> Callable[[Any], Pair]:
-        """Return the function of `interpolator_of_gap` for many steps at once, in the gaps `gap`, (n_steps,).
-
-        Its arrays have a column for each step and run, the runs of a step in turn.
-        """
-
-        def flattened(values: Any) -> Any:
-            return values.reshape(len(values), -1)
-
-        def value_and_rise(values: FloatArray) -> tuple[Any, Any]:
-            return flattened(values[:, gap]), flattened(np.diff(values, axis=1)[:, gap])
-
-        constant = {name: np.tile(v, (1, len(gap))) if v.shape[1] > 1 else v for name, v in self.constant.items()}
-        moving = {name: value_and_rise(v) for name, v in self.moving.items()}
-        sloping = {name: value_and_rise(v) for name, v in self.sloping.items()}
-        held = {name: flattened(v[:, gap]) for name, v in self.held.items()}
-        return _interpolator(constant, moving, held, sloping)
-
-
-def _interpolator(
-    constant: Mapping[str, Any],
-    moving: Mapping[str, tuple[Any, Any]],
-    held: Mapping[str, Any],
-    sloping: Mapping[str, tuple[Any, Any]],
-) -> Callable[[Any], Pair]:
-    """Return a function from a share of a gap to the parameters and the columns there, by name.
-
-    `moving` and `sloping` hold pairs: the value at the beginning of the gap, and its rise over the gap.
-    """
-    if not (moving or sloping):
-        throughout = constant, held
-        return lambda share: throughout
-
-    def inputs_at(share: Any) -> Pair:
-        p = {**constant, **{name: low + share * rise for name, (low, rise) in moving.items()}}
-        u = {**held, **{name: low + share * rise for name, (low, rise) in sloping.items()}}
-        return p, u
-
-    return inputs_at
-
-
-def _values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
-    """Index values (n_points,) or (n_samples, n_points) by rows (n_places, n_runs); (n, 1) becomes (n, 1, 1)."""
-    if values.ndim == 1:
-        return np.asarray(values[rows][None])
-    return values[:, :, None] if values.shape[1] == 1 else np.asarray(values[:, rows])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -19,8 +19,10 @@ from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_for_table
 from probewise.systems.calls import Caller, IntegrationTally
+from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.mistakes import user_function_error
-from probewise.systems.motion import LawWithEffects, RowsInRuns, integrate_readings, readings_of_states
+from probewise.systems.motion import LawWithEffects, integrate_readings, readings_of_states
+from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
@@ -353,8 +355,9 @@ class SystemChain:
             def values_of_samples(values: Any) -> Any:
                 return values[samples] if np.ndim(values) == 2 and len(values) > 1 else values
 
+            motion = LawWithEffects(law, between_rows=self._between_rows(theta[samples]))
             return (
-                self._apply_stage(Stage.RATE, LawWithEffects(law), theta[samples], plan),
+                self._apply_stage(Stage.RATE, motion, theta[samples], plan),
                 {name: values_of_samples(values) for name, values in parameters.items()},
                 {name: values_of_samples(values) for name, values in columns.items()},
             )
@@ -401,6 +404,15 @@ class SystemChain:
 
     look, read = simulated_view, readings_from_simulated_view  # their earlier names
 
+    def _between_rows(self, theta: FloatArray) -> BetweenRows:
+        """Return what the effects do to inputs and parameters between the rows of a law."""
+        out = BetweenRows()
+        for effect, own in self._effects_with_theta_columns:
+            act = _act_between_rows(effect)
+            if act is not None:
+                out = act(out, theta[:, own])
+        return out
+
     def _apply_stage(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
         for effect, columns in self._effects_with_theta_columns:
             if effect.stage is stage:
@@ -410,3 +422,9 @@ class SystemChain:
     @cached_property
     def _effects_with_theta_columns(self) -> list[tuple[AnyEffect, slice]]:
         return effects_with_columns(self.effects, self.system.n_params)
+
+
+def _act_between_rows(effect: AnyEffect) -> Callable[[BetweenRows, FloatArray], BetweenRows] | None:
+    """Return what an effect does between the rows, if it does anything there that its act at the rows does not say."""
+    found: Callable[[BetweenRows, FloatArray], BetweenRows] | None = getattr(effect, "between_rows", None)
+    return found

@@ -12,8 +12,9 @@ from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, Form
-from probewise.systems.motion import RowsInRuns, integrate_states
+from probewise.systems.motion import integrate_states
 from probewise.systems.row_order import rows_are_in_order
+from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 

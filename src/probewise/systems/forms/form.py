@@ -16,12 +16,29 @@ from probewise.effects.shared_scale_prior import SharedScalePrior
 from probewise.effects.vocabulary import VariantMasks, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
+from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.table import RunTable
 
 _FEW = 48  # positions of a change point that are enough to detect one
 
 Act = Callable[[Any, FloatArray, RunTable], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the table; returns the value with the effect."""
+
+ActBetween = Callable[[BetweenRows, FloatArray], BetweenRows]
+"""Function of what other effects do between the rows and parameters (n_samples, n_params); adds the effect's."""
+
+
+@dataclass(frozen=True)
+class ActInTime:
+    """An act `at_rows` of an effect that acts otherwise between the rows of a law than the law's `hold` says."""
+
+    at_rows: Act
+    between_rows: ActBetween
+
+    def __call__(self, value: Any, theta: FloatArray, table: RunTable) -> Any:
+        """Return the stage's value at the rows with the effect."""
+        return self.at_rows(value, theta, table)
+
 
 Say = Callable[[FloatArray, FloatArray], str]
 """Function of the parameters' mean and sd, (n_params,) each; returns a sentence."""
@@ -133,6 +150,11 @@ class Form:
     def nothing(self) -> Mapping[int, float] | None:
         """Parameter values, by index, at which it has no effect: `absent`, else all amplitudes 0; else None."""
         return dict(self.absent) or dict.fromkeys(self.amplitudes, 0.0) or None
+
+    @property
+    def between_rows(self) -> ActBetween | None:
+        """What it does between the rows of a law, if that is not what the law's `hold` makes of its act at the rows."""
+        return self.act.between_rows if isinstance(self.act, ActInTime) else None
 
     def apply(self, value: Any, theta: FloatArray, plan: Any) -> Any:
         """Return the value of its stage with the effect applied, with parameters theta (n_samples, n_params)."""

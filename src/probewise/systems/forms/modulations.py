@@ -13,9 +13,10 @@ from probewise.effects import HeavyTailedPrior
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import ChangePoints, mean_with_sd
+from probewise.systems.forms.form import ActBetween, ChangePoints, mean_with_sd
 from probewise.systems.forms.frequencies import frequency_prior, residual_peaks, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
+from probewise.systems.law_inputs import Jump
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_MOMENTS = 512
@@ -27,8 +28,9 @@ class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
     `marginals` is a function of the amplitude's prior, `entries` and `suggested` of the amplitude's typical size,
-    `units` of the quantity's unit, `says` of the quantity's name and unit and the parameters' mean and sd. The other
-    attributes become those of the `Form`.
+    `units` of the quantity's unit, `says` of the quantity's name and unit and the parameters' mean and sd.
+    `between_rows` is a function of the name of a parameter that varies so, where it does not go on between the rows of
+    a law as the law's `hold` says. The other attributes become those of the `Form`.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
@@ -43,6 +45,7 @@ class Modulation:
     counted_from: str = ""
     suggested: Callable[[float], FloatArray | None] = lambda size: None
     shared_scale: bool = False
+    between_rows: Callable[[str], ActBetween] | None = None
 
 
 def _single_entry_bank(size: float) -> FloatArray:
@@ -60,6 +63,7 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
         says=lambda what, unit, mean, sd: f"{what} drifts by {mean_with_sd(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
         counted_from=origin_in_words(table.time, origin, time_unit),
+        between_rows=lambda name: lambda between, theta: between.with_drift(name, theta[:, :1]),
     )
 
 
@@ -96,6 +100,9 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool
         when = f"row {mean[1]:.0f}" if by_row else mean_with_sd(mean[1], sd[1], time_unit)
         return f"{what} jumps by {mean_with_sd(mean[0], sd[0], unit)} at {when} and stays there"
 
+    def jump_in_time(parameter: str) -> ActBetween:
+        return lambda between, theta: between.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))
+
     return Modulation(
         at_rows=at_rows,
         marginals=lambda a: {"a": a, name: Uniform(at[0], at[-1])},
@@ -104,6 +111,7 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool
         says=says,
         covariates=("row",) if by_row else ("time",),
         change_points=change_points,
+        between_rows=None if by_row else jump_in_time,
     )
 
 

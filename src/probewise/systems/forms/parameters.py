@@ -12,7 +12,7 @@ from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, Form
+from probewise.systems.forms.form import Act, ActInTime, Form
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.forms.readings import modulated_form
 from probewise.systems.table import RunTable
@@ -41,12 +41,15 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
             each["differs"] = modulations.value_per_run_modulation(table)
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)
+            act = _parameter_shifter(name, how)
+            if how.between_rows is not None:
+                act = ActInTime(act, how.between_rows(name))
             yield from modulated_form(
                 about,
                 f"{kind}:{name}",
                 stage=Stage.PARAMETER,
                 how=how,
-                act=_parameter_shifter(name, how),
+                act=act,
                 guess=size,
                 what=name,
                 unit="",

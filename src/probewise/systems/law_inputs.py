@@ -1,0 +1,287 @@
+"""Parameters and columns of a law between the rows: held, on straight lines, or with a jump."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.systems.rows_in_runs import RowsInRuns
+from probewise.systems.simulator import Law
+
+_ROUNDING = 16  # of the last digit of a time: breaks closer to the beginning of a step are at it
+
+Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
+"""Parameters and columns by name."""
+
+Line = tuple[Any, Any]
+"""A value at the beginning of a gap between rows, and its rise over the gap."""
+
+
+@dataclass(frozen=True, eq=False)
+class Jump:
+    """A jump of a parameter by `size` after the time `at`, as printed, (n_samples, 1) each."""
+
+    parameter: str
+    size: FloatArray
+    at: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BetweenRows:
+    """What effects do between the rows; the law's `hold` alone determines the rest.
+
+    Parameters
+    ----------
+    drifts
+        By parameter, its slope in time as printed, (n_samples, 1).
+    jumps
+        Jumps of parameters.
+    """
+
+    drifts: Mapping[str, FloatArray] = field(default_factory=dict)
+    jumps: tuple[Jump, ...] = ()
+
+    def with_drift(self, parameter: str, slope: FloatArray) -> BetweenRows:
+        """Return it with a drift of a parameter, a slope in time, (n_samples, 1); two of one parameter add up."""
+        before = self.drifts.get(parameter, 0.0)
+        return replace(self, drifts={**self.drifts, parameter: np.asarray(before + slope)})
+
+    def with_jump(self, jump: Jump) -> BetweenRows:
+        """Return it with a jump of a parameter."""
+        return replace(self, jumps=(*self.jumps, jump))
+
+
+@dataclass(frozen=True, eq=False)
+class StepInputs:
+    """Parameters and columns within some steps; the last axis of the arrays is that of the steps and runs, or 1.
+
+    `constant` and `held` do not change within a step; `moving` and `sloping` are on straight lines. The first of each
+    pair are parameters, the second columns.
+    """
+
+    constant: Mapping[str, Any]
+    moving: Mapping[str, Line]
+    held: Mapping[str, Any]
+    sloping: Mapping[str, Line]
+
+    def __call__(self, share: Any) -> Pair:
+        """Return parameters and columns, by name, at a share of the gap between rows."""
+        if not (self.moving or self.sloping):
+            return self.constant, self.held
+        p = {**self.constant, **{name: low + share * rise for name, (low, rise) in self.moving.items()}}
+        u = {**self.held, **{name: low + share * rise for name, (low, rise) in self.sloping.items()}}
+        return p, u
+
+    def of_some(self, columns: IntArray) -> StepInputs:
+        """Return the inputs of some of the columns of the arrays."""
+
+        def chosen(values: Any) -> Any:
+            return values[..., columns] if values.shape[-1] > 1 else values
+
+        def chosen_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
+            return {name: (chosen(low), chosen(rise)) for name, (low, rise) in lines.items()}
+
+        return StepInputs(
+            {name: chosen(values) for name, values in self.constant.items()},
+            chosen_lines(self.moving),
+            {name: chosen(values) for name, values in self.held.items()},
+            chosen_lines(self.sloping),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StepPart:
+    """A part of some steps in which no input jumps.
+
+    `columns` are the indices of its columns of the states' arrays, None: all; `begin` and `length` are shares of the
+    gap between rows, numbers or arrays with one value per column.
+    """
+
+    columns: IntArray | None
+    inputs: Callable[[Any], Pair]
+    begin: Any
+    length: Any
+
+
+@dataclass(frozen=True, eq=False)
+class LawInputs:
+    """Parameters and columns of a law at the positions in runs: some held over a gap, some interpolated linearly.
+
+    `constant`, `kept` and `moving` are parameters, `held` and `sloping` are columns: (1 or n_samples, n_places,
+    n_runs); a constant parameter has no axis of places. `rises` are the changes over each gap of what is moving or
+    sloping, by name of the parameter or column, (1 or n_samples, n_places - 1, n_runs).
+    """
+
+    places: RowsInRuns
+    constant: Mapping[str, Any]  # parameters
+    kept: Mapping[str, FloatArray]  # parameters
+    moving: Mapping[str, FloatArray]  # parameters
+    held: Mapping[str, NDArray[Any]]  # columns
+    sloping: Mapping[str, FloatArray]  # columns
+    rises_of_parameters: Mapping[str, FloatArray]
+    rises_of_columns: Mapping[str, FloatArray]
+    jumps: tuple[Jump, ...] = ()
+
+    @classmethod
+    def arranged_by_runs(
+        cls,
+        law: Law,
+        places: RowsInRuns,
+        parameters: Mapping[str, FloatArray],
+        columns: Mapping[str, NDArray[Any]],
+        between: BetweenRows | None = None,
+    ) -> LawInputs:
+        """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
+
+        Parameters that vary from row to row go on between the rows as columns do, since a column moves them; `between`
+        has their drifts and jumps.
+        """
+        rows, time = places.row_by_position_and_run, places.table.time
+        between = BetweenRows() if between is None else between
+        constant: dict[str, Any] = {}
+        kept: dict[str, FloatArray] = {}
+        moving: dict[str, FloatArray] = {}
+        rises_of_parameters: dict[str, FloatArray] = {}
+        for name, values in parameters.items():
+            for jump in between.jumps:
+                if jump.parameter == name:  # it is added where it is, within a gap
+                    values = values - jump.size * (places.table.time_s > jump.at)
+            own = values_at_rows(values, rows)
+            if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
+                constant[name] = own[:, 0]
+            elif law.hold == "linear":
+                moving[name], rises_of_parameters[name] = own, np.diff(own, axis=1)
+            elif name in between.drifts:
+                moving[name], rises_of_parameters[name] = own, between.drifts[name][:, :, None] * places.gaps
+            else:
+                kept[name] = own
+        sloping: dict[str, FloatArray] = {}
+        held: dict[str, NDArray[Any]] = {}
+        for name, values in columns.items():
+            slopes = name == time or (law.hold == "linear" and values.dtype == np.float64)
+            (sloping if slopes else held)[name] = values_at_rows(values, rows)
+        rises_of_columns = {name: np.diff(values, axis=1) for name, values in sloping.items()}
+        return cls(
+            places,
+            constant,
+            kept,
+            moving,
+            held,
+            sloping,
+            rises_of_parameters,
+            rises_of_columns,
+            between.jumps,
+        )
+
+    @property
+    def has_breaks(self) -> bool:
+        """Whether inputs may jump within a gap between rows."""
+        return bool(self.jumps)
+
+    def of_gap(self, k: int) -> StepInputs:
+        """Return parameters and columns in the gap between positions k and k + 1, with a column for each run."""
+        return StepInputs(
+            {**self.constant, **{name: v[:, k] for name, v in self.kept.items()}},
+            {name: (v[:, k], self.rises_of_parameters[name][:, k]) for name, v in self.moving.items()},
+            {name: v[:, k] for name, v in self.held.items()},
+            {name: (v[:, k], self.rises_of_columns[name][:, k]) for name, v in self.sloping.items()},
+        )
+
+    def of_steps(self, gap: IntArray) -> StepInputs:
+        """Return those of `of_gap` for many steps at once, in the gaps `gap`, (n_steps,).
+
+        Their arrays have a column for each step and run, the runs of a step in turn.
+        """
+
+        def flattened(values: Any) -> Any:
+            return values.reshape(len(values), -1)
+
+        def value_and_rise(values: FloatArray, rise: FloatArray) -> Line:
+            return flattened(values[:, gap]), flattened(rise[:, gap])
+
+        constant = {name: np.tile(v, (1, len(gap))) if v.shape[1] > 1 else v for name, v in self.constant.items()}
+        return StepInputs(
+            {**constant, **{name: flattened(v[:, gap]) for name, v in self.kept.items()}},
+            {name: value_and_rise(v, self.rises_of_parameters[name]) for name, v in self.moving.items()},
+            {name: flattened(v[:, gap]) for name, v in self.held.items()},
+            {name: value_and_rise(v, self.rises_of_columns[name]) for name, v in self.sloping.items()},
+        )
+
+    def parts_of_steps(
+        self, inputs: StepInputs, gap: IntArray, begin: Any, length: Any, *, whole: bool
+    ) -> Iterator[StepPart]:
+        """Divide steps where a parameter jumps; yield the parts in turn.
+
+        Parameters
+        ----------
+        inputs
+            Parameters and columns of these steps.
+        gap, begin, length
+            The gap of each step, (n_steps,), and the shares of it at which the step begins, and that it takes: numbers,
+            or one per step and run.
+        whole
+            Whether each part has all columns of the states, so that runs are together; else those alone that have one.
+        """
+        if not self.has_breaks:
+            yield StepPart(None, inputs, begin, length)
+            return
+        run = np.tile(np.arange(self.places.row_by_position_and_run.shape[1]), len(gap))
+        n_columns = len(run)
+        start, gap_s = self._begins[gap].ravel(), self.places.gaps[gap].ravel()
+        end = np.broadcast_to(begin + length, n_columns)
+        share = np.broadcast_to(begin, (1, n_columns))
+        columns = np.arange(n_columns)
+        while True:
+            now, last = start + share * gap_s, start + end * gap_s
+            stop = self._next_break(now)
+            over = ~(stop < last)
+            part = self._with_breaks(inputs, 0.5 * (now + np.where(over, last, stop)))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                until = np.where(over, end, (stop - start) / gap_s)
+            yield StepPart(None if len(columns) == n_columns else columns, part, share, until - share)
+            going = ~over.all(axis=0)
+            if not going.any():
+                return
+            share = until
+            if not whole:
+                some = np.flatnonzero(going)
+                columns, run = columns[some], run[some]
+                start, gap_s, end, share = start[some], gap_s[some], end[some], share[:, some]
+                inputs = inputs.of_some(some)
+
+    @cached_property
+    def _begins(self) -> FloatArray:
+        """Time at which each gap begins, as printed, (n_places - 1, n_runs)."""
+        return np.asarray(self.places.table.time_s[self.places.row_by_position_and_run[:-1]])
+
+    def _next_break(self, now: FloatArray) -> FloatArray:
+        """Return the time of the next jump of a parameter after `now`, of that shape; infinite if none is left."""
+        rounding = _ROUNDING * np.spacing(np.abs(self.places.table.time_s).max())
+        out: Any = np.inf
+        for jump in self.jumps:
+            out = np.minimum(out, np.where(jump.at > now + rounding, jump.at, np.inf))
+        return np.asarray(out)
+
+    def _with_breaks(self, inputs: StepInputs, at: FloatArray) -> StepInputs:
+        """Return inputs with the parameters with jumps as they are around the times `at`."""
+        constant, moving = dict(inputs.constant), dict(inputs.moving)
+        for jump in self.jumps:
+            name, own = jump.parameter, jump.size * (at > jump.at)
+            if name in moving:
+                moving[name] = moving[name][0] + own, moving[name][1]
+            else:
+                constant[name] = constant[name] + own
+        return StepInputs(constant, moving, inputs.held, inputs.sloping)
+
+
+def values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
+    """Index values (n_points,) or (n_samples, n_points) by rows (n_places, n_runs); (n, 1) becomes (n, 1, 1)."""
+    if values.ndim == 1:
+        return np.asarray(values[rows][None])
+    return values[:, :, None] if values.shape[1] == 1 else np.asarray(values[:, rows])

@@ -1,0 +1,160 @@
+"""What a law is given between the rows, with effects on its inputs: against SciPy's solve_ivp from break to break."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from probewise.systems import Law, Noise, RunTable, Simulator, System
+from probewise.systems.all_steps import TrajectoryCache
+from probewise.systems.forms import ReferenceFit, bind_forms
+
+_RNG = np.random.default_rng(0)
+_SPRING, _FRICTION, _START = 4.0, 0.3, 0.7
+_TIMES = [np.cumsum(_RNG.uniform(0.05, 0.4, n)) for n in (36, 27)]
+_FORCE = [np.repeat(_RNG.normal(0, 3, len(t) // 3), 3) for t in _TIMES]
+_WARM = [np.cumsum(_RNG.normal(0, 1, len(t))) for t in _TIMES]
+_ORDER = np.argsort(np.concatenate(_TIMES), kind="stable")  # the rows of both runs in turn
+_ROWS = [np.argsort(_ORDER)[: len(_TIMES[0])], np.argsort(_ORDER)[len(_TIMES[0]) :]]
+_MEAN_FORCE, _MEAN_WARM = (float(np.concatenate(columns).mean()) for columns in (_FORCE, _WARM))
+
+
+def _in_order(parts):
+    return np.concatenate(parts)[_ORDER]
+
+
+TABLE = RunTable(
+    {
+        "t_s": _in_order(_TIMES),
+        "run": _in_order([np.full(len(t), float(k)) for k, t in enumerate(_TIMES)]),
+        "force": _in_order(_FORCE),
+        "warm": _in_order(_WARM),
+        "y": np.zeros(len(_ORDER)),
+    },
+    time="t_s",
+    run="run",
+)
+
+
+def _about(law, parameters, table, values, *, sd=1e-3, max_step=0.06):
+    """Return the reference fit at parameters `values`: uniform from 0 to twice each, so that they are in the middle."""
+    priors = {name: (0.0, 2 * value) for name, value in zip(parameters, values, strict=True)}
+    simulator = Simulator(
+        "y", "m", priors, law=replace(law, max_step_s=max_step), time="t_s", run=table.run, noise=Noise(sd=sd)
+    )
+    system = System.of(simulator, table)
+    return ReferenceFit(system, table, np.zeros(system.n_params), sd)
+
+
+def _spring_about(hold):
+    law = Law(
+        {"x": _START, "v": 0.0},
+        lambda s, p, u: {"x": s["v"], "v": u["force"] - p["k"] * s["x"] - p["c"] * s["v"]},
+        hold=hold,
+    )
+    return _about(law, ("k", "c"), TABLE, (_SPRING, _FRICTION))
+
+
+ABOUT = {hold: _spring_about(hold) for hold in ("previous", "linear")}
+FORMS = {hold: bind_forms(about) for hold, about in ABOUT.items()}
+
+
+def _predicted(about, form, settings):
+    theta = np.concatenate([np.repeat(about.theta, len(settings), axis=0), settings], axis=1)
+    return about.system.chain(about.table, (form,)).predict(theta, about.table)
+
+
+def _column(times, values, at, hold):
+    """Return a column at a time; before the first one, its first value."""
+    if hold == "linear":
+        return np.interp(at, times, values)
+    return values[max(np.searchsorted(times, at, side="right") - 1, 0)]
+
+
+def _integrated(rates, start, times, breaks=()):
+    """Integrate rates(t, s, middle) from break to break, the rows among them; `middle` is that of the interval."""
+    inside = [t for t in breaks if times[0] < t < times[-1]]
+    edges = np.unique(np.concatenate([times, inside]))
+    states = [np.asarray(start, dtype=float)]
+    for low, high in pairwise(edges):
+        if high - low < 1e-12:
+            states.append(states[-1])
+            continue
+        middle = 0.5 * (low + high)
+        solved = solve_ivp(
+            lambda t, s, middle=middle: rates(t, s, middle),
+            (low, high),
+            states[-1],
+            method="DOP853",
+            rtol=1e-10,
+            atol=1e-12,
+        )
+        states.append(solved.y[:, -1])
+    return np.array(states)[np.searchsorted(edges, times)]
+
+
+def _spring_by_solve_ivp(hold, *, spring=lambda t, middle, k: _SPRING, delay=0.0, breaks=()):
+    """Return x at all rows; `spring` is a function of the time, the middle of the interval and the run."""
+    out = np.empty(len(TABLE))
+    for k, (times, force) in enumerate(zip(_TIMES, _FORCE, strict=True)):
+
+        def rates(t, s, middle, k=k, times=times, force=force):
+            at = middle if hold == "previous" else t  # within an interval nothing that is held jumps
+            push = _column(times, force, at - delay, hold)
+            return [s[1], push - spring(t, middle, k) * s[0] - _FRICTION * s[1]]
+
+        out[_ROWS[k]] = _integrated(rates, [_START, 0.0], times, [*breaks, *(times + delay)])[:, 0]
+    return out
+
+
+def _spring_of_column(hold, columns, mean, a):
+    def spring(t, middle, k):
+        return _SPRING + a * (_column(_TIMES[k], columns[k], middle if hold == "previous" else t, hold) - mean)
+
+    return spring
+
+
+CASES = {
+    "depends:k:force": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _FORCE, _MEAN_FORCE, 0.3)}),
+    "depends:k:warm": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _WARM, _MEAN_WARM, 0.3)}),
+    "drifts:k": ([0.2], lambda hold: {"spring": lambda t, middle, k: _SPRING + 0.2 * t}),
+    "steps:k": (
+        [1.0, 4.01],
+        lambda hold: {"spring": lambda t, middle, k: _SPRING + (middle > 4.01), "breaks": [4.01]},
+    ),
+    "differs:k": (
+        [[0.5, -0.8][int(name)] for name in TABLE.scan_names],
+        lambda hold: {"spring": lambda t, middle, k: _SPRING + [0.5, -0.8][k]},
+    ),
+}
+
+
+@pytest.mark.parametrize("hold", ["previous", "linear"])
+@pytest.mark.parametrize("name", CASES)
+def test_a_parameter_goes_on_between_rows_as_what_moves_it(name, hold):
+    """A column that is held or on straight lines, as the law says; time; a jump at its time; a value per run."""
+    setting, how = CASES[name]
+    about = ABOUT[hold]
+    found = _predicted(about, FORMS[hold][name], np.array([setting]))[0]
+    expected = _spring_by_solve_ivp(hold, **how(hold))
+    size = np.abs(expected - about.predicted).max()
+    assert size > 0.1
+    np.testing.assert_allclose(found, expected, atol=1e-5 * size)
+
+
+@pytest.mark.parametrize("hold", ["previous", "linear"])
+@pytest.mark.parametrize("name", ["depends:k:force", "drifts:k", "steps:k"])
+def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name, hold):
+    about, setting = ABOUT[hold], np.array(CASES[name][0])
+    settings = setting * (1 + 0.02 * np.random.default_rng(1).normal(size=(5, len(setting))))
+    refusing = TrajectoryCache(n_refused=99)  # it is stepped
+    stepped = replace(about, system=replace(about.system, trajectories=refusing))
+    expected = _predicted(stepped, FORMS[hold][name], settings)
+    own = replace(about, system=replace(about.system, trajectories=TrajectoryCache()))
+    own.system.chain(TABLE, ()).predict(own.theta, TABLE)
+    for _ in range(2):
+        np.testing.assert_allclose(_predicted(own, FORMS[hold][name], settings), expected, atol=1e-9)
+    assert own.system.trajectories.n_refused == 0
+    assert not refusing.known

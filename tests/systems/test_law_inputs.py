@@ -9,7 +9,9 @@ from scipy.integrate import solve_ivp
 
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.all_steps import TrajectoryCache
+from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.inputs import delayed_held_column
 
 _RNG = np.random.default_rng(0)
 _SPRING, _FRICTION, _START = 4.0, 0.3, 0.7
@@ -95,14 +97,14 @@ def _integrated(rates, start, times, breaks=()):
     return np.array(states)[np.searchsorted(edges, times)]
 
 
-def _spring_by_solve_ivp(hold, *, spring=lambda t, middle, k: _SPRING, delay=0.0, breaks=()):
+def _spring_by_solve_ivp(hold, *, spring=lambda t, middle, k: _SPRING, delay=0.0, gain=1.0, breaks=()):
     """Return x at all rows; `spring` is a function of the time, the middle of the interval and the run."""
     out = np.empty(len(TABLE))
     for k, (times, force) in enumerate(zip(_TIMES, _FORCE, strict=True)):
 
         def rates(t, s, middle, k=k, times=times, force=force):
             at = middle if hold == "previous" else t  # within an interval nothing that is held jumps
-            push = _column(times, force, at - delay, hold)
+            push = gain * _column(times, force, at - delay, hold)
             return [s[1], push - spring(t, middle, k) * s[0] - _FRICTION * s[1]]
 
         out[_ROWS[k]] = _integrated(rates, [_START, 0.0], times, [*breaks, *(times + delay)])[:, 0]
@@ -116,6 +118,7 @@ def _spring_of_column(hold, columns, mean, a):
     return spring
 
 
+DELAY = "input_delay:force"
 CASES = {
     "depends:k:force": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _FORCE, _MEAN_FORCE, 0.3)}),
     "depends:k:warm": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _WARM, _MEAN_WARM, 0.3)}),
@@ -128,13 +131,15 @@ CASES = {
         [[0.5, -0.8][int(name)] for name in TABLE.scan_names],
         lambda hold: {"spring": lambda t, middle, k: _SPRING + [0.5, -0.8][k]},
     ),
+    DELAY: ([0.33], lambda hold: {"delay": 0.33}),
 }
 
 
-@pytest.mark.parametrize("hold", ["previous", "linear"])
-@pytest.mark.parametrize("name", CASES)
-def test_a_parameter_goes_on_between_rows_as_what_moves_it(name, hold):
-    """A column that is held or on straight lines, as the law says; time; a jump at its time; a value per run."""
+@pytest.mark.parametrize(
+    ("name", "hold"), [(n, h) for n in CASES for h in ("previous", "linear") if (n, h) != (DELAY, "linear")]
+)
+def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold):
+    """A column that is held or on straight lines, as the law says, late or not; time; a jump at its time; a run."""
     setting, how = CASES[name]
     about = ABOUT[hold]
     found = _predicted(about, FORMS[hold][name], np.array([setting]))[0]
@@ -145,7 +150,7 @@ def test_a_parameter_goes_on_between_rows_as_what_moves_it(name, hold):
 
 
 @pytest.mark.parametrize("hold", ["previous", "linear"])
-@pytest.mark.parametrize("name", ["depends:k:force", "drifts:k", "steps:k"])
+@pytest.mark.parametrize("name", ["depends:k:force", "drifts:k", "steps:k", DELAY])
 def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name, hold):
     about, setting = ABOUT[hold], np.array(CASES[name][0])
     settings = setting * (1 + 0.02 * np.random.default_rng(1).normal(size=(5, len(setting))))
@@ -158,3 +163,62 @@ def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name
         np.testing.assert_allclose(_predicted(own, FORMS[hold][name], settings), expected, atol=1e-9)
     assert own.system.trajectories.n_refused == 0
     assert not refusing.known
+
+
+def test_a_battery_reads_the_current_of_one_dead_time_earlier():
+    """V = u0 - r I - v, v' = (d I^2 - v) / tau: the reading and the rates see the late current, also its square."""
+    rng = np.random.default_rng(2)
+    times = np.cumsum(rng.choice([0.3, 1.0, 2.5], 60))
+    current = np.repeat(rng.choice([0.0, 1.0, 2.0, 3.0, -1.0], 20), 3)
+    table = RunTable({"t_s": times, "amp": current, "y": np.zeros(60)}, time="t_s")
+    r, d, tau, delay = 0.05, 0.03, 8.0, 1.7
+    law = Law(
+        {"v": 0.0},
+        lambda s, p, u: {"v": (p["d"] * u["amp"] ** 2 - s["v"]) / p["tau"]},
+        lambda s, p, u: 3.7 - p["r"] * u["amp"] - s["v"],
+    )
+    about = _about(law, ("r", "d", "tau"), table, (r, d, tau), max_step=1.0)
+    found = _predicted(about, bind_forms(about)["input_delay:amp"], np.array([[delay]]))[0]
+
+    def rates(t, s, middle):
+        return [(d * _column(times, current, middle - delay, "previous") ** 2 - s[0]) / tau]
+
+    v = _integrated(rates, [0.0], times, times + delay)[:, 0]
+    late = np.array([_column(times, current, t - delay, "previous") for t in times])
+    np.testing.assert_allclose(found, 3.7 - r * late - v, atol=1e-7)
+
+
+def test_a_late_column_is_held_exactly_one_row_later_where_the_dead_time_is_a_gap():
+    """Times of a tenth of a second are not exact: a dead time of three of them ends at a row, not just before it."""
+    times = 0.1 * np.arange(40)
+    values = np.random.default_rng(1).normal(size=(1, 40))
+    table = RunTable({"t_s": times, "u": values[0]}, time="t_s")
+    found = delayed_held_column(values, np.array([[0.0], [0.3], [99.0]]), table)
+    np.testing.assert_array_equal(found[0], values[0])
+    np.testing.assert_array_equal(found[1], values[0, np.maximum(np.arange(40) - 3, 0)])
+    np.testing.assert_array_equal(found[2], np.full(40, values[0, 0]))
+
+
+def test_a_column_with_a_wrong_scale_beside_its_dead_time_has_both():
+    form, gain = (FORMS["previous"][name] for name in ("input_delay:force", "input_gain:force"))
+    about = ABOUT["previous"]
+    theta = np.concatenate([about.theta[0], [0.33], [0.1]])[None, :]
+    found = about.system.chain(TABLE, (form, gain)).predict(theta, TABLE)[0]
+    np.testing.assert_allclose(found, _spring_by_solve_ivp("previous", delay=0.33, gain=1.1), atol=1e-5)
+
+
+def test_the_cost_counts_the_parts_of_the_steps_that_a_late_column_divides():
+    n_calls, about = 0, ABOUT["previous"]
+    own = about.system.simulator.law
+
+    def rates(s, p, u):
+        nonlocal n_calls
+        n_calls += 1
+        return own.rates(s, p, u)
+
+    simulator = replace(about.system.simulator, law=replace(own, rates=rates))
+    system = replace(
+        about.system, simulator=simulator, tally=IntegrationTally(), trajectories=TrajectoryCache(n_refused=99)
+    )
+    _predicted(replace(about, system=system), FORMS["previous"]["input_delay:force"], np.array([[0.33]]))
+    assert system.tally.n_evaluations == pytest.approx(n_calls, rel=0.25)

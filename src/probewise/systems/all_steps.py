@@ -25,6 +25,7 @@ from probewise.systems.motion import (
     evaluations_per_step,
     initial_states,
     integrate_states,
+    n_parts_of_schedule,
     states_by_step,
     step_in_part,
     time_gaps,
@@ -223,11 +224,12 @@ def integrate_from_known_trajectories(
     Every state at every row, by name, (n_samples, n_points); and the cost, in evaluations of the rates of all samples
     together.
     """
-    n_samples, n_steps = len(theta), len(steps.gap_of_step)
+    n_samples = len(theta)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
         states_by_name = integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step)
-        return states_by_name, n_steps * evaluations_per_step(motion, steps.schedule.method)
+        n_parts = n_parts_of_schedule(motion, steps.schedule)
+        return states_by_name, n_parts * evaluations_per_step(motion, steps.schedule.method)
     states, left, cost = None, np.arange(n_samples), 0
     known, nearest = memory.known_and_nearest_indices(steps, effects, theta, n_own)
     refused = False
@@ -250,7 +252,7 @@ def integrate_from_known_trajectories(
             states = there
         else:
             states[:, left] = there
-        cost += n_steps
+        cost += n_parts_of_schedule(motion, steps.schedule)
         finite = np.isfinite(there).all(axis=(0, 2, 3))
         memory.add(
             steps,

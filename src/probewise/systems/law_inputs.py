@@ -1,4 +1,4 @@
-"""Parameters and columns of a law between the rows: held, on straight lines, or with a jump."""
+"""Parameters and columns of a law between the rows: held, on straight lines, late, or with a jump."""
 
 from __future__ import annotations
 
@@ -38,14 +38,22 @@ class BetweenRows:
 
     Parameters
     ----------
+    dead_times
+        By column, the time after which it acts, (n_samples, 1).
     drifts
         By parameter, its slope in time as printed, (n_samples, 1).
     jumps
         Jumps of parameters.
     """
 
+    dead_times: Mapping[str, FloatArray] = field(default_factory=dict)
     drifts: Mapping[str, FloatArray] = field(default_factory=dict)
     jumps: tuple[Jump, ...] = ()
+
+    def with_dead_time(self, column: str, dead_time: FloatArray) -> BetweenRows:
+        """Return it with a column that acts after a dead time, (n_samples, 1); two of one column add up."""
+        before = self.dead_times.get(column, 0.0)
+        return replace(self, dead_times={**self.dead_times, column: np.asarray(before + dead_time)})
 
     def with_drift(self, parameter: str, slope: FloatArray) -> BetweenRows:
         """Return it with a drift of a parameter, a slope in time, (n_samples, 1); two of one parameter add up."""
@@ -97,7 +105,7 @@ class StepInputs:
 
 @dataclass(frozen=True, eq=False)
 class StepPart:
-    """A part of some steps in which no input jumps.
+    """A part of some steps in which no input jumps or bends.
 
     `columns` are the indices of its columns of the states' arrays, None: all; `begin` and `length` are shares of the
     gap between rows, numbers or arrays with one value per column.
@@ -126,6 +134,7 @@ class LawInputs:
     sloping: Mapping[str, FloatArray]  # columns
     rises_of_parameters: Mapping[str, FloatArray]
     rises_of_columns: Mapping[str, FloatArray]
+    late: Mapping[str, _LateColumn] = field(default_factory=dict)
     jumps: tuple[Jump, ...] = ()
 
     @classmethod
@@ -140,7 +149,7 @@ class LawInputs:
         """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
 
         Parameters that vary from row to row go on between the rows as columns do, since a column moves them; `between`
-        has their drifts and jumps.
+        has their drifts and jumps, and the columns that are late.
         """
         rows, time = places.row_by_position_and_run, places.table.time
         between = BetweenRows() if between is None else between
@@ -166,6 +175,10 @@ class LawInputs:
         for name, values in columns.items():
             slopes = name == time or (law.hold == "linear" and values.dtype == np.float64)
             (sloping if slopes else held)[name] = values_at_rows(values, rows)
+        late = {
+            name: _LateColumn.of(_Timeline(places), columns[name], dead_time, linear=law.hold == "linear")
+            for name, dead_time in between.dead_times.items()
+        }
         rises_of_columns = {name: np.diff(values, axis=1) for name, values in sloping.items()}
         return cls(
             places,
@@ -176,13 +189,14 @@ class LawInputs:
             sloping,
             rises_of_parameters,
             rises_of_columns,
+            late,
             between.jumps,
         )
 
     @property
     def has_breaks(self) -> bool:
-        """Whether inputs may jump within a gap between rows."""
-        return bool(self.jumps)
+        """Whether inputs may jump or bend within a gap between rows."""
+        return bool(self.late or self.jumps)
 
     def of_gap(self, k: int) -> StepInputs:
         """Return parameters and columns in the gap between positions k and k + 1, with a column for each run."""
@@ -216,7 +230,7 @@ class LawInputs:
     def parts_of_steps(
         self, inputs: StepInputs, gap: IntArray, begin: Any, length: Any, *, whole: bool
     ) -> Iterator[StepPart]:
-        """Divide steps where a parameter jumps; yield the parts in turn.
+        """Divide steps where inputs jump or bend, a late column or a parameter with a jump; yield the parts in turn.
 
         Parameters
         ----------
@@ -239,9 +253,9 @@ class LawInputs:
         columns = np.arange(n_columns)
         while True:
             now, last = start + share * gap_s, start + end * gap_s
-            stop = self._next_break(now)
+            stop = self._next_break(now, run)
             over = ~(stop < last)
-            part = self._with_breaks(inputs, 0.5 * (now + np.where(over, last, stop)))
+            part = self._with_breaks(inputs, 0.5 * (now + np.where(over, last, stop)), run, start, gap_s)
             with np.errstate(divide="ignore", invalid="ignore"):
                 until = np.where(over, end, (stop - start) / gap_s)
             yield StepPart(None if len(columns) == n_columns else columns, part, share, until - share)
@@ -260,24 +274,145 @@ class LawInputs:
         """Time at which each gap begins, as printed, (n_places - 1, n_runs)."""
         return np.asarray(self.places.table.time_s[self.places.row_by_position_and_run[:-1]])
 
-    def _next_break(self, now: FloatArray) -> FloatArray:
-        """Return the time of the next jump of a parameter after `now`, of that shape; infinite if none is left."""
+    def _next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
+        """Return the time of the next jump or bend of an input after `now`, of that shape; infinite if none is left."""
         rounding = _ROUNDING * np.spacing(np.abs(self.places.table.time_s).max())
         out: Any = np.inf
+        for late in self.late.values():
+            out = np.minimum(out, late.next_break(now, run))
         for jump in self.jumps:
             out = np.minimum(out, np.where(jump.at > now + rounding, jump.at, np.inf))
         return np.asarray(out)
 
-    def _with_breaks(self, inputs: StepInputs, at: FloatArray) -> StepInputs:
-        """Return inputs with the parameters with jumps as they are around the times `at`."""
+    def _with_breaks(
+        self, inputs: StepInputs, at: FloatArray, run: IntArray, start: FloatArray, gap_s: FloatArray
+    ) -> StepInputs:
+        """Return inputs with the late columns and the parameters with jumps as they are around the times `at`."""
         constant, moving = dict(inputs.constant), dict(inputs.moving)
+        held, sloping = dict(inputs.held), dict(inputs.sloping)
+        for name, late in self.late.items():
+            value, slope = late.line_at(at, run, start)
+            if late.linear:
+                sloping[name] = value, slope * gap_s
+            else:
+                held[name] = value
         for jump in self.jumps:
             name, own = jump.parameter, jump.size * (at > jump.at)
             if name in moving:
                 moving[name] = moving[name][0] + own, moving[name][1]
             else:
                 constant[name] = constant[name] + own
-        return StepInputs(constant, moving, inputs.held, inputs.sloping)
+        return StepInputs(constant, moving, held, sloping)
+
+
+@dataclass(frozen=True, eq=False)
+class _Timeline:
+    """All rows of a table on one line of time, run after run, so that one search finds the rows of all runs."""
+
+    places: RowsInRuns
+
+    @cached_property
+    def rows(self) -> IntArray:
+        """The rows, run by run."""
+        return np.concatenate(self.places.table.rows_by_scan())
+
+    @cached_property
+    def is_first(self) -> NDArray[np.bool_]:
+        """Mask of the first row of each run, in the order of `rows`."""
+        run = self.places.table.scan[self.rows]
+        return np.append(True, run[1:] != run[:-1])
+
+    @cached_property
+    def first_and_last(self) -> tuple[FloatArray, FloatArray]:
+        """Times, as printed, at which each run begins and ends, (n_runs,) each."""
+        time = self.places.table.time_s[self.rows]
+        at = np.flatnonzero(self.is_first)
+        return time[at], time[np.append(at[1:], len(time)) - 1]
+
+    @cached_property
+    def width(self) -> float:
+        """Time of the longest run; 1 if none has any."""
+        first, last = self.first_and_last
+        return float((last - first).max()) or 1.0
+
+    @cached_property
+    def shift(self) -> FloatArray:
+        """What is added to a time of each run to place it on the line, (n_runs,)."""
+        first, _ = self.first_and_last
+        return np.asarray(2 * self.width * np.arange(len(first)) - first)
+
+    @cached_property
+    def at(self) -> FloatArray:
+        """Place of each of `rows` on the line."""
+        return np.asarray(self.places.table.time_s[self.rows] + self.shift[self.places.table.scan[self.rows]])
+
+    @cached_property
+    def rounding(self) -> float:
+        """Difference of two places that may be that of rounding alone."""
+        return float(_ROUNDING * np.spacing(max(self.at[-1], np.abs(self.places.table.time_s).max())))
+
+    def places_of(self, times: FloatArray, run: IntArray) -> FloatArray:
+        """Place times as printed, (n_samples, n_columns), of runs `run` (n_columns,), on the line."""
+        first, last = self.first_and_last
+        margin = 0.25 * self.width
+        return np.asarray(np.clip(times, first[run] - margin, last[run] + margin) + self.shift[run])
+
+
+@dataclass(frozen=True, eq=False)
+class _LateColumn:
+    """A column that acts after a dead time, (n_samples, 1); before a run, its first value holds.
+
+    `values` and `slopes` are those of the rows on the timeline, (1 or n_samples, n_points); `breaks` are the places on
+    it at which the column itself jumps, or bends where it is `linear`.
+    """
+
+    timeline: _Timeline
+    values: FloatArray
+    slopes: FloatArray
+    breaks: FloatArray
+    dead_time: FloatArray
+    linear: bool
+
+    @classmethod
+    def of(cls, timeline: _Timeline, column: FloatArray, dead_time: FloatArray, *, linear: bool) -> _LateColumn:
+        values = np.atleast_2d(column)[:, timeline.rows]
+        gap = np.append(np.diff(timeline.at), 1.0)
+        ends = np.append(timeline.is_first[1:], True) | (gap <= 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes = np.where(ends, 0.0, np.diff(values, axis=1, append=0.0) / gap) if linear else np.zeros((1, 1))
+        course = slopes if linear else values
+        changes = np.any(np.diff(course, axis=1, prepend=course[:, :1]) != 0, axis=0)
+        if linear:
+            changes |= timeline.is_first | np.append(False, gap[:-1] <= 0)
+        else:
+            changes &= ~timeline.is_first
+        return cls(timeline, values, slopes, timeline.at[changes], dead_time, linear)
+
+    def next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
+        """Return the time of the next break after `now`, (n_samples, n_columns); infinite if none is left."""
+        sought = self.timeline.places_of(now - self.dead_time, run) + self.timeline.rounding
+        at = np.append(self.breaks, np.inf)[np.searchsorted(self.breaks, sought, side="right")]
+        return np.asarray(at - self.timeline.shift[run] + self.dead_time)
+
+    def line_at(self, at: FloatArray, run: IntArray, start: FloatArray) -> Line:
+        """Return its straight line around the times `at`, (n_samples, n_columns): value at `start`, slope in time."""
+        line, earlier = self.timeline, at - self.dead_time
+        first, last = line.first_and_last
+        before = earlier < first[run]
+        inside = np.clip(earlier, first[run], last[run]) + line.shift[run]
+        row = np.searchsorted(line.at, inside, side="right") - 1
+        row = np.where(before, np.flatnonzero(line.is_first)[run], row)
+        value = _of_rows(self.values, row)
+        if not self.linear:
+            return value, 0.0
+        slope = np.where(before, 0.0, _of_rows(self.slopes, row))
+        return value + slope * (start - self.dead_time - (line.at[row] - line.shift[run])), slope
+
+
+def _of_rows(values: FloatArray, row: IntArray) -> FloatArray:
+    """Take values (1 or n_samples, n_points) at rows (1 or n_samples, n_columns)."""
+    sample = np.arange(len(values))[:, None] if len(values) > 1 else 0
+    return np.asarray(values[sample, row])
 
 
 def values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:

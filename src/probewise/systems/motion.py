@@ -128,7 +128,7 @@ def integrate_readings(
     parameters
         (n_samples, 1), or (n_samples, n_points) if they vary by row.
     columns
-        (n_points,), or (n_samples, n_points) if an effect changes them.
+        (n_points,), or (n_samples, n_points) if an effect changes them; as recorded, of those that `motion` delays.
     max_step
         Largest step at fourth order, in the unit of time; see `StepSchedule.from_fourth_order_steps`.
     """
@@ -211,6 +211,11 @@ def evaluations_per_step(motion: LawWithEffects, method: RungeKutta) -> int:
         return len(method.b)
     n_stages = len(method.b) if method is FOURTH_ORDER else N_LONGER * len(FOURTH_ORDER.b)
     return n_stages + n_stages // 2 if motion.friction else n_stages
+
+
+def n_parts_of_schedule(motion: LawWithEffects, schedule: StepSchedule) -> int:
+    """Return about how many steps and parts of steps a schedule has: a column that is late divides one in each gap."""
+    return int(schedule.n_steps.sum() + len(schedule.n_steps) * bool(motion.between_rows.dead_times))
 
 
 def time_gaps(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArray:

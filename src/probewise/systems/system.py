@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -335,17 +335,22 @@ class SystemChain:
         if system.caller is not None:
             readings = system.caller(parameters, columns)
         else:
-            readings = self._integrated_readings(parameters, columns, theta, plan)
+            of_rates = self._columns_of_rates(columns, theta, plan)
+            readings = self._integrated_readings(parameters, columns, of_rates, theta, plan)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
     def _integrated_readings(
         self,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
+        of_rates: Mapping[str, NDArray[Any]],
         theta: FloatArray,
         plan: RunTable,
     ) -> FloatArray:
-        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise."""
+        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise.
+
+        `of_rates` are the columns that its rates get, `columns` those at the rows, as `observe` gets them.
+        """
         system, law = self.system, self.system.simulator.law
         assert law is not None
 
@@ -359,7 +364,7 @@ class SystemChain:
             return (
                 self._apply_stage(Stage.RATE, motion, theta[samples], plan),
                 {name: values_of_samples(values) for name, values in parameters.items()},
-                {name: values_of_samples(values) for name, values in columns.items()},
+                {name: values_of_samples(values) for name, values in of_rates.items()},
             )
 
         try:
@@ -387,6 +392,7 @@ class SystemChain:
             self._integrated_readings(
                 {name: values_of_sample(values, k) for name, values in parameters.items()},
                 {name: values_of_sample(values, k) for name, values in columns.items()},
+                {name: values_of_sample(values, k) for name, values in of_rates.items()},
                 theta[k : k + 1],
                 plan,
             )
@@ -403,6 +409,22 @@ class SystemChain:
         return view
 
     look, read = simulated_view, readings_from_simulated_view  # their earlier names
+
+    def _columns_of_rates(
+        self, columns: Mapping[str, NDArray[Any]], theta: FloatArray, plan: RunTable
+    ) -> Mapping[str, NDArray[Any]]:
+        """Return the columns for the rates of a law: without the effects that act between the rows, and so there.
+
+        `columns` are those with all effects on inputs.
+        """
+        acting = [each for each in self._effects_with_theta_columns if each[0].stage is Stage.INPUT]
+        at_rows = [(effect, own) for effect, own in acting if _act_between_rows(effect) is None]
+        if len(at_rows) == len(acting):
+            return columns
+        out: Mapping[str, NDArray[Any]] = columns_without_reading(self.system.simulator, plan)
+        for effect, own in at_rows:
+            out = cast(Any, effect).apply(out, theta[:, own], plan)
+        return out
 
     def _between_rows(self, theta: FloatArray) -> BetweenRows:
         """Return what the effects do to inputs and parameters between the rows of a law."""

@@ -14,7 +14,7 @@ from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
-from probewise.systems.forms.form import Act, Form, Say, mean_with_sd
+from probewise.systems.forms.form import Act, ActInTime, Form, Say, mean_with_sd
 from probewise.systems.forms.frequencies import max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
@@ -27,6 +27,7 @@ _MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
 _ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, some wave fits any readings
 _LEAST_WAVES = 1.5  # in a column's range: half a period is seen again; any bend is a part of a slower wave
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
+_ROUNDING = 16  # of the last digit of a time: a dead time that ends so close before a row has ended
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
 
 Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
@@ -103,9 +104,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
                 about,
                 f"input_delay:{name}",
                 "tau_s",
-                _column_changer(
-                    name, mean_of_delayed_held_column if about.is_held_between_rows(name) else delayed_values
-                ),
+                _column_delayer(about, name),
                 about.duration,
                 about.time_unit,
                 says,
@@ -141,6 +140,17 @@ def _clock_scaler(origin: float) -> Change:
 def _column_changer(name: str, change: Change) -> Act:
     """Return the function that applies `change` to the column `name` of the inputs."""
     return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
+
+
+def _column_delayer(about: ReferenceFit, name: str) -> Act:
+    """Return the function that delays the column `name`: of a law at the rows as well as between them."""
+    held = about.is_held_between_rows(name)
+    if not held:
+        return _column_changer(name, delayed_values)
+    if about.system.simulator.law is None:
+        return _column_changer(name, mean_of_delayed_held_column)
+    at_rows = _column_changer(name, delayed_held_column)
+    return ActInTime(at_rows, lambda between, theta: between.with_dead_time(name, theta[:, :1]))
 
 
 def _amplitude_form(
@@ -258,6 +268,20 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
 
 def _column_with_dead_zone(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
+
+
+def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Return the value that a held column had one dead time before each row, (n_samples, n_points)."""
+    values = np.atleast_2d(c)
+    out = np.empty((max(len(values), len(theta)), values.shape[1]))
+    for rows in table.rows_by_scan():
+        time = table.time_s[rows]
+        earlier = time - theta[:, :1] + _ROUNDING * np.spacing(np.abs(time).max())
+        before = np.clip(np.searchsorted(time, earlier, side="right") - 1, 0, None)
+        before = np.where(theta[:, :1] == 0, np.arange(len(rows)), before)  # also of rows with the same time
+        own = np.broadcast_to(values[:, rows], (len(out), len(rows)))
+        out[:, rows] = np.take_along_axis(own, np.broadcast_to(before, own.shape), axis=1)
+    return out
 
 
 def mean_of_delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

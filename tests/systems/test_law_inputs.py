@@ -135,9 +135,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "hold"), [(n, h) for n in CASES for h in ("previous", "linear") if (n, h) != (DELAY, "linear")]
-)
+@pytest.mark.parametrize("hold", ["previous", "linear"])
+@pytest.mark.parametrize("name", CASES)
 def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold):
     """A column that is held or on straight lines, as the law says, late or not; time; a jump at its time; a run."""
     setting, how = CASES[name]
@@ -222,3 +221,19 @@ def test_the_cost_counts_the_parts_of_the_steps_that_a_late_column_divides():
     )
     _predicted(replace(about, system=system), FORMS["previous"]["input_delay:force"], np.array([[0.33]]))
     assert system.tally.n_evaluations == pytest.approx(n_calls, rel=0.25)
+
+
+def test_a_late_column_on_straight_lines_conserves_what_it_brings():
+    """x' = u: what came until the last row is all that the column brought until one dead time before."""
+    times = np.cumsum(np.random.default_rng(5).choice([0.2, 1.0, 3.0], 40))
+    flow = np.repeat([0.0, 4.0, 1.0, 6.0], 10)
+    table = RunTable({"t_s": times, "flow": flow, "y": np.zeros(40)}, time="t_s")
+    law = Law({"x": 0.0}, lambda s, p, u: {"x": p["gain"] * u["flow"] + 0 * s["x"]}, hold="linear")
+    about = _about(law, ("gain",), table, (1.0,), max_step=1.0)
+    taus = np.array([[0.07], [0.9], [4.4]])
+    found = _predicted(about, bind_forms(about)["input_delay:flow"], taus)
+    for x, tau in zip(found, taus[:, 0], strict=True):
+        fine = np.unique(np.concatenate([np.linspace(times[0] - tau, times[-1] - tau, 1000), times]))
+        fine = fine[fine <= times[-1] - tau]
+        brought = np.sum(np.diff(fine) * np.interp(0.5 * (fine[1:] + fine[:-1]), times, flow))
+        assert x[-1] == pytest.approx(brought, rel=1e-9)

@@ -145,11 +145,9 @@ def _column_changer(name: str, change: Change) -> Act:
 def _column_delayer(about: ReferenceFit, name: str) -> Act:
     """Return the function that delays the column `name`: of a law at the rows as well as between them."""
     held = about.is_held_between_rows(name)
-    if not held:
-        return _column_changer(name, delayed_values)
     if about.system.simulator.law is None:
-        return _column_changer(name, mean_of_delayed_held_column)
-    at_rows = _column_changer(name, delayed_held_column)
+        return _column_changer(name, mean_of_delayed_held_column if held else delayed_values)
+    at_rows = _column_changer(name, delayed_held_column if held else delayed_values)
     return ActInTime(at_rows, lambda between, theta: between.with_dead_time(name, theta[:, :1]))
 
 

@@ -18,6 +18,7 @@ from probewise.systems.forms.form import Act, ActInTime, Form, Say, mean_with_sd
 from probewise.systems.forms.frequencies import max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
+from probewise.systems.late_columns import ROUNDING
 from probewise.systems.table import RunTable, covariate_of_column
 
 _N_SIZES = 9
@@ -27,7 +28,6 @@ _MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
 _ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, some wave fits any readings
 _LEAST_WAVES = 1.5  # in a column's range: half a period is seen again; any bend is a part of a slower wave
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
-_ROUNDING = 16  # of the last digit of a time: a dead time that ends so close before a row has ended
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
 
 Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
@@ -274,7 +274,7 @@ def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> Fl
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
         time = table.time_s[rows]
-        earlier = time - theta[:, :1] + _ROUNDING * np.spacing(np.abs(time).max())
+        earlier = time - theta[:, :1] + ROUNDING * np.spacing(np.abs(time).max())
         before = np.clip(np.searchsorted(time, earlier, side="right") - 1, 0, None)
         before = np.where(theta[:, :1] == 0, np.arange(len(rows)), before)  # also of rows with the same time
         own = np.broadcast_to(values[:, rows], (len(out), len(rows)))

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence.held_out import Parts
-from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.ssf_forms import SsfForms
 from probewise.diagnosis.prior_odds import PriorOdds
@@ -126,6 +126,13 @@ class Apparatus(Protocol):
 
     def held_out_parts(self, recording: Recording) -> Parts:
         """Return the part of each usable reading, (n_usable,), and the names of the parts, to hold out in turn."""
+        ...
+
+    def coordinates_of_new_run(self, model: Model) -> IntArray:
+        """Return the indices of a model's coordinates of which each run has a value of its own, (n_coordinates,).
+
+        In a run that is yet to be recorded such a value is known by its prior alone.
+        """
         ...
 
     def candidate_measurements(

@@ -41,7 +41,7 @@ class RunTable:
     instrumentation
         Unit, range and step of a reading.
     like
-        Planned runs, each with the recorded run whose per-run parameters it is assumed to share.
+        Planned runs, each with the recorded run whose values of parameters and effects per run its prediction takes.
     first_row
         Number of the first row, counted from the first row of the recording to which effects are bound: 0 for that
         recording, its length for a table that follows it.

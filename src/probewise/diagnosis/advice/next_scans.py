@@ -9,13 +9,14 @@ added greedily by information per minute, as long as there is information to gai
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.advice.new_runs import slopes_split_by_run
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.scheduling import MOST_READINGS, Command, rows_by_command
@@ -50,6 +51,7 @@ class Rival:
     """A hypothesis about the mean readings (not their noise): label, model with best point z (n_params,), probability.
 
     `label` is its name in words; `root` (n_params, n_params) a square root of the covariance of z: root root^T.
+    `of_run` are the indices of the coordinates of which each run has a value of its own: in a new run it is not known.
     """
 
     label: str
@@ -57,11 +59,13 @@ class Rival:
     z: FloatArray
     root: FloatArray
     probability: float
+    of_run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def predictive_distribution(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
         mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
-        return PredictiveNormal(mean / sd, slopes @ self.root / sd)
+        shared, own = slopes_split_by_run(slopes, self.of_run, plan)
+        return PredictiveNormal(mean / sd, np.concatenate([shared @ self.root, own], axis=1) / sd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,13 +175,29 @@ def _shortlisted_command_indices(
     everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
     means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
     minutes = np.array([option.minutes for option in offered])
+    leader = max(rivals, key=lambda rival: rival.probability)
+    model = replace(leader.model, plan=everywhere)
+    of_run = model.predict_and_differentiate(leader.z, by=leader.of_run)[1] / sd if leader.of_run.size else None
     kept: dict[int, None] = {}
     for a, b in combinations(range(len(rivals)), 2):
-        square = (means[a] - means[b]) ** 2
+        apart = means[a] - means[b]
+        squares = [_squared_distance(apart[own], None if of_run is None else of_run[own]) for own in rows]
         # Separation beyond this adds nothing.
-        worth = np.minimum([square[own].sum() for own in rows], _ENOUGH) / minutes
+        worth = np.minimum(squares, _ENOUGH) / minutes
         kept |= dict.fromkeys(np.argsort(-worth, kind="stable")[:_PROMISING].tolist())
     return list(kept)
+
+
+def _squared_distance(apart: FloatArray, of_run: FloatArray | None) -> float:
+    """Return the squared distance of predictions, in noise sds, that unknown values of one new run leave.
+
+    `apart` is the difference of the predictions, (n_points,), `of_run` the slopes by those values, (n_points, k).
+    """
+    square = float(apart @ apart)
+    if of_run is None:
+        return square
+    along = of_run.T @ apart
+    return square - float(along @ np.linalg.solve(np.eye(len(along)) + of_run.T @ of_run, along))
 
 
 def _expected_log_bayes_factor_over_closest(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, measurement_separating_rivals
+from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
 from probewise.diagnosis.fitting.fit import residual_degrees_of_freedom
 from probewise.diagnosis.names import Names
@@ -40,13 +42,14 @@ def choose_next_measurement(searched: Searched, null: WeighedFit) -> NextMeasure
     sd, plan, apparatus = found[0].whitened_sd, prepared.recording.plan, prepared.apparatus
     as_calibrated = f"{apparatus.words.null} as calibrated"
     rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated) for candidate in found]
+    rivals = [_with_coordinates_of_new_run(rival, apparatus) for rival in rivals]
     if len(rivals) > 1:
         return measurement_separating_rivals(rivals, sd, plan, apparatus)
     if apparatus.is_refit_budget_spent():
         return None
     others = dict.fromkeys(n for names in ranked for n in names if n in prepared.effects)
     imagined = (_rival_with_undetected_effect(searched, null, name) for name in others)
-    tried = islice((rival for rival in imagined if rival is not None), _TRIED)
+    tried = islice((_with_coordinates_of_new_run(rival, apparatus) for rival in imagined if rival is not None), _TRIED)
     wanted = (measurement_separating_rivals([*rivals, rival], sd, plan, apparatus) for rival in tried)
     return next((asked for asked in wanted if asked is not None), None)
 
@@ -68,6 +71,10 @@ def _leading_fits(searched: Searched, null: WeighedFit, ranked: Mapping[Names, f
 def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> Rival:
     label = " with ".join(map(spoken_name, candidate.names)) or as_calibrated
     return Rival(label, candidate.found.model, candidate.found.z, _covariance_root_of_fit(candidate), probability)
+
+
+def _with_coordinates_of_new_run(rival: Rival, apparatus: Apparatus) -> Rival:
+    return replace(rival, of_run=apparatus.coordinates_of_new_run(rival.model))
 
 
 def _rival_with_undetected_effect(searched: Searched, null: WeighedFit, name: str) -> Rival | None:

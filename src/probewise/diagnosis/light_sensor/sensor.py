@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Words
-from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.ssf_forms import SsfForms
 from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, rows_repeatable_without_hands
@@ -95,6 +95,10 @@ class LightSensorApparatus:
     def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
         """Return the slopes of the readings by fine structure of the SSF, (n_usable, n_columns)."""
         return fine_structure_slopes(found.model, found.z, usable)
+
+    def coordinates_of_new_run(self, model: Model) -> IntArray:
+        """Return no indices: the sensor is the same in every scan."""
+        return np.zeros(0, dtype=np.int64)
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.evidence.held_out import LEAST_ROWS, Parts
-from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -39,6 +39,7 @@ from probewise.systems import RunTable, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.proposals import formula_forms
 from probewise.systems.forms.rates import names_in_definitions
+from probewise.systems.forms.rebinding import has_value_per_run
 from probewise.systems.forms.sorted_rows import names_of_jumps_in_sorted_rows
 from probewise.systems.forms.stop import MeterStop
 from probewise.systems.table import covariate_of_column
@@ -252,6 +253,13 @@ class SimulatorApparatus:
         n = int(usable.sum())
         part = np.minimum(np.arange(n) * _N_BLOCKS // max(n, 1), _N_BLOCKS - 1)
         return part, tuple(f"part {k + 1} of {_N_BLOCKS}" for k in range(_N_BLOCKS))
+
+    def coordinates_of_new_run(self, model: Model) -> IntArray:
+        """Return the indices of the parameters per run, and of the effects' values per run, (n_coordinates,)."""
+        names, of_run = list(self.system.marginals), {*self.system.nuisance_names}
+        parameters = [k for k, name in enumerate(names) if name in of_run]
+        values = [np.arange(model.n_params)[model.coordinate_slice(n)] for n in model.names if has_value_per_run(n)]
+        return np.concatenate([np.array(parameters, dtype=np.int64), *values])
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None

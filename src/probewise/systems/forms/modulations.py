@@ -116,7 +116,7 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool
 
 
 def value_per_run_modulation(table: RunTable) -> Modulation:
-    """Return a variation by one value per run: a_run; 0 for runs outside the recording.
+    """Return a variation by one value per run: a_run; 0 for runs outside the recording that are like none of it.
 
     The values have one scale in common, unless runs are so many that a single one could not differ much more than the
     others within the bounds of a coordinate.
@@ -125,7 +125,7 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         known = {name: k for k, name in enumerate(names)}
-        at = np.array([known.get(name, len(names)) for name in rows.scan_names])
+        at = np.array([known.get(rows.like.get(name, name), len(names)) for name in rows.scan_names])
         values = np.concatenate([theta, np.zeros((len(theta), 1))], axis=1)
         return np.asarray(values[:, at[rows.scan]])
 

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.advice.separating_readings import COUNTS, EffectEntry, ReadingsWithEffects
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
-from probewise.effects import NamedEffect, name_of_first_copy
+from probewise.effects import name_of_first_copy
 
 ALIAS_COSINE = 0.9
-_LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # least nats per reading; less is rounding error
+_LAMBDA = 8.0  # size of an effect at which it is detected for certain
+_LEAST_SHARE = 0.05  # least share of its change of the readings that counts for its lambda, whatever a fit absorbs
+_ENOUGH = 3.0  # nats that separate two effects
+_WORTHWHILE = 0.5  # nats that are worth the most readings
 
 
 @dataclass(frozen=True)
@@ -39,16 +41,24 @@ class Alias:
 
 def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
     """Return the largest principal cosine of two templates (n_points, k), a fit projected out; 0 if it absorbs one."""
-    bases = []
-    for columns in (first, second):
-        raw = np.linalg.norm(problem.law(columns)) / problem.sd
-        projected = problem.project(columns)
-        # Columns that the fit absorbs to within a thousandth are ignored.
-        if np.linalg.norm(projected) <= 1e-3 * raw:
-            return 0.0
-        u, lengths, _ = np.linalg.svd(projected, full_matrices=False)
-        bases.append(u[:, lengths > 1e-3 * lengths[0]])
+    bases = [_projected_basis(problem.project(c), problem.law(c) / problem.sd)[0] for c in (first, second)]
+    if not all(basis.size for basis in bases):
+        return 0.0
     return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
+
+
+def _projected_basis(projected: FloatArray, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Orthonormalise a template with a fit projected out, (n_rows, k); no directions if the fit absorbs it.
+
+    `whitened` is the template before, (n_points, k). Returns the directions, (n_rows, n_directions), and the amounts of
+    the columns that make each, (k, n_directions).
+    """
+    # Columns that the fit absorbs to within a thousandth are ignored.
+    if not np.linalg.norm(projected) > 1e-3 * np.linalg.norm(whitened):
+        return projected[:, :0], np.zeros((projected.shape[1], 0))
+    u, lengths, axes = np.linalg.svd(projected, full_matrices=False)
+    kept = lengths > 1e-3 * lengths[0]
+    return u[:, kept], axes[kept].T / lengths[kept]
 
 
 def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
@@ -85,7 +95,7 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
     """
     prepared, misfit_templates = searched.prepared, searched.misfit_templates
     telling: dict[str, FloatArray] = {}
-    chosen: dict[str, NamedEffect[Any]] = {}
+    chosen: dict[str, EffectEntry] = {}
     for name, effect in prepared.effects.items():
         if (
             name in prepared.noise_effect_names
@@ -97,46 +107,79 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         blocks = OrthonormalBlocks.of(problem, templates.columns)
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
-        telling[name], chosen[name] = templates.columns[best], templates.variant_of_entry(best)
-    apparatus = prepared.apparatus
-    pairs = collinear_pairs(problem, telling, otherwise=apparatus.words.settles_nothing)
-    return pairs_with_separating_scans(pairs, found, chosen, problem.sd, apparatus)
+        telling[name] = templates.columns[best]
+        chosen[name] = EffectEntry(templates.variant_of_entry(best), templates.settings[best])
+    pairs = collinear_pairs(problem, telling, otherwise=prepared.apparatus.words.settles_nothing)
+    return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
 
 
 def pairs_with_separating_scans(
-    pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float, apparatus: Apparatus
+    pairs: Sequence[Alias],
+    problem: Linearised,
+    found: Fit,
+    entries: Mapping[str, EffectEntry],
+    usable: IntArray,
+    apparatus: Apparatus,
 ) -> list[Alias]:
     """Return the pairs with `settle_by` and `readings` of the best scan that the apparatus could take.
 
-    Both effects have the size that changes the plan's readings by 0.4 noise sds rms. The best scan has the most nats
-    between the two per reading, and as many readings as three nats need, at most 102. A pair that no scan separates is
-    unchanged.
+    That is the scan that adds three nats between the two in the fewest readings, at most 102, or else the one that adds
+    most, if more than half a nat. All parameters are refitted to old and new readings, and the other effect with them;
+    of the two cases, that the one acts or the other, the harder one counts. The effect that acts has lambda 8 in the
+    old readings. A pair that no scan separates is unchanged.
+
+    Parameters
+    ----------
+    pairs
+        The aliased pairs.
+    problem, found
+        The null fit, linearised and as a fit.
+    entries
+        The entry of each effect's bank that is taken for it, by name.
+    usable
+        The rows of the plan with a usable reading.
+    apparatus
+        The apparatus that can measure more.
     """
-    names = sorted({name for pair in pairs for name in pair.effects})
-    null = found.model.predict(found.z[None, :])[0]
-    shapes = {}
-    for name in names:
-        model = found.model.with_effect(effects[name])
-        z = np.concatenate([found.z, model.z_of_last_effect(effects[name].bank()[0][:1])[0]])
-        here = model.predict(z[None, :])[0] - null
-        shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
-    best = {pair.effects: (_LEAST_NATS, pair) for pair in pairs}
-    scans = apparatus.candidate_measurements(found.model.plan, level=null)
-    if not (best and scans):
+    plan = found.model.plan
+    scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])
+    if not (pairs and scans):
         return list(pairs)
-    everywhere = apparatus.plan_of_alternatives(scans, found.model.plan)
-    null = replace(found.model, plan=everywhere).predict(found.z[None, :])[0]
-    there = {
-        name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale
-        for name, (model, z, _, scale) in shapes.items()
-    }
+    named = {name: entries[name] for name in sorted({name for pair in pairs for name in pair.effects})}
+    everywhere = apparatus.plan_of_alternatives(scans, plan)
+    readings = ReadingsWithEffects.of(problem, found, named, usable=usable, plan=everywhere, apparatus=apparatus)
+    truths = {pair.effects: _collinear_amounts(problem, readings, *pair.effects) for pair in pairs}
+    best = {pair.effects: (MOST_READINGS + 1, -_WORTHWHILE, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
-        for first, second in best:
-            sign = np.sign(float(shapes[first][2] @ shapes[second][2])) or 1.0
-            apart = there[first][rows] - sign * there[second][rows]
-            per_reading = 0.5 * float(np.sum(apart**2)) / sd**2 / len(rows)
-            if per_reading > best[first, second][0]:
-                readings = min(max(math.ceil(3.0 / per_reading), 1), MOST_READINGS)
-                advised = replace(best[first, second][1], settle_by=scan.description, readings=readings)
-                best[first, second] = (per_reading, advised)
-    return [alias for _, alias in best.values()]
+        taken = readings.in_one_run(rows)
+        for effects, amounts in truths.items():
+            one, other = effects
+            nats = _gained(taken.nats_against(one, amounts[0], other))
+            if not nats[-1] > _WORTHWHILE:
+                continue
+            nats = np.minimum(nats, _gained(taken.nats_against(other, amounts[1], one)))
+            enough = np.flatnonzero(nats >= _ENOUGH)
+            needed = int(COUNTS[enough[0]]) if enough.size else MOST_READINGS + 1
+            most = float(nats[enough[0] if enough.size else -1])
+            if (needed, -most) < best[effects][:2]:
+                asked = replace(best[effects][2], settle_by=scan.description, readings=min(needed, MOST_READINGS))
+                best[effects] = (needed, -most, asked)
+    return [alias for _, _, alias in best.values()]
+
+
+def _gained(nats: FloatArray) -> FloatArray:
+    return np.asarray(nats - nats[0])
+
+
+def _collinear_amounts(problem: Linearised, readings: ReadingsWithEffects, *names: str) -> list[FloatArray]:
+    """Return the amounts of the columns of each of two effects that make their most collinear changes, (n_columns,)."""
+    columns = [readings.old.columns[:, readings.of_effect[name]] for name in names]
+    (first, of_first), (second, of_second) = (_projected_basis(problem.project_whitened(c), c) for c in columns)
+    if not (first.size and second.size):
+        return [np.zeros(c.shape[1]) for c in columns]
+    left, _, right = np.linalg.svd(first.T @ second)
+    out = []
+    for amounts, own in ((of_first @ left[:, 0], columns[0]), (of_second @ right[0], columns[1])):
+        seen = max(1.0, _LEAST_SHARE * float(np.linalg.norm(own @ amounts)))
+        out.append(amounts * (_LAMBDA / seen))
+    return out

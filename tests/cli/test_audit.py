@@ -55,6 +55,46 @@ def test_a_calibrated_sensor_makes_a_common_rotation_visible(recording_file, sen
     assert effects["orientation_error"]["sight"] != "invisible"
 
 
+HEATER = """import numpy as np
+reading, unit, time = "temp_c", "degC", "t_s"
+parameters = {"gain": (0, 10), "start_c": ("normal", 20, 5)}
+noise = {"sd": 0.05}
+
+def simulate(p, data):
+    return p["start_c"] + p["gain"] * data["t_s"]
+"""
+
+
+def fill_in_cure(folder):
+    """Write the files that an earlier audit left, with the reading that was asked for."""
+    folder.mkdir()
+    (folder / "cure_plan.csv").write_text("x_mm,y_mm,reading\n1,2,40\n")
+    (folder / "cure_plan.json").write_text("{}")
+
+
+def test_readings_filled_into_a_cure_plan_outlive_the_audit_of_a_simulator(tmp_path):
+    (tmp_path / "heater.py").write_text(HEATER)
+    (tmp_path / "rows.csv").write_text("t_s\n" + "\n".join(map(str, range(30))) + "\n")
+    out = tmp_path / "out"
+    fill_in_cure(out)
+    assert run("audit", tmp_path / "rows.csv", "--simulator", tmp_path / "heater.py", "--out", out, "--quiet") == 0
+    assert "1,2,40" in (out / "cure_plan.csv").read_text()
+    assert (out / "cure_plan.json").exists()
+    # One that nobody filled in is of another plan now.
+    (out / "cure_plan.csv").write_text("x_mm,y_mm,reading\n1,2,\n")
+    assert run("audit", tmp_path / "rows.csv", "--simulator", tmp_path / "heater.py", "--out", out, "--quiet") == 0
+    assert not (out / "cure_plan.csv").exists()
+
+
+@pytest.mark.slow
+def test_readings_filled_into_a_cure_plan_are_not_replaced_by_the_next(recording_file, tmp_path, capsys):
+    fill_in_cure(tmp_path / "out")
+    assert run("audit", recording_file, "--out", tmp_path / "out") == 0
+    assert (tmp_path / "out" / "cure_plan_kept.csv").read_text().endswith("1,2,40\n")
+    assert (tmp_path / "out" / "cure_plan_kept.json").read_text() == "{}"
+    assert "cure_plan_kept.csv" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("harm", ["no file", "no json", "unknown pattern", "no rows", "nan place", "damaged sensor"])
 def test_input_that_cannot_be_used_is_refused_in_one_line(harm, recording_file, tmp_path, capsys):
     more = []

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_path, add_quiet, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._output import (
+    checked_output_directory,
+    holds_readings,
+    staged_output,
+    tables_and_descriptions,
+)
 from probewise.cli._simulator import add_simulator, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -75,13 +80,21 @@ def _write_results(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
 
     drawn = report.encoded_figures(audit)
     cures = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
-    with staged_output(out, inputs=(plan, plan.with_suffix(".json")), outdated=cures) as stage:
+    with staged_output(out, inputs=_files_not_to_replace(plan, out), outdated=cures) as stage:
         stage.write_json("audit.json", audit_json(audit))
         stage.write_figures(drawn)
         stage.write("report.html", report.page_html(audit, drawn, source=plan.name))
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
     return stage.notes_on_renamed_inputs
+
+
+def _files_not_to_replace(plan: Path, out: Path) -> list[Path]:
+    """List files that results must not replace: the plan, and an earlier cure plan with readings filled in."""
+    from probewise.diagnosis import CURE_PLAN
+
+    filled_in = out / CURE_PLAN
+    return tables_and_descriptions([plan, *([filled_in] if holds_readings(filled_in, "reading") else [])])
 
 
 VERB = Verb("audit", "List, before any data, the effects that a plan cannot detect or tell apart.", add_arguments, run)

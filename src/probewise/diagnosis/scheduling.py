@@ -11,6 +11,8 @@ from probewise._arrays import IntArray
 from probewise.recordings.plan import Plan
 
 MOST_READINGS = 102
+WORTHWHILE_NATS = 0.5
+"""Expected log Bayes factor below which further readings separate nothing that is worth their time."""
 
 
 class Command(Protocol):

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.advice.separating_readings import COUNTS, EffectEntry, ReadingsWithEffects
+from probewise.diagnosis.advice.separating_readings import COUNTS, Amounts, EffectEntry, ReadingsWithEffects
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
+from probewise.diagnosis.scheduling import MOST_READINGS, WORTHWHILE_NATS, rows_by_command
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
 from probewise.effects import name_of_first_copy
@@ -22,7 +22,6 @@ ALIAS_COSINE = 0.9
 _LAMBDA = 8.0  # size of an effect at which it is detected for certain
 _LEAST_SHARE = 0.05  # least share of its change of the readings that counts for its lambda, whatever a fit absorbs
 _ENOUGH = 3.0  # nats that separate two effects
-_WORTHWHILE = 0.5  # nats that are worth the most readings
 
 
 @dataclass(frozen=True)
@@ -148,16 +147,15 @@ def pairs_with_separating_scans(
     named = {name: entries[name] for name in sorted({name for pair in pairs for name in pair.effects})}
     everywhere = apparatus.plan_of_alternatives(scans, plan)
     readings = ReadingsWithEffects.of(problem, found, named, usable=usable, plan=everywhere, apparatus=apparatus)
-    truths = {pair.effects: _collinear_amounts(problem, readings, *pair.effects) for pair in pairs}
-    best = {pair.effects: (MOST_READINGS + 1, -_WORTHWHILE, pair) for pair in pairs}  # the least is best
+    sized = {pair.effects: _collinear_amounts(problem, readings, *pair.effects) for pair in pairs}
+    best = {pair.effects: (MOST_READINGS + 1, -WORTHWHILE_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
         taken = readings.in_one_run(rows)
-        for effects, amounts in truths.items():
-            one, other = effects
-            nats = _gained(taken.nats_against(one, amounts[0], other))
-            if not nats[-1] > _WORTHWHILE:
+        for effects, (one, other) in sized.items():
+            nats = _gained(taken.nats_against(one, other))
+            if not nats[-1] > WORTHWHILE_NATS:
                 continue
-            nats = np.minimum(nats, _gained(taken.nats_against(other, amounts[1], one)))
+            nats = np.minimum(nats, _gained(taken.nats_against(other, one)))
             enough = np.flatnonzero(nats >= _ENOUGH)
             needed = int(COUNTS[enough[0]]) if enough.size else MOST_READINGS + 1
             most = float(nats[enough[0] if enough.size else -1])
@@ -171,15 +169,15 @@ def _gained(nats: FloatArray) -> FloatArray:
     return np.asarray(nats - nats[0])
 
 
-def _collinear_amounts(problem: Linearised, readings: ReadingsWithEffects, *names: str) -> list[FloatArray]:
-    """Return the amounts of the columns of each of two effects that make their most collinear changes, (n_columns,)."""
+def _collinear_amounts(problem: Linearised, readings: ReadingsWithEffects, *names: str) -> list[Amounts]:
+    """Return the most collinear changes by two effects, each of lambda 8."""
     columns = [readings.old.columns[:, readings.of_effect[name]] for name in names]
     (first, of_first), (second, of_second) = (_projected_basis(problem.project_whitened(c), c) for c in columns)
     if not (first.size and second.size):
-        return [np.zeros(c.shape[1]) for c in columns]
+        return [Amounts(name, np.zeros(c.shape[1])) for name, c in zip(names, columns, strict=True)]
     left, _, right = np.linalg.svd(first.T @ second)
     out = []
-    for amounts, own in ((of_first @ left[:, 0], columns[0]), (of_second @ right[0], columns[1])):
-        seen = max(1.0, _LEAST_SHARE * float(np.linalg.norm(own @ amounts)))
-        out.append(amounts * (_LAMBDA / seen))
+    for name, values, own in zip(names, (of_first @ left[:, 0], of_second @ right[0]), columns, strict=True):
+        seen = max(1.0, _LEAST_SHARE * float(np.linalg.norm(own @ values)))
+        out.append(Amounts(name, values * (_LAMBDA / seen)))
     return out

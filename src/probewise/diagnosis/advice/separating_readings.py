@@ -43,6 +43,19 @@ class EffectEntry:
 
 
 @dataclass(frozen=True, eq=False)
+class Amounts:
+    """A change by an effect, as amounts of its columns: `values` (n_columns,)."""
+
+    name: str
+    values: FloatArray
+
+    @property
+    def variance(self) -> float:
+        """Variance of the amounts, and so of one more."""
+        return max(float(np.var(self.values)), 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
 class LinearReadings:
     """Readings linearised about a fit, in noise sds: `slopes` (n_points, n_params) and `columns` (n_points, n_columns).
 
@@ -118,20 +131,38 @@ class ReadingsWithEffects:
 class NatsInOneRun(ReadingsWithEffects):
     """Nats that separate effects after any number of readings, evenly spread, of one further run."""
 
-    def nats_against(self, name: str, amounts: FloatArray, rival: str) -> FloatArray:
-        """Return the nats by which an effect, if it acts, beats the best fit of another, (n_counts,).
+    def nats_against(self, truth: Amounts, rival: Amounts) -> FloatArray:
+        """Return the expected log Bayes factor of an effect that acts over another, which is refitted, (n_counts,).
 
-        `amounts` are those of the effect's columns, (n_columns,). NaN if one of the effects has no finite change.
+        It is a Kullback-Leibler divergence of normal distributions: of an effect with a value per run, that of the
+        further run is normal with the mean and the variance of the others. NaN if an effect has no finite change.
         """
-        columns, others = self.of_effect[name], self.of_effect[rival]
-        number = self.old.columns.shape[1] + np.cumsum(self.columns_of_run) - 1  # the run's own are behind all columns
-        others = np.concatenate([others, number[others[self.columns_of_run[others]]]])
-        along = self._projected_products[:, :, columns] @ amounts  # (n_counts, k)
-        among = self._projected_products[:, others[:, None], others] + _FREE * np.eye(len(others))
-        if not (np.isfinite(along).all() and np.isfinite(among).all()):
+        columns, others = self.of_effect[truth.name], self.of_effect[rival.name]
+        own, others_own = self._numbers_of_own_values(columns), self._numbers_of_own_values(others)
+        every, fitted = np.concatenate([columns, own]), np.concatenate([others, others_own])
+        products = self._projected_products
+        among = products[:, fitted[:, None], fitted]
+        along = products[:, fitted[:, None], every]
+        left = products[:, every[:, None], every]
+        if not (np.isfinite(among).all() and np.isfinite(left).all()):
             return np.full(len(COUNTS), np.nan)
-        imitated = np.linalg.solve(among, along[:, others, None])[:, :, 0]
-        return np.asarray(0.5 * (along[:, columns] @ amounts - np.sum(along[:, others] * imitated, axis=1)))
+        prior = np.concatenate([np.full(len(others), _FREE), np.full(len(others_own), 1 / rival.variance)])
+        left = left - along.transpose(0, 2, 1) @ np.linalg.solve(among + np.diag(prior), along)
+        n = len(columns)
+        twice = np.einsum("i,mij,j->m", truth.values, left[:, :n, :n], truth.values)
+        if own.size:
+            spread = np.eye(len(own)) + truth.variance * products[:, own[:, None], own]
+            twice += truth.variance * np.einsum("mii->m", left[:, n:, n:]) - np.linalg.slogdet(spread)[1]
+        if others_own.size:
+            spread = np.eye(len(others_own)) + rival.variance * products[:, others_own[:, None], others_own]
+            absorbed = len(others_own) - np.einsum("mii->m", np.linalg.inv(spread))
+            twice += np.linalg.slogdet(spread)[1] - absorbed
+        return np.asarray(0.5 * twice)
+
+    def _numbers_of_own_values(self, columns: IntArray) -> IntArray:
+        """Return the numbers, behind all columns, of the columns by the further run's own values of an effect."""
+        number = self.old.columns.shape[1] + np.cumsum(self.columns_of_run) - 1
+        return np.asarray(number[columns[self.columns_of_run[columns]]])
 
     @cached_property
     def _projected_products(self) -> FloatArray:
@@ -139,7 +170,10 @@ class NatsInOneRun(ReadingsWithEffects):
         n_old, n_params = self.old.slopes.shape
         own, own_columns = self.further.slopes[:, self.of_run], self.further.columns[:, self.columns_of_run]
         shared, shared_columns = self.further.slopes.copy(), self.further.columns.copy()
-        shared[:, self.of_run], shared_columns[:, self.columns_of_run] = 0.0, 0.0
+        shared[:, self.of_run] = 0.0
+        for numbers in self.of_effect.values():  # the new run's value is about the mean of the others
+            if self.columns_of_run[numbers].all():
+                shared_columns[:, numbers] = shared_columns[:, numbers].mean(axis=1, keepdims=True)
         absent, absent_columns = np.zeros((n_old, own.shape[1])), np.zeros((n_old, own_columns.shape[1]))
         before = np.concatenate([self.old.slopes, absent, self.old.columns, absent_columns], axis=1)
         after = np.concatenate([shared, own, shared_columns, own_columns], axis=1)

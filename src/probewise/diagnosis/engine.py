@@ -18,8 +18,9 @@ from probewise.diagnosis.advice.rivals import choose_next_measurement
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
-from probewise.diagnosis.judgement.judged import judge
+from probewise.diagnosis.judgement.judged import Judged, judge
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.prepared import Prepared, prepare
 from probewise.diagnosis.repair.best_repair import BestRepair, judged_and_best_repair
 from probewise.diagnosis.repair.correction import improvement_and_correction
@@ -27,6 +28,7 @@ from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples, draw
 from probewise.diagnosis.repair.places import locate_effects_and_residuals
 from probewise.diagnosis.repair.repair import repair_of
 from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.scheduling import WORTHWHILE_NATS
 from probewise.diagnosis.search.formulas import search_with_formulas
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
@@ -35,7 +37,7 @@ from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agr
 from probewise.diagnosis.verdict_report.beyond import formula_of, remainder_of
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
-from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
+from probewise.diagnosis.verdict_report.reason import Grounds, combinations_in_reason, reason_of
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.effects.vocabulary import require_effect_classes, sentence_from_samples
 from probewise.progress import Progress, silent
@@ -147,7 +149,7 @@ def diagnosis_of_search(
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)
     grounds = replace(
-        _facts_for_reason(searched, test, best, drawn=drawn, found=found, where=where, asked=asked),
+        _facts_for_reason(searched, test, judged, best, drawn=drawn, found=found, where=where, asked=asked),
         nuisances=noise.nuisances,
     )
     reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
@@ -168,6 +170,7 @@ def diagnosis_of_search(
 def _facts_for_reason(
     searched: Searched,
     test: GlobalTest,
+    judged: Judged,
     best: BestRepair,
     *,
     drawn: NullBestAndRepairedSamples,
@@ -191,5 +194,27 @@ def _facts_for_reason(
         beside=beside.names if beside else (),
         shows_in=tuple(place.covariate for place in where),
         p_value_after=best.improvement.p_value_after,
-        settles=None if asked is None else asked.description,
+        settles=_separating_readings_in_words(searched, judged, asked),
     )
+
+
+def _separating_readings_in_words(searched: Searched, judged: Judged, asked: NextMeasurement | None) -> str | None:
+    """Return the next readings in words if they separate the hypotheses that the reason names; "" if none do.
+
+    None if that is not known: these hypotheses differ in their noise alone, or are not among those compared.
+    """
+    formulas = {names for names in asked.effects if effects_out_of_vocabulary(names)} if asked else set()
+    named = set[Names]()
+    for names in combinations_in_reason(judged):
+        if names == ("unknown",):  # without a formula it predicts what the null does
+            named |= formulas or {()}
+        else:
+            named.add(tuple(sorted({*names} - searched.prepared.noise_effect_names)))
+    if len(named) < 2:
+        return None
+    if asked is None:
+        return ""
+    nats = asked.nats_among(named)
+    if nats is None:
+        return None
+    return asked.description if nats >= WORTHWHILE_NATS else ""

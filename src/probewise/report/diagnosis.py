@@ -10,6 +10,7 @@ from probewise.diagnosis import (
     ALARM,
     MOST_READINGS,
     TO_SEPARATE,
+    WORTHWHILE_NATS,
     Alias,
     Diagnosis,
     EffectFound,
@@ -59,7 +60,6 @@ _MOST_PLACES = 3
 _MOST_CREDIBLE = 6
 _LIKELY = 0.05  # probability of an effect from which it has a paragraph of its own
 _CHANCE = 0.05  # p-value above which chance is a sufficient explanation
-_TELLS_SOMETHING = 0.5  # nats
 _WEAK = " too weak to be detected so far"
 _IN_UNIT_OF_TIME = ("tau_s", "at_s")
 _NOISE_CAPTIONS = {
@@ -278,7 +278,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if not isinstance(diagnosis.apparatus, SimulatorApparatus) or diagnosis.apparatus.tells_duration:
         asked += f", about {duration_text(plan.minutes)}"
     description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
-    if told < _TELLS_SOMETHING:
+    if told < WORTHWHILE_NATS:
         return (
             f"Nothing that is worth the time: the best plan of up to {MOST_READINGS} readings has an expected log "
             f"Bayes factor of {number_text(told, 1)} nats. It is in {file}: {description} ({asked})."

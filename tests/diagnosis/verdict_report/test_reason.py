@@ -73,6 +73,12 @@ SAID = [
         "repeat run 2.",
     ),
     (
+        judged("cannot_tell"),
+        {"settles": ""},
+        "These 100 readings cannot tell apart lag (0.70), clean (0.20) and unknown (0.10); no reading tells them "
+        "apart.",
+    ),
+    (
         judged("unknown", ("unknown",)),
         {"beside": ("lag",), "shows_in": ("time", "level")},
         "Beside lag, something is missing (p = 0.0001) that no named effect explains; it shows most in time.",

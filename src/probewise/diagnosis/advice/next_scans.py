@@ -8,9 +8,9 @@ added greedily by information per minute, as long as there is information to gai
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 from scipy.special import logsumexp
@@ -19,6 +19,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.advice.new_runs import slopes_split_by_run
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.scheduling import MOST_READINGS, Command, rows_by_command
 from probewise.recordings.plan import Plan
 
@@ -36,7 +37,9 @@ class NextMeasurement:
     """Scans to take next, as one plan, with the information that they are expected to give.
 
     `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
-    true. `between`: each of the hypotheses, in words. `minutes`: duration with breaks.
+    true. `between`: each of the hypotheses, in words; `effects`: the effects of each; `probabilities`: of each, as used
+    here, (n_rivals,); `nats` (n_rivals, n_rivals): expected log Bayes factor of each, if true, over each other.
+    `minutes`: duration with breaks.
     """
 
     plan: Plan
@@ -44,6 +47,17 @@ class NextMeasurement:
     minutes: float
     expected_log_bayes_factor: float
     between: tuple[str, ...]
+    effects: tuple[Names, ...]
+    probabilities: FloatArray
+    nats: FloatArray
+
+    def nats_among(self, hypotheses: Collection[Names]) -> float | None:
+        """Return the expected log Bayes factor of the true one of some of the hypotheses over its closest rival there.
+
+        None if fewer than two of them were compared.
+        """
+        at = [k for k, names in enumerate(self.effects) if names in hypotheses]
+        return None if len(at) < 2 else _mean_over_closest(self.nats[np.ix_(at, at)], self.probabilities[at])
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,14 +149,16 @@ def measurement_separating_rivals(
     if not chosen:
         return None
     scans = [offered[k] for k in chosen]
+    nats = _expected_log_bayes_factors([predictive.take_readings(taken) for predictive in predictives])
     return NextMeasurement(
         apparatus.plan_of_sequence(scans, plan),
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
-        _expected_log_bayes_factor_over_closest(
-            [predictive.take_readings(taken) for predictive in predictives], weights
-        ),
+        _mean_over_closest(nats, weights),
         tuple(rival.label for rival in rivals),
+        tuple(tuple(sorted(rival.model.names)) for rival in rivals),
+        weights,
+        nats,
     )
 
 
@@ -200,18 +216,20 @@ def _squared_distance(apart: FloatArray, of_run: FloatArray | None) -> float:
     return square - float(along @ np.linalg.solve(np.eye(len(along)) + of_run.T @ of_run, along))
 
 
-def _expected_log_bayes_factor_over_closest(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
-    """Return the expected log Bayes factor of the truth over its closest rival, in nats, averaged by `weights`."""
+def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> FloatArray:
+    """Return the expected log Bayes factor of each hypothesis, if true, over each other, (n, n), in nats."""
     covariances = [predictive.covariance for predictive in predictives]
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
-    hardest = []
-    for a, true in enumerate(predictives):
-        divergences = []
-        for b, other in enumerate(predictives):
-            if a != b:
-                apart = true.mean - other.mean
-                trace = float(np.sum(inverse[b] * covariances[a])) - len(apart)
-                divergences.append(0.5 * (trace + log_dets[b] - log_dets[a] + apart @ inverse[b] @ apart))
-        hardest.append(min(divergences))
-    return max(float(weights @ hardest), 0.0)
+    out = np.zeros((len(predictives), len(predictives)))
+    for a, b in permutations(range(len(predictives)), 2):
+        apart = predictives[a].mean - predictives[b].mean
+        trace = float(np.sum(inverse[b] * covariances[a])) - len(apart)
+        out[a, b] = 0.5 * (trace + log_dets[b] - log_dets[a] + apart @ inverse[b] @ apart)
+    return out
+
+
+def _mean_over_closest(nats: FloatArray, weights: FloatArray) -> float:
+    """Return the log Bayes factor of the truth over its closest rival, averaged by weights (n,); `nats` (n, n)."""
+    others = np.where(np.eye(len(nats), dtype=np.bool_), np.inf, nats)
+    return max(float(weights @ others.min(axis=1) / weights.sum()), 0.0)

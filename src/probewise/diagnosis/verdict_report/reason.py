@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.verdict_report.words import p_in_words
@@ -43,7 +44,8 @@ class Grounds:
     p_value_after
         p-value of the global test of the repaired model.
     settles
-        The readings that would separate the hypotheses, in words; None if there are none.
+        The readings that would separate the hypotheses that the sentence names, in words; "" if no such readings do,
+        None if that is not known.
     nuisances
         Sentences on the noise that was found beside what has a name in the vocabulary.
     """
@@ -76,6 +78,13 @@ def reason_of(judged: Judged, grounds: Grounds) -> str:
         "named": _named_sentence,
     }
     return say[judged.verdict](judged, grounds)
+
+
+def combinations_in_reason(judged: Judged) -> list[Names]:
+    """Return the effects of the hypotheses that the reason of `cannot_tell` names."""
+    if judged.shared:
+        return [tuple(sorted({*judged.shared, *h.effects})) for h in _rivals_to_name(judged.beside_shared)]
+    return [h.effects for h in _rivals_to_name(judged.hypotheses)]
 
 
 def _withdrawn_sentence(judged: Judged, grounds: Grounds) -> str:
@@ -117,7 +126,9 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
 
 
 def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
-    cure = "" if grounds.settles is None else f"{TO_SEPARATE}{grounds.settles}"
+    cure = "" if grounds.settles is None else f"; {grounds.words.settles_nothing}"
+    if grounds.settles:
+        cure = f"{TO_SEPARATE}{grounds.settles}"
     said = _joined_effect_sentences(judged.shared, grounds)
     if said:
         return f"{said}. {_open_beside_shared(judged, grounds)}{cure}."
@@ -131,9 +142,13 @@ def _open_beside_shared(judged: Judged, grounds: Grounds) -> str:
 
 
 def _rivals_in_words(hypotheses: Sequence[Hypothesis], *, nothing: str = "clean") -> str:
-    rivals = [h for k, h in enumerate(hypotheses[:3]) if k < 2 or h.probability >= _WORTH_NAMING]
-    *others, last = (f"{h.label if h.effects else nothing} ({h.probability:.2f})" for h in rivals)
+    named = _rivals_to_name(hypotheses)
+    *others, last = (f"{h.label if h.effects else nothing} ({h.probability:.2f})" for h in named)
     return f"{', '.join(others)} and {last}" if others else last
+
+
+def _rivals_to_name(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    return [h for k, h in enumerate(hypotheses[:3]) if k < 2 or h.probability >= _WORTH_NAMING]
 
 
 def _noise_sentence(judged: Judged, grounds: Grounds) -> str:

@@ -7,6 +7,7 @@ import pytest
 from heater import heater, runs
 
 from probewise.diagnosis import audit_system
+from probewise.diagnosis.system import audit as system_audit
 from probewise.errors import ParameterError
 from probewise.systems import Noise, Simulator
 
@@ -84,3 +85,28 @@ def test_a_plan_by_the_epoch_shows_what_the_same_plan_from_0_shows():
     for name, (detectability, share) in expected.items():
         assert found[name][0] == detectability
         assert found[name][1] == pytest.approx(share, abs=1e-3)
+
+
+@pytest.mark.parametrize("most", [100, 200])
+def test_a_part_of_a_long_table_tells_the_sizes_that_all_of_it_shows(most, monkeypatch):
+    whole = audit_system(heater(), runs(n=150))
+    monkeypatch.setattr(system_audit, "_MOST_ROWS", most)
+    part = {effect.name: effect.smallest for effect in audit_system(heater(), runs(n=150)).effects}
+    ratios = [
+        part[effect.name][0].amount / effect.smallest[0].amount
+        for effect in whole.effects
+        if effect.smallest and effect.smallest[0].amount and part[effect.name] and part[effect.name][0].amount
+    ]
+    assert len(ratios) > 10
+    np.testing.assert_allclose(np.median(ratios), 1.0, atol=0.05)
+    assert np.mean(np.abs(np.log(ratios)) < 0.2) > 0.8
+
+
+def test_rows_that_are_used_do_not_keep_step_with_a_table_that_repeats(monkeypatch):
+    """Power switches every second row; every fourth row would have it constant."""
+    monkeypatch.setattr(system_audit, "_MOST_ROWS", 75)
+    table = runs(n=100)
+    table = table.with_columns({"power_w": np.where(np.arange(300) % 2, 4.0, 2.0), "room_c": np.arange(300) % 4 / 1.0})
+    found = audit_system(heater(), table)
+    assert of(found, "sensitivity:room_c").detectability != "invisible"
+    assert of(found, "depends:gain:power_w").detectability != "invisible"

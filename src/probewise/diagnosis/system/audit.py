@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.audit.detectability import LAMBDA, ExpectedSensor, PlanTemplates
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, audits_and_cosines
 from probewise.diagnosis.system.apparatus import ON_NOISE, SimulatorApparatus
@@ -23,7 +23,8 @@ from probewise.systems.table import median_sd_of_column
 _STANDS_STILL = 0.02  # noise sds by which predictions may change when the integration step is halved
 _NOISE = 0.01  # of the range of the readings, if no noise is declared
 _SETTINGS = 64  # of an effect's bank
-_MOST_ROWS = 1200  # rows used; of a longer table every second, third, ...
+_MOST_ROWS = 1200  # rows used
+_GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> PlanAudit:
@@ -69,9 +70,10 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
     expected = ExpectedSensor(cast(Any, system), z, (float(predicted.min()), float(predicted.max())), sd)
-    stride = -(-len(own) // _MOST_ROWS)
     laid = PlanTemplates.of_scaled_effects(expected, cast(Plan, own), built, most=_SETTINGS)
-    laid = replace(laid, slopes=laid.slopes[::stride], columns=laid.columns[::stride])
+    rows = _evenly_spread_rows(len(own), _MOST_ROWS)
+    each = math.sqrt(len(own) / len(rows))  # every row taken stands for several, with as much information as they have
+    laid = replace(laid, slopes=each * laid.slopes[rows], columns=each * laid.columns[rows])
     found, cosines = audits_and_cosines(laid, cast(Any, names), simulator.unit)
     effects = tuple(_with_rows_needed(effect, reasons) for effect in found)
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
@@ -86,6 +88,17 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
         words=words,
         classes=_alias_classes(effects),
     )
+
+
+def _evenly_spread_rows(n_points: int, most: int) -> IntArray:
+    """Return all row numbers of a table or, of a longer one, `most` of them: one in each of as many equal stretches.
+
+    Its place there differs from stretch to stretch, by the golden ratio, so that no column of the table keeps step.
+    """
+    if n_points <= most:
+        return np.arange(n_points)
+    stretch = np.arange(most)
+    return np.asarray((stretch + stretch * _GOLDEN % 1.0) * n_points / most, dtype=np.int64)
 
 
 def _without_reading_column(simulator: Simulator, table: RunTable) -> RunTable:

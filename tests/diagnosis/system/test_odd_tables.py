@@ -118,3 +118,8 @@ def test_a_missing_reading_is_no_reason_why_a_law_predicts_nothing_later_in_the_
     table = table_for(simulator, {"t": _T, "y": np.where(np.arange(_N) == 2, np.nan, _Y)})
     with pytest.raises(ParameterError, match=r"rates is 'no finite reading in 19 of 40 rows, first in row 23'"):
         prepare_system(simulator, table)
+
+
+def test_a_table_of_one_row_is_refused_in_one_line():
+    with pytest.raises(ParameterError, match="the table is 'one row'; allowed: 12 rows or more"):
+        diagnose_system(_line(), {"x": [0.5], "y": [2.0]}, rng=np.random.default_rng(1))

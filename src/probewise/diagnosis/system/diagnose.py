@@ -114,6 +114,8 @@ def prepare_system(
         notes=(*notes, *note_on_row_order(simulator, table)),
     )
     system = System.of(simulator, table)
+    if with_effects and len(table) < 2:  # nothing can change along it
+        raise ParameterError("the table", "one row", f"{system.least_readings} rows or more, not all readings equal")
     plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)
     if recording.plan is not plan:
         table = replace(table, columns=cast(RunTable, recording.plan).columns)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis import audit_system, diagnose_system
+from probewise.diagnosis import audit_system, diagnose_system, fit_simulator
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.errors import ParameterError
 from probewise.systems import Law, Simulator, table_for
@@ -123,3 +123,11 @@ def test_a_missing_reading_is_no_reason_why_a_law_predicts_nothing_later_in_the_
 def test_a_table_of_one_row_is_refused_in_one_line():
     with pytest.raises(ParameterError, match="the table is 'one row'; allowed: 12 rows or more"):
         diagnose_system(_line(), {"x": [0.5], "y": [2.0]}, rng=np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("task", [diagnose_system, fit_simulator])
+@pytest.mark.parametrize("n", [1, 40])
+def test_a_table_without_a_reading_is_refused_before_any_fit(task, n):
+    """Warnings are errors here, and a fit to no reading gives some."""
+    with pytest.raises(ParameterError, match="allowed: 12 "):
+        task(_line(), {"x": _X[:n], "y": np.full(n, np.nan)}, rng=np.random.default_rng(1))

@@ -120,6 +120,10 @@ def prepare_system(
     if recording.plan is not plan:
         table = replace(table, columns=cast(RunTable, recording.plan).columns)
     recording, stop = without_readings_at_stop(simulator, table, recording)
+    if not recording.usable.any():
+        raise ParameterError(
+            "usable readings", 0, f"{system.least_readings} or more; column {simulator.reading} has none"
+        )
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)

@@ -37,6 +37,8 @@ def test_the_matrix_takes_its_statuses_by_their_old_name_with_a_warning():
     ("size", "said"),
     [
         (DetectableSize("per_volt", "1/V", 0.069), "relative change 0.069 per V"),
+        (DetectableSize("a", "1 per temp_c", 0.069), "a 0.069 per temp_c"),
+        (DetectableSize("b", "1/s", 0.069), "b 0.069 per s"),
         (DetectableSize("per_mm_x", "LEGO/mm", 0.014), "along X 0.014 LEGO units per mm"),
         (DetectableSize("amp", "LEGO", 0.55), "amplitude 0.55 LEGO units"),
         (DetectableSize("mm_per_mm", "mm/mm", 0.0015), "slope 0.0015 mm per mm"),

@@ -73,7 +73,9 @@ def _detectable_size_in_words(parameter: str, unit: str, amount: float | None) -
 
 
 def _unit_in_words(unit: str) -> str:
-    """Write "1/V" as "per V" and "LEGO/h" as "LEGO units per h"; a user's own unit is kept."""
+    """Write "1/V" as "per V", as "1 per V" too, and "LEGO/h" as "LEGO units per h"; a user's own unit is kept."""
+    if unit.startswith("1 per "):
+        return unit.removeprefix("1 ")
     upper, _, lower = unit.partition("/")
     if upper not in ("1", "LEGO", "mm"):
         return unit_name(unit)

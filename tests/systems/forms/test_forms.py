@@ -553,3 +553,12 @@ def test_a_fast_wave_in_times_that_come_in_clusters_is_tried_where_the_residuals
 
 def test_evenly_spaced_rows_suggest_no_further_frequencies():
     assert FORMS["interference"].suggested is None
+
+
+def test_a_rate_of_change_of_what_has_no_unit_counts_from_one():
+    system = System.of(_simulator(), TABLE)
+    units = {name: form.units for name, form in bind_forms(ReferenceFit(system, TABLE, np.zeros(2), SD)).items()}
+    assert units["depends:gain:room_c"] == ("1 per room_c",)
+    assert units["drifts:gain"] == ("1/s",)
+    assert units["sensitivity:room_c"] == ("V per room_c",)
+    assert not [name for name, own in units.items() for unit in own if unit.startswith((" ", "/"))]

@@ -59,7 +59,7 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
         at_rows=lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
         marginals=lambda a: {"a": a},
         entries=_single_entry_bank,
-        units=lambda unit: (f"{unit}/{time_unit}",),
+        units=lambda unit: (f"{unit or '1'}/{time_unit}",),
         says=lambda what, unit, mean, sd: f"{what} drifts by {mean_with_sd(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
         counted_from=origin_in_words(table.time, origin, time_unit),
@@ -79,7 +79,7 @@ def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
         at_rows=at_rows,
         marginals=lambda a: {"a": a},
         entries=_single_entry_bank,
-        units=lambda unit: (f"{unit} per {name}",),
+        units=lambda unit: (f"{unit or '1'} per {name}",),
         says=lambda what, unit, mean, sd: f"{what} changes by {mean_with_sd(mean[0], sd[0], unit)} per unit of {name}",
         covariates=(covariate_of_column(name),),
     )

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
-from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.bank import TemplateBank
@@ -60,14 +59,10 @@ def log_bayes_factors_of_pairs(
     blocks = OrthonormalBlocks.of_projected_templates(np.concatenate(both, axis=1), [c.shape[1] for c in both])
     together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_kept)[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
-    out: dict[Names, float] = {}
-    at = 0
-    for a, b in pairs:
-        block = slice(at, at + len(best[a]) * len(best[b]))
-        at = block.stop
-        gained = float(logsumexp(together[block]) - logsumexp(apart[block]))
-        out[a, b] = log_mean_exp(singles[a]) + log_mean_exp(singles[b]) + gained
-    return out
+    starts = np.concatenate([[0], np.cumsum([len(best[a]) * len(best[b]) for a, b in pairs])[:-1]])
+    gained = np.logaddexp.reduceat(together, starts) - np.logaddexp.reduceat(apart, starts)
+    alone = {name: log_mean_exp(scores) for name, scores in singles.items()}
+    return {(a, b): alone[a] + alone[b] + float(own) for (a, b), own in zip(pairs, gained, strict=True)}
 
 
 def _joined_templates(first: FloatArray, second: FloatArray) -> FloatArray:

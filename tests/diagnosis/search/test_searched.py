@@ -54,6 +54,20 @@ def test_orders_are_those_of_the_clean_mean_alone():
     assert posterior().order_probabilities == {1: pytest.approx(0.25), 2: pytest.approx(0.75)}
 
 
+def test_orders_are_averaged_over_noises_by_the_prior_of_the_noise():
+    """Order 2 leads only under outliers; by prior times evidence, not by evidence alone, order 1 is more probable."""
+    by_noise = {1: {(): 0.0, ("outliers",): 0.0}, 2: {(): -1.0, ("outliers",): 0.5}}
+    fits = {
+        (n, ()): Fit(evidence={noise: SimpleNamespace(log_z=log_z) for noise, log_z in own.items()})
+        for n, own in by_noise.items()
+    }
+    weight = {noise: math.exp(PRIOR.log_prior_on_noise(noise, alone=True)) for noise in ((), ("outliers",))}
+    first, second = (sum(weight[noise] * math.exp(z) for noise, z in by_noise[n].items()) for n in (1, 2))
+    found = posterior_of(Evidences(fits), PRIOR, certain=(), n_forms=2).order_probabilities
+    assert found[1] == pytest.approx(first / (first + second))
+    assert found[1] > 0.5
+
+
 def test_evidence_that_is_moved_moves_what_is_unknown_beside_it():
     moved = EVIDENCES.with_log_evidence_shifted({(1, ()): 2.0})
     assert moved.unknown[1, (), ()] == 3.0

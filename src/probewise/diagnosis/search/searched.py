@@ -192,12 +192,18 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
     for (names, noise), value in evidences.screened.items():
         log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
+
+    def log_prior_on_noise(noise: Names, *, alone: bool) -> float:
+        return prior.log_prior_on_noise(tuple(n for n in noise if n not in certain), alone=alone)
+
     for names, noise in log_p:
-        uncertain = tuple(n for n in noise if n not in certain)
-        log_p[names, noise] += -math.log(n_forms) + prior.log_prior_on_noise(uncertain, alone=not names)
+        log_p[names, noise] += -math.log(n_forms) + log_prior_on_noise(noise, alone=not names)
     total = float(logsumexp(list(log_p.values())))
     nulls = {n: fit for (n, names), fit in evidences.fits.items() if not names}
-    clean_by_order = {n: float(logsumexp([e.log_z for e in fit.evidence.values()])) for n, fit in nulls.items()}
+    clean_by_order = {
+        n: float(logsumexp([e.log_z + log_prior_on_noise(noise, alone=True) for noise, e in fit.evidence.items()]))
+        for n, fit in nulls.items()
+    }
     norm = float(logsumexp(list(clean_by_order.values())))
     return Posterior(
         {key: math.exp(value - total) for key, value in log_p.items()},

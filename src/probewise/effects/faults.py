@@ -29,6 +29,7 @@ class Outliers(NoiseEffect):
     stage = Stage.NOISE
     units = ("1", "noise sd")
     covariates = ("level", "time")
+    nodes_per_parameter = (4, 4)
 
     @cached_property
     def prior(self) -> Product:
@@ -36,10 +37,6 @@ class Outliers(NoiseEffect):
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
-
-    def bank(self) -> FloatArray:
-        u = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) + 0.5) / 4
-        return self.prior.from_unit_cube(u)[:, None, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -65,6 +62,7 @@ class Dropouts(NoiseEffect):
     stage = Stage.NOISE
     units = ("1", "reading")
     covariates = ("level", "time")
+    nodes_per_parameter = ()  # they depend on the readings, and the share's lie close
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:

@@ -34,6 +34,7 @@ class Quantisation(NoiseEffect):
     units = ("reading",)
     covariates = ("lattice",)
     n_nodes = 16
+    nodes_per_parameter = ()  # one node, from the readings
     seen_above: ClassVar[float] = 0.3
     """Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
 

@@ -160,6 +160,7 @@ class NoisePerRun(NoiseEffect):
     words = "noise that differs from run to run"
     stage = Stage.NOISE
     covariates = ("run",)
+    nodes_per_parameter = ()  # they are most probable values about a fit
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:

@@ -196,9 +196,19 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
         """Return the change of readings that were predicted without it, same shape; 0 unless it `changes_the_mean`."""
         return np.zeros_like(predicted)
 
+    @property
+    def nodes_per_parameter(self) -> tuple[int, ...]:
+        """Numbers of nodes along each parameter, whose product is the bank; () if the nodes depend on the fit.
+
+        Where a fit determines a parameter better than its nodes lie apart, they are refined.
+        """
+        return (self.n_nodes,)
+
     def bank(self) -> FloatArray:
-        """Return equally weighted nodes of the prior of its one parameter, (n_nodes, 1, 1)."""
-        return self.prior.from_unit_cube((np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes)[:, None, :]
+        """Return equally weighted nodes of the prior, (n_nodes, 1, n_params): midpoints along each parameter."""
+        axes = [(np.arange(n) + 0.5) / n for n in self.nodes_per_parameter or (self.n_nodes,)]
+        u = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
+        return self.prior.from_unit_cube(u)[:, None, :]
 
     def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
         """Return equally weighted nodes of the prior given a fit, (n_nodes, n_params); none where the fit excludes it.

@@ -79,22 +79,27 @@ def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     white. If the floor of the sd exceeds the residuals, the integral over the sd is taken as wide as without a floor.
     """
     every = noise.nodes_for_predictions(found.predicted)
+    out = log_evidence_under(found, every.laws) + every.log_weights
+    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every)
+
+
+def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw]) -> FloatArray:
+    """Return the log evidence of a fit under each noise distribution, (n_laws,); minus infinity if impossible."""
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
-    out = np.empty(len(every.laws))
-    normal = [node for node, law in enumerate(every.laws) if law.whitened_density.is_normal]
+    out = np.empty(len(laws))
+    normal = [node for node, law in enumerate(laws) if law.whitened_density.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
-        out[nodes] = _normal_log_evidences(found, [every.laws[node] for node in nodes], joined)
+        out[nodes] = _normal_log_evidences(found, [laws[node] for node in nodes], joined)
     tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # grouped by whitening, rounded noise separately
     for node in sorted({*range(len(out))} - {*normal}):
-        law = every.laws[node]
+        law = laws[node]
         tailed.setdefault((law.whitening_key, law.flat > 0), []).append(node)
     for nodes in tailed.values():
-        out[nodes] = _tailed_log_evidences(found, [every.laws[node] for node in nodes], joined)
-    out += [law.log_extra for law in every.laws]
-    out += every.log_weights + log_multiplicity(found.model.sensor)
+        out[nodes] = _tailed_log_evidences(found, [laws[node] for node in nodes], joined)
+    out += np.array([law.log_extra for law in laws]) + log_multiplicity(found.model.sensor)
     out[np.isnan(out)] = -math.inf  # slopes or residuals whose squares overflow: impossible
-    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every)
+    return out
 
 
 def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:

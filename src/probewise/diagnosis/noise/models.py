@@ -83,11 +83,7 @@ class NoiseModel:
 
         `predicted` are predictions of the usable rows, (n_usable,). With `rounding`, each node is a noise sd.
         """
-        residuals = (self._usable_readings - predicted) / self._relative_sd
-        # Rounded readings can all be as predicted; rounding errors alone are not outliers.
-        sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12)) or 1.0
-        span = float(np.ptp(predicted)) or 1.0
-        seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
+        residuals, sd = self._residuals_and_rough_sd(predicted)
         rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._usable_readings)
         banks = [self._weighted_nodes(effect, residuals / sd, rows) for effect in self.effects]
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
@@ -96,9 +92,7 @@ class NoiseModel:
                 [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
             )
             log_weights = (log_weights[:, None] + log_each).ravel()
-        noise = self._noise_parameters_at_nodes(settings, seen)
-        far = np.abs(residuals) > _FAR * sd
-        laws = tuple(self._law_at_node(noise, k, far) for k in range(len(settings)))
+        laws = self.laws_at(settings, predicted)
         if self.rounding:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
@@ -108,6 +102,24 @@ class NoiseModel:
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
             return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
         return NoiseNodes(settings, laws, log_weights)
+
+    def laws_at(self, settings: FloatArray, predicted: FloatArray) -> tuple[NoiseLaw, ...]:
+        """Return the noise distributions at settings of the parameters, (n_nodes, n_params), without rounding.
+
+        `predicted` are predictions of the usable rows, (n_usable,).
+        """
+        residuals, sd = self._residuals_and_rough_sd(predicted)
+        span = float(np.ptp(predicted)) or 1.0
+        noise = self._noise_parameters_at_nodes(settings, np.clip((predicted - predicted.min()) / span, 0.0, 1.0))
+        far = np.abs(residuals) > _FAR * sd
+        return tuple(self._law_at_node(noise, k, far) for k in range(len(settings)))
+
+    def _residuals_and_rough_sd(self, predicted: FloatArray) -> tuple[FloatArray, float]:
+        """Return the residuals over their declared relative sds, (n_usable,), and a robust estimate of their sd."""
+        residuals = (self._usable_readings - predicted) / self._relative_sd
+        # Rounded readings can all be as predicted; rounding errors alone are not outliers.
+        sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12))
+        return residuals, sd or 1.0
 
     def _weighted_nodes(
         self, effect: NoiseEffect, residuals: FloatArray, rows: FittedReadings

@@ -68,3 +68,5 @@ REFITTED_AT_OTHER_ORDERS = 1e-4  # probability of such a combination, among thos
 WITH_UNKNOWN = 4  # refitted combinations that something unknown is weighed beside
 MOST_FAULTS = 3  # of the noise at once
 NOISE_PAIR_WITHIN = 3.0  # nats over white noise from which a second fault of the noise is looked for
+# Nats behind the best to which refined nodes must be able to raise a noise model: further back it does not count.
+NOISE_NODES_REFINED_WITHIN = 10.0

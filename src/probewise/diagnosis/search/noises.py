@@ -11,12 +11,13 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, laplace_evidence
+from probewise.diagnosis.evidence.refined_nodes import refined
 from probewise.diagnosis.evidence.templates import combinations_up_to
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.models import NoiseModel, least_sd_given_rounding, rough_sd, rounding_hides_noise
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.constants import MOST_FAULTS, NOISE_PAIR_WITHIN
+from probewise.diagnosis.search.constants import MOST_FAULTS, NOISE_NODES_REFINED_WITHIN, NOISE_PAIR_WITHIN
 from probewise.effects import CorrelatedNoise, NoiseEffect, Quantisation, RandomWalk, lattice_step
 from probewise.recordings.plan import Recording
 
@@ -80,8 +81,16 @@ class NoiseModels:
         return float(logsumexp(values)) if values else -math.inf
 
     def evidence_by_noise(self, found: Fit) -> dict[Names, NoiseEvidence]:
-        """Compute the evidence of a fit under every noise model, by the names of its effects."""
-        return {names: laplace_evidence(found, model) for names, model in self.models.items()}
+        """Compute the evidence of a fit under every noise model, by the names of its effects.
+
+        Those that may come near the best have nodes about their peak, where those of the prior lie too far apart.
+        """
+        evidence = {names: laplace_evidence(found, model) for names, model in self.models.items()}
+        best = max((e.log_z + self.log_prior(names) for names, e in evidence.items()), default=-math.inf)
+        return {
+            names: refined(found, own, least=best - self.log_prior(names) - NOISE_NODES_REFINED_WITHIN)
+            for names, own in evidence.items()
+        }
 
     def best_evidence(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
         """Return the evidence, of those given by noise model, whose noise model is most probable, priors included."""

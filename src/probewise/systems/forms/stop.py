@@ -42,6 +42,7 @@ class MeterStop(NoiseEffect):
     units: ClassVar[tuple[str, ...]] = ("reading",)
     covariates: ClassVar[tuple[str, ...]] = ("level",)
     amplitudes: ClassVar[tuple[int, ...]] = ()
+    nodes_per_parameter: ClassVar[tuple[int, ...]] = ()
     changes_the_mean: ClassVar[bool] = True
 
     @classmethod

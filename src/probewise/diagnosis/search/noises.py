@@ -112,17 +112,37 @@ class NoiseModels:
             parts = [n for n in known if set(n) < set(first)]
             if not parts or known[first].log_z < max(known[n].log_z for n in parts) + NOISE_PAIR_WITHIN:
                 return size > 1
-            likely = {name: known[first].likeliest_nodes_of_effect(name) for name in self._uncertain_names(first)}
+            # Beside another effect the likeliest values may be others: nodes about them alone would lie too close.
+            of_first = laplace_evidence(found, self.models[first])
+            likely = {name: of_first.likeliest_nodes_of_effect(name) for name in self._uncertain_names(first)}
             best = max(e.log_z + self.log_prior(names) for names, e in known.items())
             for other in singles:
                 both = tuple(sorted({*first, *other}))
                 if len(self._uncertain_names(both)) != size + 1 or set(both) >= WITH_MEMORY:
                     continue
-                model = self._build_model(both, likely | self.models[other].coarse_nodes_by_effect())
-                own = laplace_evidence(found, model)
+                coarse = self.models[other].coarse_nodes_by_effect()
+                nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
+                own = refined(found, nearby)
                 if own.log_z + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
-                    self.models[both], known[both] = model, own
+                    recentred = self._nodes_beside(found, nearby, self._uncertain_names(first))
+                    self.models[both], known[both] = self._build_model(both, recentred | coarse), own
         return True
+
+    def _nodes_beside(
+        self, found: Fit, evidence: NoiseEvidence, names: Names
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return the likeliest nodes of each effect named, of all its nodes, beside the likeliest nodes of the others.
+
+        `evidence` is that of a fit under all effects together, of which each has only few nodes.
+        """
+        effects = self._uncertain_names(evidence.noise.names)
+        likely = {name: evidence.likeliest_nodes_of_effect(name) for name in effects}
+        out = {}
+        for name in names:
+            beside = {other: nodes for other, nodes in likely.items() if other != name}
+            again = laplace_evidence(found, self._build_model(evidence.noise.names, beside))
+            out[name] = again.likeliest_nodes_of_effect(name)
+        return out
 
     def _uncertain_names(self, names: Names) -> Names:
         return tuple(n for n in names if n not in self.certain)

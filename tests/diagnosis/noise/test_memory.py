@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.noise.memory import innovations_given_rest, walk_given_readings
+from probewise.diagnosis.noise.wide_readings import with_known_wide_readings
 
 _N = 40
 
@@ -101,6 +104,6 @@ def test_an_outlying_reading_does_not_pull_the_smoothed_walk():
     residuals[100] += 30.0
     nothing = np.zeros(200)
     plain = NoiseLaw(nothing + 1, nothing, nothing > 0, walk=np.full(200, 0.05**2))
-    tailed = NoiseLaw(nothing + 1, nothing, nothing > 0, share=0.05, times=10.0, walk=np.full(200, 0.05**2))
+    tailed = with_known_wide_readings(replace(plain, share=0.05, times=10.0), residuals)
     assert abs(walk_given_readings(tailed, residuals)[100] - walk[100]) < 0.5
     assert walk_given_readings(plain, residuals)[100] - walk[100] > 0.5

@@ -183,18 +183,30 @@ def sequential_log_densities(
     turned, innovations, kept = whitened[:, :-1], whitened[:, -1], law.kept[out]
     mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
     noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
-    shares = np.array([1 - law.share, law.share])
+    shares, widths = np.array([1 - law.share, law.share]), _variances_of_narrow_and_wide(law, out, sd)
     for k in np.flatnonzero(kept):
         row = turned[k]
         gain = covariance @ row
         left, spread = innovations[k] - row @ mean, max(float(row @ gain), 0.0)
-        parts = np.array([noise_2[k] + spread, noise_2[k] * law.times**2 + spread])
+        parts = noise_2[k] * widths[k] + spread
         density = _log_normal_density(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
         densities[k] = np.logaddexp(*density)
         variance = float(np.exp(density - densities[k]) @ parts)  # the most probable noise variance of this reading
         mean += gain * left / variance
         covariance -= np.outer(gain, gain) / variance
     return np.asarray((densities - np.log(sd)) * kept)
+
+
+def _variances_of_narrow_and_wide(law: NoiseLaw, out: BoolArray, sd: FloatArray) -> FloatArray:
+    """Return the variances of each held-out reading if it is narrow and if it is wide, in units of sd^2, (n_out, 2).
+
+    `sd` is that of each reading, (n_out,), given the others. Whatever it reads, it may be either.
+    """
+    if not law.wide.size:
+        return np.tile([1.0, law.times**2], (len(sd), 1))
+    own = law.sd[out] ** 2
+    narrow = own * law.relative_precision[out]
+    return np.stack([sd**2 - own + narrow, sd**2 - own + narrow * law.times**2], axis=1) / sd[:, None] ** 2
 
 
 def _log_normal_density(miss: FloatArray, variance: FloatArray) -> FloatArray:

@@ -56,6 +56,8 @@ class NoiseLaw:
 
     Whitening, a linear map, makes residuals independent with one scale sigma; each is then normal, optionally with a
     heavy tail (`times` as wide with probability `share`) or rounded (flat-topped). Lost readings carry no information.
+    Beside a random walk the tail is of each reading's own noise: given the probabilities of readings to be `wide`,
+    which a fit's residuals tell (`wide_readings`), the noise is normal, with sds that include them.
 
     Parameters
     ----------
@@ -80,6 +82,8 @@ class NoiseLaw:
     before
         Number of the reading with which each has the correlation `carry`, (n_points,), arbitrary where that is 0.
         Empty: the reading above, as always unless the rows of scans are interleaved.
+    wide
+        Probability of each reading to be wide, (n_points,), where `sd` includes it; empty without or if unknown.
     """
 
     sd: FloatArray
@@ -93,6 +97,7 @@ class NoiseLaw:
     least: float = 0.0
     walk: FloatArray = field(default_factory=lambda: np.zeros(0))
     before: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    wide: FloatArray = field(default_factory=lambda: np.zeros(0))
     kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
 
     def __post_init__(self) -> None:
@@ -136,7 +141,8 @@ class NoiseLaw:
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
         above, carry = self._nearest_taken_before(rows)
         before = np.maximum(above, 0) if self.before.size else self.before
-        return replace(self, sd=self.sd[rows], carry=carry, lost=self.lost[rows], walk=walk, before=before)
+        wide = self.wide[rows] if self.wide.size else self.wide
+        return replace(self, sd=self.sd[rows], carry=carry, lost=self.lost[rows], walk=walk, before=before, wide=wide)
 
     def _nearest_taken_before(self, rows: BoolArray) -> tuple[IntArray, FloatArray]:
         """Return for each reading taken the nearest taken before it, and its correlation with that: (n_taken,) both.
@@ -248,8 +254,16 @@ class NoiseLaw:
         return np.asarray(np.sqrt(self.sd**2 + self.flat**2 / 3))
 
     def without_tail_or_rounding(self) -> NoiseLaw:
-        """Return normal noise with the same whitening, its sd free, without tail or rounding."""
-        return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
+        """Return normal noise with the same whitening, its sd free, without tail or rounding; no reading is wide."""
+        plain = replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
+        if not self.wide.size:
+            return plain
+        return replace(plain, sd=self.sd * np.sqrt(self.relative_precision), wide=np.zeros(0))
+
+    @property
+    def relative_precision(self) -> FloatArray:
+        """Expected precision of each reading's own noise relative to that of a narrow one, (n_points,)."""
+        return np.asarray(1 - (1 - self.times**-2) * self.wide) if self.wide.size else np.ones(len(self.sd))
 
     def likeliest_sigma(self, whitened: FloatArray) -> FloatArray:
         """Return the known or most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
@@ -377,6 +391,8 @@ def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
         if one:
             return RoundedNormal(laws[0].flat, laws[0].sigma, sd)
         return RoundedNormal(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]), sd)
+    if any(law.wide.size for law in laws):  # which readings are wide is in their sds
+        return Tail(0.0, 1.0)
     if one:
         return Tail(laws[0].share, laws[0].times)
     return Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))

@@ -16,8 +16,6 @@ from scipy.linalg import solve_banded, solveh_banded
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.law import NoiseLaw
 
-_ROUNDS = 4  # of weights for outlying readings about a smoothed walk
-
 
 @dataclass(frozen=True, eq=False)
 class _Chain:
@@ -133,32 +131,13 @@ def _told_by_later(chain: _Chain, given: BoolArray, y: FloatArray) -> tuple[Floa
 
 
 def walk_given_readings(law: NoiseLaw, residuals: FloatArray) -> FloatArray:
-    """Return the expected random walk in residuals, given all of them, (n_points,); 0 without a walk.
-
-    Under a heavy tail, outlying readings have the weight that their distance from the walk leaves them.
-    """
+    """Return the expected random walk in residuals, given all of them, (n_points,); 0 without a walk."""
     n = len(residuals)
     if not law.walk.size:
         return np.zeros(n)
-    steps = 1 / law.walk
+    steps, weight = 1 / law.walk, law.kept / law.sd**2
     bands = np.zeros((2, n))
-    bands[0] = steps
+    bands[0] = steps + weight
     bands[0, :-1] += steps[1:]
     bands[1, :-1] = -steps[1:]
-    weight = law.kept / law.sd**2
-    walk = _smoothed(bands, weight, residuals)
-    if law.share:
-        sigma = float(law.likeliest_sigma(law(residuals)[:, None])[0])
-        for _ in range(_ROUNDS):
-            apart = (residuals - walk) / (law.sd * max(sigma, 1e-150))
-            wide = law.share / law.times * np.exp(-0.5 * (apart / law.times) ** 2)
-            narrow = (1 - law.share) * np.exp(-0.5 * apart**2)
-            odds = wide / np.maximum(wide + narrow, 1e-300)
-            walk = _smoothed(bands, weight * (1 - odds * (1 - law.times**-2)), residuals)
-    return walk
-
-
-def _smoothed(steps: FloatArray, weight: FloatArray, residuals: FloatArray) -> FloatArray:
-    bands = steps.copy()
-    bands[0] += weight
     return np.asarray(solveh_banded(bands, weight * residuals, lower=True, check_finite=False))

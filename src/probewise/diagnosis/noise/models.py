@@ -12,6 +12,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable, order_by_scan, previous_usable
 from probewise.diagnosis.noise.rounded_normal import RoundedNormal
+from probewise.diagnosis.noise.wide_readings import with_known_wide_readings
 from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
@@ -112,7 +113,9 @@ class NoiseModel:
         span = float(np.ptp(predicted)) or 1.0
         noise = self._noise_parameters_at_nodes(settings, np.clip((predicted - predicted.min()) / span, 0.0, 1.0))
         far = np.abs(residuals) > _FAR * sd
-        return tuple(self._law_at_node(noise, k, far) for k in range(len(settings)))
+        laws = (self._law_at_node(noise, k, far) for k in range(len(settings)))
+        left = self._usable_readings - predicted
+        return tuple(with_known_wide_readings(law, left) if law.walk.size and law.share else law for law in laws)
 
     def _residuals_and_rough_sd(self, predicted: FloatArray) -> tuple[FloatArray, float]:
         """Return the residuals over their declared relative sds, (n_usable,), and a robust estimate of their sd."""

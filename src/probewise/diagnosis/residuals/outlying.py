@@ -25,6 +25,8 @@ _A = 0.5  # parameter of the beta prior of the share of outlying readings (Jeffr
 
 def outlier_probabilities(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
     """Return the probability of each residual to be from the wide part of a noise distribution, (n_points,)."""
+    if law.wide.size:
+        return law.wide
     whitened = law(residuals)
     return Tail(law.share, law.times).wide_probability((whitened / law.likeliest_sigma(whitened[:, None])[0]) ** 2)
 

@@ -1,0 +1,126 @@
+"""Outlying readings beside a random walk, against the sum over all sets of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from probewise.diagnosis.evidence.held_out import sequential_log_densities
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.noise.wide_readings import with_known_wide_readings
+from probewise.diagnosis.residuals.outlying import outlier_probabilities
+
+N = 9
+OWN_SD = np.array([1.0, 0.7, 1.3, 1.0, 1.0, 0.8, 1.0, 1.2, 1.0])
+
+
+def _law(share, times, step, sd=OWN_SD):
+    n = len(sd)
+    return NoiseLaw(sd, np.zeros(n), np.zeros(n, dtype=bool), share, times, walk=np.full(n, step**2))
+
+
+def _covariance(law, sigma, wide):
+    walked = np.cumsum(law.walk)
+    return sigma**2 * (np.minimum.outer(walked, walked) + np.diag((law.sd * np.where(wide, law.times, 1.0)) ** 2))
+
+
+def _by_enumeration(law, residuals, sigma):
+    """Return the log density of residuals and each reading's probability to be wide, from all 2^n sets of those."""
+    kept = ~law.lost
+    sets = np.array(list(itertools.product((False, True), repeat=int(kept.sum()))))
+    log_p = []
+    for some in sets:
+        wide = np.zeros(len(kept), dtype=bool)
+        wide[kept] = some
+        own = _covariance(law, sigma, wide)[np.ix_(kept, kept)]
+        log_prior = some.sum() * math.log(law.share) + (~some).sum() * math.log1p(-law.share)
+        log_p.append(log_prior + multivariate_normal.logpdf(residuals[kept], cov=own))
+    total = float(logsumexp(log_p))
+    out = np.zeros(len(kept))
+    out[kept] = np.exp(np.array(log_p) - total) @ sets
+    return total, out
+
+
+def _draw(law, rng):
+    wide = rng.random(N) < 0.2
+    return np.cumsum(np.sqrt(law.walk) * rng.normal(size=N)) + law.sd * rng.normal(size=N) * np.where(
+        wide, law.times, 1.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("share", "times", "step"), [(0.05, 20.0, 0.6), (0.1, 3.0, 1.0), (0.05, 20.0, 2.0), (0.2, 10.0, 0.2)]
+)
+def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, step):
+    rng = np.random.default_rng(0)
+    lost = np.arange(N) == 4
+    for case in range(8):
+        law = replace(_law(share, times, step), lost=lost if case % 2 else np.zeros(N, dtype=bool))
+        residuals = 0.3 * _draw(law, rng)
+        known = with_known_wide_readings(law, residuals)
+        whitened = known(residuals)[:, None]
+        sigma = known.likeliest_sigma(whitened)
+        log_density = -float(known.minus_log_likelihood(whitened, sigma)[0]) - 0.5 * known.n_kept * math.log(
+            2 * math.pi
+        )
+        wanted, wide = _by_enumeration(law, residuals, float(sigma[0]))
+        assert log_density - known.half_log_det() + known.log_extra == pytest.approx(wanted, abs=0.06)
+        np.testing.assert_allclose(known.wide, wide, atol=0.05)
+
+
+def test_of_spikes_on_a_walk_each_is_one_reading_and_not_its_neighbours():
+    rng = np.random.default_rng(1)
+    n = 200
+    spikes = np.zeros(n)
+    spikes[[20, 21, 90, 150]] = [25.0, 30.0, -25.0, 40.0]
+    residuals = np.cumsum(0.6 * rng.normal(size=n)) + rng.normal(size=n) + spikes
+    law = with_known_wide_readings(_law(0.03, 20.0, 0.6, np.ones(n)), residuals)
+    np.testing.assert_array_equal(np.flatnonzero(outlier_probabilities(residuals, law) > 0.5), np.flatnonzero(spikes))
+    whitened = law(residuals)
+    assert float(law.likeliest_sigma(whitened[:, None])[0]) == pytest.approx(1.0, abs=0.2)  # 4 sds: 4 / sqrt(2 n)
+    assert np.abs(whitened).max() < 5
+    without = law.without_tail_or_rounding()
+    np.testing.assert_allclose(without.sd, 1.0)
+    part = np.arange(n) < 30
+    np.testing.assert_array_equal(law.take_readings(part).wide, law.wide[part])
+
+
+def test_without_noise_nothing_is_wide():
+    law = with_known_wide_readings(_law(0.05, 10.0, 0.5), np.zeros(N))
+    assert np.isfinite([law.log_extra, *law.sd]).all()
+    assert (law.wide < 0.05).all()
+
+
+@pytest.mark.parametrize("far", [1e200, np.inf, np.nan])
+def test_predictions_that_ran_away_are_no_error(far):
+    law = with_known_wide_readings(_law(0.05, 10.0, 0.5), np.full(N, far))
+    assert law.whitened_density.is_normal
+
+
+def test_a_held_out_reading_is_wide_or_narrow_by_prior_not_by_what_it_reads():
+    """Its density given the rest is a mixture of both, so that an outlier costs the logarithm of its share."""
+    rng = np.random.default_rng(3)
+    law = _law(0.05, 20.0, 0.6)
+    residuals = np.cumsum(0.6 * rng.normal(size=N)) + law.sd * rng.normal(size=N)
+    residuals[5] += 30.0
+    known = with_known_wide_readings(law, residuals)
+    out = np.arange(N) == 5
+    slopes = np.zeros((N, 1))
+    own = sequential_log_densities(known, out, residuals, slopes, np.zeros(1), np.eye(1), 1.0)
+    # The other readings are plainly narrow: the density from dense covariances, with reading 5 narrow and wide.
+    rest = ~out
+    parts = []
+    for wide, share in ((out, law.share), (out & False, 1 - law.share)):
+        covariance = _covariance(law, 1.0, wide)
+        gain = np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest][:, out])
+        mean, variance = residuals[rest] @ gain[:, 0], covariance[5, 5] - covariance[out][:, rest][0] @ gain[:, 0]
+        parts.append(
+            math.log(share) - 0.5 * math.log(2 * math.pi * variance) - 0.5 * (residuals[5] - mean) ** 2 / variance
+        )
+    assert float(own[0]) == pytest.approx(float(logsumexp(parts)), abs=0.1)

@@ -251,3 +251,9 @@ def test_lost_readings_are_found_among_rounded_ones(declared):
     assert "dropouts" in found.combination
     lost = next(effect for effect in found.effects if effect.name == "dropouts")
     assert lost.parameters[1].mean == pytest.approx(3.0, abs=0.01)
+
+
+def test_walks_that_differ_less_than_readings_tell_need_no_other_fit():
+    law = replace(white_noise(50), walk=np.full(50, 0.5))
+    assert law.is_practically_equal(replace(law, walk=1.15 * law.walk))
+    assert not law.is_practically_equal(replace(law, walk=1.3 * law.walk))

@@ -115,7 +115,10 @@ class NoiseLaw:
         return tuple(values.tobytes() for values in arrays)
 
     def is_practically_equal(self, other: NoiseLaw) -> bool:
-        """Return whether another distribution is equal, to 3 % of sd, 0.03 of correlation, and 6 % of the walk."""
+        """Return whether another distribution is equal, to 3 % of sd, 0.03 of correlation, and 20 % of the walk.
+
+        That of the walk is a variance, which few readings determine to better than 20 %.
+        """
         return (
             (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
             and np.array_equal(self.lost, other.lost)
@@ -123,7 +126,7 @@ class NoiseLaw:
             and np.allclose(self.sd, other.sd, rtol=0.03)
             and np.allclose(self.carry, other.carry, atol=0.03)
             and self.walk.shape == other.walk.shape
-            and np.allclose(self.walk, other.walk, rtol=0.06)
+            and np.allclose(self.walk, other.walk, rtol=0.2)
         )
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -124,3 +124,14 @@ def test_a_pair_of_noises_has_no_less_evidence_than_all_its_nodes():
     every = laplace_evidence(found, NoiseModel((CorrelatedNoise(), Outliers()), recording))
     assert own.log_z > every.log_z - 1.0
     assert _mean_and_sd(own)[0][0] == pytest.approx(0.75, abs=0.05)
+
+
+def test_a_fit_at_the_edge_of_its_formula_is_impossible_under_any_noise():
+    """A slope there is no number; neither is it a warning."""
+    found, recording = _found_with(WHITE[:100])
+    slopes = found.slopes.copy()
+    slopes[7, 0] = np.nan
+    for effects in ((), (RandomWalk(),), (Outliers(),), (Outliers(), RandomWalk())):
+        evidence = laplace_evidence(replace(found, slopes=slopes), NoiseModel(effects, recording))
+        assert evidence.log_z == -np.inf
+        assert refined(found, evidence) is evidence

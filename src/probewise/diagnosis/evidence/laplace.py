@@ -86,6 +86,8 @@ def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
 def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw]) -> FloatArray:
     """Return the log evidence of a fit under each noise distribution, (n_laws,); minus infinity if impossible."""
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
+    if not np.isfinite(joined).all():  # a fit at the edge of what its formula predicts
+        return np.full(len(laws), -math.inf)
     out = np.empty(len(laws))
     normal = [node for node, law in enumerate(laws) if law.whitened_density.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)

@@ -8,6 +8,7 @@ to a twentieth of a nat.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,8 @@ from probewise.diagnosis.noise.law import NoiseLaw
 
 _ROUNDS = 20
 _SAME = 0.01  # change of a reading's relative precision, and of sigma, at which the rounds end
-_LEAST, _FARTHEST = 1e-150, 1e100  # sigma; residuals whose squares are numbers
+_SMALLEST = 1e-9  # sigma, of the largest residual: most readings may be exactly as predicted
+_FARTHEST = 1e100  # residual whose square is a number
 
 
 def with_known_wide_readings(law: NoiseLaw, residuals: FloatArray) -> NoiseLaw:
@@ -42,16 +44,20 @@ def with_known_wide_readings(law: NoiseLaw, residuals: FloatArray) -> NoiseLaw:
     kept, excess = ~law.lost, 1 - law.times**-2
     steps, own = 1 / law.walk, law.sd**2
     bands = np.stack([steps + np.append(steps[1:], 0.0), np.append(-steps[1:], 0.0)])
-    sigma = max(float(law.likeliest_sigma(law(residuals)[:, None])[0]), _LEAST)  # as if of the innovations, to begin
+    sigma = math.inf
     precise = np.ones(len(own))  # expected precision of each reading, relative to a narrow one
     for k in range(_ROUNDS):
         weight = law.kept * precise / own
         smoothed, variance = _smoothed_and_variance(bands, weight, residuals)
+        unshared = np.maximum(1 - weight * variance, 1e-12)
+        apart, beside = (residuals - smoothed) / unshared, variance / unshared  # from the walk as the others tell it
         last = sigma
         if k:
-            sigma = max(float(np.sqrt(np.mean((weight * (residuals - smoothed) * residuals)[kept]))), _LEAST)
-        unshared = np.maximum(1 - weight * variance, 1e-12)
-        apart, beside = (residuals - smoothed) / unshared / sigma, variance / unshared  # from the walk the others tell
+            sigma = math.sqrt(max(float(np.mean((weight * (residuals - smoothed) * residuals)[kept])), 0.0))
+        else:  # whatever some outlying readings are
+            sigma = float(np.median(np.abs(apart / np.sqrt(beside + own))[kept])) / 0.6745
+        sigma = max(sigma, law.sigma_floor, _SMALLEST * float(np.abs(apart).max()), 1e-150)
+        apart /= sigma
         log_narrow = np.log1p(-law.share) + _log_density(apart, beside + own)
         log_wide = np.log(law.share) + _log_density(apart, beside + own * law.times**2)
         wide, used = expit(log_wide - log_narrow), precise

@@ -122,8 +122,9 @@ class NoiseModels:
                     continue
                 coarse = self.models[other].coarse_nodes_by_effect()
                 nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
-                own = refined(found, nearby)
-                if own.log_z + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
+                least = best - NOISE_PAIR_WITHIN - self.log_prior(both)
+                own = refined(found, nearby, least=least)
+                if own.log_z > least:
                     recentred = self._nodes_beside(found, nearby, self._uncertain_names(first))
                     self.models[both], known[both] = self._build_model(both, recentred | coarse), own
         return True

@@ -185,3 +185,46 @@ def test_a_parameter_per_run_is_an_array_in_a_table_of_one_row_too(n_rows):
     found = system.chain(table, ()).predict(np.array([[0.7, 1.5]]), table)
     by_name = dict(zip(system.marginals, [0.7, 1.5], strict=True))
     np.testing.assert_allclose(found[0], by_name["a[1]"] + by_name["b"] * X[:n_rows])
+
+
+def _in_place(p, data):
+    rate, x = p["b"], data["x"]
+    rate /= 60
+    x *= 60
+    return p["a"] * np.exp(-rate * x + 0 * p.get("b")) + 60 * rate - p["b"]  # p["b"] is what it was
+
+
+def _in_place_with_a_loop(p, data):
+    rate = p["b"]
+    rate /= 60
+    return np.array([float(p["a"]) * np.exp(-float(rate) * 60 * x) for x in data["x"]])
+
+
+def _in_place_with_a_branch(p, data):
+    return _in_place(p, data) if float(p["a"]) > 0 else data["x"]
+
+
+@pytest.mark.parametrize(
+    ("simulate", "options"),
+    [
+        (_in_place, {}),
+        (_in_place, {"vectorized": True}),
+        (_in_place_with_a_loop, {}),
+        (_in_place_with_a_branch, {"per_run": ("b",)}),
+    ],
+)
+def test_what_a_function_changes_in_place_is_its_own(simulate, options):
+    """To a user p["b"] is a number, which k = p["b"]; k /= 60 leaves as it is."""
+    table = RunTable({"x": X, "y": np.zeros(11), "run": np.zeros(11)}, run="run")
+    prior = {"a": Uniform(0.5, 2.0), "b": Uniform(0.5, 2.0)}
+    own, plain = (
+        System.of(Simulator("y", "V", prior, simulate=each, run="run", **options), table)
+        for each in (simulate, _elementwise)
+    )
+    theta = own.theta(own.starts)
+    before = theta.copy()
+    for _ in range(2):
+        np.testing.assert_allclose(
+            own.chain(table, ()).predict(theta, table), plain.chain(table, ()).predict(theta, table), rtol=1e-9
+        )
+    np.testing.assert_array_equal(theta, before)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from probewise.errors import ParameterError
+from probewise.errors import FileError, ParameterError
 from probewise.systems import Law, RunTable, Simulator, System
 from probewise.systems.motion import LawWithEffects, Limit, RowsInRuns, integrate_states
 
@@ -174,3 +174,54 @@ def test_rates_may_change_what_they_are_given():
     table = _table([0.0, 1.0, 2.0, 3.0], force=np.array([1.0, 2.0, 0.0, 0.0]))
     expected, found = (_states(Law({"x": 1.0}, rates), table, {"k": 0.3}, 0.1)["x"] for rates in (plain, changing))
     np.testing.assert_array_equal(found, expected)
+
+
+def _pendulum_with_changes_in_place(s, p, u):
+    speed, damping, turn = s["omega"], p["c"], u["turn"]
+    damping /= 60
+    speed += turn
+    turn *= 0
+    return {"phi": speed, "omega": -9.81 / p["l_m"] * np.sin(s["phi"]) - 60 * damping * s["omega"]}
+
+
+def _turned_pendulum(s, p, u):
+    return _pendulum({**s, "omega": s["omega"] + u["turn"]}, p, u) | {
+        "omega": -9.81 / p["l_m"] * np.sin(s["phi"]) - p["c"] * s["omega"]
+    }
+
+
+def _degrees_in_place(s, p, u):
+    angle, turn = s["phi"], u["turn"]
+    angle *= 180
+    turn += 1
+    return angle / np.pi
+
+
+@pytest.mark.parametrize("hold", ["previous", "linear"])
+def test_what_a_law_changes_in_place_is_its_own(hold):
+    """Route two: the same law with new arrays. Steps one after another, then all at once from a known trajectory."""
+    table = _table(np.linspace(0, 3, 40), turn=np.linspace(-1, 1, 40))
+    prior = {"l_m": (0.5, 1.0), "c": (0.1, 1.0)}
+    predicted = []
+    for rates, observe in (
+        (_pendulum_with_changes_in_place, _degrees_in_place),
+        (_turned_pendulum, lambda s, p, u: s["phi"] * 180 / np.pi),
+    ):
+        law = Law({"phi": 1.0, "omega": 0.0}, rates, observe, hold=hold)
+        system = System.of(Simulator("y", "deg", prior, law=law, time="t_s"), table)
+        theta = system.theta(system.starts)
+        predicted.append([system.chain(table, ()).predict(theta * k, table) for k in (1.0, 1.0, 1.001)])
+    np.testing.assert_allclose(*predicted, rtol=1e-9, atol=1e-9)
+
+
+def test_a_parameter_changed_in_place_to_an_array_of_more_runs_is_a_clear_mistake():
+    def rates(s, p, u):
+        rate = p["c"]
+        rate *= s["phi"]
+        return {"phi": -rate}
+
+    columns = {"t_s": np.arange(12.0), "y": np.zeros(12), "run": np.repeat(["a", "b"], 6)}
+    table = RunTable(columns, "t_s", "run")
+    simulator = Simulator("y", "V", {"c": (0.1, 1.0)}, law=Law({"phi": 1.0}, rates), time="t_s", run="run")
+    with pytest.raises(FileError, match=r"allowed: k = k \* x in place of k \*= x"):
+        System.of(simulator, table)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.progress import Progress
-from probewise.systems.simulator import Simulate
+from probewise.systems.simulator import Simulate, call_on_read_only, read_only_views
 
 MOST_CALLS = 20_000
 """Expected limit of calls in a diagnosis, for a `simulate` that takes one sample at a time; it is not enforced."""
@@ -164,7 +164,7 @@ class Caller:
         n_samples = shape[0]
         self._count_call()
         try:
-            readings = np.asarray(self.simulate(dict(parameters), dict(columns)), dtype=np.float64)
+            readings = np.asarray(self._simulated(parameters, columns), dtype=np.float64)
         except Exception:
             if strict:
                 raise
@@ -225,12 +225,15 @@ class Caller:
         known = self._known.pop(key := digest.digest(), None)
         if known is None:
             self._count_call()
-            returned = np.array(self.simulate(dict(own), dict(columns)), dtype=np.float64)
+            returned = np.array(self._simulated(own, columns), dtype=np.float64)
             known = _readings_broadcast_to_shape(returned, (n_points,), self.name)
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
         return known
+
+    def _simulated(self, parameters: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> Any:
+        return call_on_read_only(self.simulate, read_only_views(parameters), read_only_views(columns))
 
     def _count_call(self) -> None:
         self.n_calls += 1

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.late_columns import ROUNDING, LateColumn, Line, Timeline
 from probewise.systems.rows_in_runs import RowsInRuns
-from probewise.systems.simulator import Law
+from probewise.systems.simulator import Law, read_only_views
 
 Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
 """Parameters and columns by name."""
@@ -65,8 +65,8 @@ class BetweenRows:
 class StepInputs:
     """Parameters and columns within some steps; the last axis of the arrays is that of the steps and runs, or 1.
 
-    `constant` and `held` do not change within a step; `moving` and `sloping` are on straight lines. The first of each
-    pair are parameters, the second columns.
+    `constant` and `held` do not change within a step, and are read-only; `moving` and `sloping` are on straight lines.
+    The first of each pair are parameters, the second columns.
     """
 
     constant: Mapping[str, Any]
@@ -75,11 +75,14 @@ class StepInputs:
     sloping: Mapping[str, Line]
 
     def __call__(self, share: Any) -> Pair:
-        """Return parameters and columns, by name, at a share of the gap between rows."""
+        """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
         if not (self.moving or self.sloping):
             return self.constant, self.held
-        p = {**self.constant, **{name: low + share * rise for name, (low, rise) in self.moving.items()}}
-        u = {**self.held, **{name: low + share * rise for name, (low, rise) in self.sloping.items()}}
+        p, u = dict(self.constant), dict(self.held)
+        for at, lines in ((p, self.moving), (u, self.sloping)):
+            for name, (low, rise) in lines.items():
+                at[name] = value = low + share * rise
+                value.setflags(False)  # of writing; a keyword would double the time
         return p, u
 
     def of_some(self, columns: IntArray) -> StepInputs:
@@ -92,9 +95,9 @@ class StepInputs:
             return {name: (chosen(low), chosen(rise)) for name, (low, rise) in lines.items()}
 
         return StepInputs(
-            {name: chosen(values) for name, values in self.constant.items()},
+            read_only_views({name: chosen(values) for name, values in self.constant.items()}),
             chosen_lines(self.moving),
-            {name: chosen(values) for name, values in self.held.items()},
+            read_only_views({name: chosen(values) for name, values in self.held.items()}),
             chosen_lines(self.sloping),
         )
 
@@ -158,6 +161,7 @@ class LawInputs:
                 if jump.parameter == name:  # it is added where it is, within a gap
                     values = values - jump.size * (places.table.time_s > jump.at)
             own = values_at_rows(values, rows)
+            own.setflags(write=False)
             if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
                 constant[name] = own[:, 0]
             elif law.hold == "linear":
@@ -181,7 +185,7 @@ class LawInputs:
             constant,
             kept,
             moving,
-            held,
+            read_only_views(held),
             sloping,
             rises_of_parameters,
             rises_of_columns,
@@ -217,9 +221,9 @@ class LawInputs:
 
         constant = {name: np.tile(v, (1, len(gap))) if v.shape[1] > 1 else v for name, v in self.constant.items()}
         return StepInputs(
-            {**constant, **{name: flattened(v[:, gap]) for name, v in self.kept.items()}},
+            read_only_views({**constant, **{name: flattened(v[:, gap]) for name, v in self.kept.items()}}),
             {name: value_and_rise(v, self.rises_of_parameters[name]) for name, v in self.moving.items()},
-            {name: flattened(v[:, gap]) for name, v in self.held.items()},
+            read_only_views({name: flattened(v[:, gap]) for name, v in self.held.items()}),
             {name: value_and_rise(v, self.rises_of_columns[name]) for name, v in self.sloping.items()},
         )
 
@@ -298,7 +302,7 @@ class LawInputs:
                 moving[name] = moving[name][0] + own, moving[name][1]
             else:
                 constant[name] = constant[name] + own
-        return StepInputs(constant, moving, held, sloping)
+        return StepInputs(read_only_views(constant), moving, read_only_views(held), sloping)
 
 
 def values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:

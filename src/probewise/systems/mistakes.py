@@ -44,6 +44,8 @@ def user_function_error(
         allowed = (
             f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
         )
+    elif isinstance(error, ValueError) and "output operand" in said:
+        allowed = "k = k * x in place of k *= x: an array changed in place keeps its shape"
     elif texts and isinstance(error, TypeError | ValueError):
         shown = ", ".join(f"{name} ({_first_non_numeric_cell(columns[name])!r})" for name in texts[:4])
         allowed = f"calculations with numeric columns; these contain text: {shown}"

@@ -14,7 +14,7 @@ from probewise._arrays import FloatArray
 from probewise.systems.law_inputs import BetweenRows, LawInputs, Pair, StepPart, values_at_rows
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
-from probewise.systems.simulator import Law
+from probewise.systems.simulator import Law, call_on_read_only, read_only_views
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -80,8 +80,13 @@ class LawWithEffects:
     def rates(
         self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
     ) -> Mapping[str, Any]:
-        """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`."""
-        given = self.law.rates(dict(s), dict(p), dict(u))  # copies, which a user's function may change
+        """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`.
+
+        `p` and `u` are read-only, as an interpolator of `LawInputs` returns them; so are the states `s` afterwards.
+        """
+        for values in s.values():
+            values.setflags(False)  # of writing; a keyword would double the time
+        given: Mapping[str, Any] = call_on_read_only(self.law.rates, s, p, u)
         if self._has_no_effects:
             return given
         out = {state: given[state] for state in self.law.states}
@@ -144,7 +149,8 @@ def readings_of_states(
     if law.observe is None:
         return first
     with np.errstate(all="ignore"):
-        out = np.asarray(law.observe(dict(states), dict(parameters), dict(columns)), dtype=np.float64)
+        given = map(read_only_views, (states, parameters, columns))
+        out = np.asarray(call_on_read_only(law.observe, *given), dtype=np.float64)
     return np.array(np.broadcast_to(out, first.shape))
 
 

@@ -15,6 +15,7 @@ from probewise.systems.forms.form import Act, Form
 from probewise.systems.motion import integrate_states
 from probewise.systems.row_order import rows_are_in_order
 from probewise.systems.rows_in_runs import RowsInRuns
+from probewise.systems.simulator import call_on_read_only, read_only_views
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
@@ -94,7 +95,7 @@ class ReferenceFit:
         }
         try:
             with np.errstate(all="ignore"):
-                rates = law.rates(dict(s), dict(p), dict(u))
+                rates = call_on_read_only(law.rates, *map(read_only_views, (s, p, u)))
         except Exception:  # a user's function may refuse states that no reading asks for
             return frozenset()
         return frozenset(
@@ -114,7 +115,9 @@ class ReferenceFit:
         there = {name: values[None, :] for name, values in self.states.items()}
         nudged = there | {state: there[state] + _NUDGE * np.ptp(there[state])}
         with np.errstate(all="ignore"):
-            apart = np.subtract(*(law.rates(s, dict(parameters), dict(columns))[other] for s in (nudged, there)))
+            given = read_only_views(parameters), read_only_views(columns)
+            rates = (call_on_read_only(law.rates, read_only_views(s), *given) for s in (nudged, there))
+            apart = np.subtract(*(each[other] for each in rates))
         return bool(np.any(np.abs(apart) > 0))
 
     @cached_property

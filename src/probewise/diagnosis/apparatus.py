@@ -135,6 +135,11 @@ class Apparatus(Protocol):
         """
         ...
 
+    @property
+    def takes_one_measurement_at_a_time(self) -> bool:
+        """Whether a plan holds one of the candidate measurements only, since its file would not keep two apart."""
+        ...
+
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> Sequence[Command]:

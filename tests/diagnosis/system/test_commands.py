@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 from heater import runs
 
+from probewise.diagnosis.advice.next_scans import Rival, measurement_separating_rivals
+from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.system.commands import (
     _minutes_of_runs,
     plan_of_alternatives,
     plan_of_sequence,
     possible_run_commands,
 )
-from probewise.systems import RunTable
+from probewise.recordings import Plan
+from probewise.systems import Law, RunTable, Simulator, System, concatenate_tables
+from probewise.systems.forms import ReferenceFit
 
 TABLE = runs()
 
@@ -83,3 +88,27 @@ def test_the_time_that_runs_take_is_in_the_unit_of_the_table(unit, minutes):
     taken = _minutes_of_runs(TABLE, unit)
     of_rows = len(TABLE) / 60 if minutes is None else np.ptp(TABLE.time_s) * minutes
     assert taken == pytest.approx(0.5 + of_rows)
+
+
+@pytest.mark.parametrize("run", [None, "run"])
+def test_what_is_planned_is_what_a_diagnosis_of_both_tables_predicts(run):
+    """A warming block that starts at 20: of a FILE.py without runs a table is one run, so only one is planned."""
+    time, power = 10.0 * np.arange(34), np.where(np.arange(34) // 8 % 2 == 0, 60.0, 0.0)
+    columns = {"t_s": time, "power_w": power, "temp_c": 20.0 + 0 * time}
+    law = Law({"temp": 20.0}, lambda s, p, u: {"temp": (20 + p["gain"] * u["power_w"] - s["temp"]) / p["tau"]})
+    prior = {"gain": (0.1, 2), "tau": ("log", 10, 1000)}
+    simulator = Simulator("temp_c", "degC", prior, law=law, time="t_s", run=run, controls=("power_w",))
+    table = RunTable(columns | ({} if run is None else {run: np.full(34, "1")}), "t_s", run)
+    system = System.of(simulator, table)
+    rivals = [
+        Rival(f"{z}", Model(system, (), table), np.array([z, z]), 0.01 * np.eye(2), 0.5) for z in (0.0, 0.1)
+    ]  # 0.1 apart: more than one run is needed
+    apparatus = SimulatorApparatus(ReferenceFit(system, table, np.zeros(2), 6.0))
+    asked = measurement_separating_rivals(rivals, 6.0, cast(Plan, table), apparatus)
+    assert asked is not None
+    plan = cast(RunTable, asked.plan)
+    assert (len(plan.scan_names) == 1) == (run is None)
+    both, _ = concatenate_tables([table, RunTable(plan.columns, "t_s", run)], ["first.csv", "next.csv"])
+    theta = system.theta(np.zeros((1, 2)))
+    predicted = [system.chain(rows, ()).predict(theta, rows)[0] for rows in (plan, both)]
+    np.testing.assert_allclose(predicted[0], predicted[1][34:], rtol=1e-9)

@@ -146,6 +146,8 @@ def measurement_separating_rivals(
             break
         chosen.append(best)
         taken, told = np.concatenate([taken, rows[best]]), told + gains[best]
+        if apparatus.takes_one_measurement_at_a_time:
+            break
     if not chosen:
         return None
     scans = [offered[k] for k in chosen]

@@ -86,6 +86,7 @@ class LightSensorApparatus:
         slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
+    takes_one_measurement_at_a_time = False  # a plan names its scans
     prior_odds = staticmethod(PriorOdds.for_effects)
     covariate_of_effect = staticmethod(covariate_of_effect)
     held_out_parts = staticmethod(held_out_parts)

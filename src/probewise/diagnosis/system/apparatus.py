@@ -261,6 +261,15 @@ class SimulatorApparatus:
         values = [np.arange(model.n_params)[model.coordinate_slice(n)] for n in model.names if has_value_per_run(n)]
         return np.concatenate([np.array(parameters, dtype=np.int64), *values])
 
+    @property
+    def takes_one_measurement_at_a_time(self) -> bool:
+        """Whether FILE.py names no column of runs.
+
+        It reads every table as one run: a second run in next.csv would begin where the first ended, not from `states`
+        as it is planned, and a lag or a backlash would reach from one into the other.
+        """
+        return self.system.simulator.run is None
+
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> list[RunCommand]:

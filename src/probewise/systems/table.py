@@ -130,8 +130,13 @@ class RunTable:
 
     @cached_property
     def time_begins_anew(self) -> bool:
-        """Whether time decreases from some row of the table to the next, as if counted from the start of each run."""
-        return bool((np.diff(self.time_s) < 0).any())
+        """Whether some run begins before another has ended, as if time were counted from the start of each run.
+
+        The order of the rows does not matter: runs that each start at 0 may be sorted by time.
+        """
+        own = [self.time_s[rows] for rows in self.rows_by_scan()]
+        first, last = np.array(sorted((times.min(), times.max()) for times in own)).T
+        return bool((first[1:] < np.maximum.accumulate(last)[:-1]).any())
 
     def rows_by_scan(self) -> list[IntArray]:
         """Return the row indices of each run, in the order of the table."""

@@ -112,3 +112,11 @@ def test_what_is_planned_is_what_a_diagnosis_of_both_tables_predicts(run):
     theta = system.theta(np.zeros((1, 2)))
     predicted = [system.chain(rows, ()).predict(theta, rows)[0] for rows in (plan, both)]
     np.testing.assert_allclose(predicted[0], predicted[1][34:], rtol=1e-9)
+
+
+def test_when_time_begins_anew_does_not_depend_on_the_order_of_rows():
+    interleaved = TABLE.take(np.lexsort((TABLE.scan, TABLE.time_s)))
+    assert offered((), interleaved)["2 again"].table.time_s[0] == 0.0
+    goes_on = TABLE.with_columns({"t_s": np.arange(float(len(TABLE)))})
+    last_first = goes_on.take(np.argsort(-goes_on.scan, kind="stable"))
+    assert offered((), last_first)["2 again"].table.time_s[0] > len(TABLE) - 1

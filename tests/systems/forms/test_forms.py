@@ -92,6 +92,17 @@ def test_saturation_is_a_ceiling_above_the_middle_of_the_readings_and_a_floor_be
     np.testing.assert_allclose(_read("saturation", level), cut(NOTHING, level))
 
 
+@pytest.mark.parametrize("wild", [-99.0, 99.0])
+def test_one_wild_reading_hides_no_ceiling(wild):
+    readings = np.minimum(NOTHING, 1.2) + SD * np.random.default_rng(0).standard_normal(N_ROWS)
+    table = TABLE.with_columns({"y": np.where(np.arange(N_ROWS) == 7, wild, readings)})
+    form = bind_forms(ReferenceFit(ABOUT.system, table, np.zeros(2), SD))["saturation"]
+    found = ABOUT.system.chain(table, [form]).predict(np.append(ABOUT.theta[0], 1.2)[None, :], table)[0]
+    np.testing.assert_allclose(found, np.minimum(NOTHING, 1.2))
+    low, high = form.prior.from_unit_cube(np.array([[0.0], [1.0]])).ravel()
+    assert NOTHING.min() - 1 < low < high < NOTHING.max() + 1
+
+
 def test_the_code_of_an_error_beyond_the_declared_range_is_no_end_of_the_readings():
     simulator = replace(_simulator(), noise=Noise(sd=SD, range=(-10.0, 10.0)))
     system = System.of(simulator, TABLE)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
 
-from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
+from probewise._arrays import BoolArray, FloatArray, distinct_values, rounding_error, varies
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
@@ -299,25 +299,30 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _expected_range_of_readings(about: ReferenceFit) -> tuple[float, float]:
-    """Return the least and the largest reading to be expected in the table, without noise.
+    """Return the least and the largest reading to be expected in the table, without noise."""
+    bent = _expected_readings_and_inliers(about)[0]
+    return float(bent.min()), float(bent.max())
 
-    It is the range of the predicted readings, bent as the recorded ones are: by a polynomial in the predicted reading,
-    fitted to the residuals. Without it a law that lacks a bend misses the ends of the range by many noise sds.
+
+def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, BoolArray]:
+    """Return the readings to be expected, (n_points,), and the mask of the readings that are no outliers from these.
+
+    Expected are the predicted readings, bent as the recorded ones are: by a polynomial in the predicted reading, fitted
+    to the residuals. Without it a law that lacks a bend misses the ends of the range by many noise sds.
     """
     predicted, readings = about.predicted, about.table.columns[about.system.simulator.reading]
     low, high = float(predicted.min()), float(predicted.max())
     there = np.isfinite(readings)
     degree = min(_BEND_DEGREE, distinct_values(predicted[there]).size - 1)
     if not low < high or degree < 1:
-        return low, high
+        return predicted, there
     level, residual = 2 * (predicted - low) / (high - low) - 1, readings - predicted
     bend = np.zeros(1)
     for _ in range(3):  # the last two without outlying residuals
         bend = chebfit(level[there], residual[there], degree)
         off = np.abs(residual - chebval(level, bend))
         there = np.isfinite(readings) & (off <= _OUTLYING * max(np.nanmedian(off), about.sd))
-    bent = predicted + chebval(level, bend)
-    return float(bent.min()), float(bent.max())
+    return predicted + chebval(level, bend), there
 
 
 def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
@@ -359,8 +364,8 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     low, high = float(about.predicted.min()), float(about.predicted.max())
     if not low < high:
         return
-    readings = about.table.columns[about.system.simulator.reading]
-    readings = readings[np.isfinite(readings)]
+    # One wild reading would move the middle of the range, which tells a ceiling from a floor.
+    readings = about.table.columns[about.system.simulator.reading][_expected_readings_and_inliers(about)[1]]
     lowest, highest = about.system.simulator.noise.range
     within = readings >= (-np.inf if lowest is None else lowest)
     within &= readings <= (np.inf if highest is None else highest)

@@ -11,7 +11,7 @@ from probewise.diagnosis import OwnModel, diagnose
 from probewise.diagnosis.judgement.judged import Hypothesis
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import prepare
-from probewise.diagnosis.thinning import rows_to_diagnose
+from probewise.diagnosis.thinning import positions_in_stretches, rows_to_diagnose
 from probewise.diagnosis.verdict_report import findings
 from probewise.effects import VOCABULARY
 from probewise.priors import Normal, Product
@@ -88,3 +88,40 @@ def test_places_of_a_thinned_recording_are_drawn_over_all_of_it_and_scans_have_t
     np.testing.assert_array_equal(values[scan.figure_name][rows], whole.plan.scan[rows])
     assert np.isfinite(values[scan.figure_name]).sum() == len(rows)
     np.testing.assert_array_equal(scan.curve_at, np.unique(whole.plan.scan[rows]))
+
+
+@pytest.mark.parametrize("n", [2401, 3600, 4800, 9600, 19_200, 100_003])
+def test_a_table_that_repeats_itself_is_seen_at_all_hours(n):
+    """Within a factor of two of the mean at each hour, in each half of the table."""
+    chosen = positions_in_stretches(np.zeros(n, dtype=np.int64), 2400)
+    assert len(chosen) == 2400
+    for half in (chosen[:1200], chosen[1200:]):
+        counts = np.bincount(half % 24, minlength=24)
+        assert 25 <= counts.min() <= counts.max() <= 100
+    assert np.mean(np.diff(chosen) == 1) > 0.83  # stretches of six
+    np.testing.assert_allclose(chosen, np.linspace(0, n - 1, 2400), atol=0.03 * n)  # over the whole table
+
+
+@pytest.mark.parametrize("interleaved", [False, True])
+def test_a_stretch_lies_in_one_run(interleaved):
+    n_runs, length = 37, 271
+    run = np.arange(n_runs * length) % n_runs if interleaved else np.repeat(np.arange(n_runs), length)
+    chosen = positions_in_stretches(run, 2400)
+    assert 2300 < len(chosen) <= 2400
+    for k in range(n_runs):
+        place = np.flatnonzero(np.isin(np.flatnonzero(run == k), chosen))
+        streaks = np.diff(np.concatenate([[-1], np.flatnonzero(np.diff(place) != 1), [len(place) - 1]]))
+        assert len(streaks) > 5
+        assert streaks.min() >= 6
+
+
+def test_of_very_short_runs_about_as_many_rows_are_chosen():
+    assert len(positions_in_stretches(np.arange(9000) // 2, 2400)) == 2400
+
+
+def test_scans_there_and_back_are_chosen_of_both_ways():
+    whole = recording(200, 40)
+    kept = np.unique(whole.plan.scan[rows_to_diagnose(whole, 4000)])
+    assert len(kept) == 100
+    for half in (kept[:50], kept[50:]):
+        assert 0.25 < np.mean(half % 2) < 0.75

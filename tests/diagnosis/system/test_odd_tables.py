@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import audit_system, diagnose_system, fit_simulator
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.system.diagnose import prepare_system, recording_from_table
 from probewise.errors import ParameterError
 from probewise.systems import Law, Simulator, table_for
 
@@ -131,3 +131,12 @@ def test_a_table_without_a_reading_is_refused_before_any_fit(task, n):
     """Warnings are errors here, and a fit to no reading gives some."""
     with pytest.raises(ParameterError, match="allowed: 12 "):
         task(_line(), {"x": _X[:n], "y": np.full(n, np.nan)}, rng=np.random.default_rng(1))
+
+
+def test_of_a_long_table_all_hours_are_used_and_a_note_says_how_many():
+    day = np.arange(9600) / 24
+    sun = np.maximum(0.0, np.sin(2 * np.pi * (day - 0.25)))
+    simulator = Simulator("y", "K", {"a": (0, 5), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["sun"])
+    recording = recording_from_table(simulator, table_for(simulator, {"sun": sun, "y": 1 + sun}))
+    assert np.bincount(np.flatnonzero(recording.usable) % 24).min() > 50
+    assert recording.notes == ("2,400 of 9,600 readings are used, in stretches of six spread over the whole table",)

@@ -18,6 +18,7 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.system.finer_step import STANDS_STILL, finer_step_for_repair, searched_at_step
+from probewise.diagnosis.thinning import MOST_READINGS, positions_in_stretches
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
@@ -31,7 +32,6 @@ from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
 from probewise.systems.row_order import note_on_row_order, rows_are_in_order
 from probewise.systems.table import median_sd_of_column
 
-_MOST_COMPARED = 2400
 _STEPS_TRIED = 8  # of the fit of the simulator, from each start
 _BEST_STARTS = 3  # of which it goes on
 _BEGINNINGS = 0.25, 0.5  # shares of the longest run that are fitted before all of it
@@ -242,7 +242,8 @@ def _notes_on_integration(tally: IntegrationTally, most: int) -> Iterator[str]:
 def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     """Convert a table to a recording whose readings are the predicted column.
 
-    Of more than 2,400 readings, about that many are used, in stretches of six; the simulator still predicts every row.
+    Of more than 2,400 readings, about that many are used, in stretches of six, and a note says so; the simulator still
+    predicts every row.
 
     Raises
     ------
@@ -255,13 +256,13 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     whole = as_recording(simulator, table)
     readings = whole.readings
     usable = np.flatnonzero(whole.usable)
-    if len(usable) <= _MOST_COMPARED:
+    chosen = usable[positions_in_stretches(table.scan[usable], MOST_READINGS)]
+    if len(chosen) == len(usable):
         return whole
-    stretch, every = 6, round(6 * len(usable) / _MOST_COMPARED)
     kept = np.full(len(readings), np.nan)
-    chosen = usable[np.arange(len(usable)) % every < stretch]
     kept[chosen] = readings[chosen]
-    return replace(whole, readings=kept)
+    note = f"{len(chosen):,} of {len(usable):,} readings are used, in stretches of six spread over the whole table"
+    return replace(whole, readings=kept, notes=(*whole.notes, note))
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:

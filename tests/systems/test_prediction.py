@@ -8,7 +8,16 @@ from heater import ABOUT, SIMULATOR, fitted, runs
 
 from probewise.diagnosis.system.commands import plan_of_sequence, possible_run_commands
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system, write_system_prediction
+from probewise.systems import (
+    FittedSystem,
+    Law,
+    Noise,
+    RunTable,
+    Simulator,
+    System,
+    predict_system,
+    write_system_prediction,
+)
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit
 
@@ -330,3 +339,15 @@ def test_a_row_that_no_sample_predicts_is_told():
     model = FittedSystem(simulator, names=("a",), samples=np.full((500, 1), 0.5), noise_sd=np.ones(500))
     with pytest.raises(ParameterError, match=r"simulate is 'no finite reading in 1 of 3 rows, first in row 4'"):
         predicted(model, {"x": [1.0, 2.0, -1.0]})
+
+
+def test_a_prediction_over_longer_gaps_does_not_run_away_with_the_fastest_samples():
+    """A step of 2.5 s that served rows 10 s apart and a time constant of 2 s runs away at 0.5 s; closed form."""
+    law = Law({"x": 0.0}, lambda s, p, u: {"x": (u["drive"] - s["x"]) / p["tau_s"]})
+    simulator = Simulator("x", "K", {"tau_s": ("log", 0.1, 100)}, law=law, time="t_s", noise=Noise(sd=0.01))
+    tau = np.geomspace(0.5, 3.0, 500)
+    fitted = FittedSystem(simulator, ("tau_s",), tau[:, None], np.full(500, 0.01), max_step=2.5)
+    table = {"t_s": 30.0 * np.arange(12), "drive": np.tile([1.0, 0.0, 2.0], 4)}
+    found = predict_system(fitted, table, rng=np.random.default_rng(1))
+    held = table["drive"][:-1]
+    np.testing.assert_allclose(found.mean[1:], held, atol=2e-3)  # after 30 s, ten time constants, the drive is reached

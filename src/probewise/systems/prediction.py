@@ -33,7 +33,7 @@ from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
-from probewise.systems.system import System, SystemChain
+from probewise.systems.system import STANDS_STILL, System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, covariate_of_column, relative_sds_of_column
 
 _OF_A_COLUMN = "sensitivity:", "depends:"  # effects, besides those on an input, that name a column last
@@ -159,6 +159,7 @@ def predict_system(
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
     given, lost = _filled_table_and_unpredictable_mask(chain, theta, own)
+    chain = _chain_with_converged_step(chain, theta, given, float(np.median(fitted.noise_sd)))
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed, never = 0, np.ones(len(own), dtype=np.bool_)
     between = _smoothing_width_by_row(chain, theta, given) if is_drawn else None
@@ -201,6 +202,23 @@ def predict_system(
     return SystemPrediction(
         own, recording.readings, mean=mean, sd=sd, log_density=scores, n_samples=n_samples, n_failed=n_failed
     )
+
+
+def _chain_with_converged_step(chain: SystemChain, theta: FloatArray, table: RunTable, noise_sd: float) -> SystemChain:
+    """Return a chain whose integration step serves the extreme samples over a table; `chain` if none is in reach.
+
+    The step was chosen for the likeliest parameters and the gaps between the rows of the recording. Over longer gaps,
+    and at the fastest rates that the samples hold, an integration may run away.
+    """
+    effects = cast(Sequence[NamedEffect[Any]], chain.effects)
+    extreme = theta[np.unique([theta.argmin(axis=0), theta.argmax(axis=0)])]
+    try:
+        system = chain.system.with_converged_step(
+            table, extreme, effects, tolerance=STANDS_STILL * noise_sd, or_finest=True
+        )
+    except ParameterError:  # a friction or a bound that no step meets exactly
+        return chain
+    return chain if system is chain.system else system.chain(table, effects)
 
 
 def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:

@@ -28,6 +28,9 @@ from probewise.systems.table import RunTable
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
+STANDS_STILL = 0.02
+"""Noise sds, rms, that predictions may move by when the step of the integration is halved."""
+
 _MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
 _CONVERGING = 4.0  # factor by which halving the step reduces the change at least, if the law is smooth
 
@@ -264,7 +267,7 @@ class System:
             The rows.
         theta
             Parameters of the system and of the effects, (n_samples, n_params); samples without finite predictions do
-            not count.
+            not count, unless half the step makes them finite.
         effects
             Effects added to the law.
         tolerance
@@ -285,7 +288,10 @@ class System:
             finer = replace(now, max_step=now.max_step / 2)
             fine = finer.chain(table, effects).predict(theta, table)
             there = np.isfinite(coarse) & np.isfinite(fine)
-            moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2))) if there.any() else np.inf
+            ran_away = np.isfinite(fine) & ~np.isfinite(coarse)  # at the longer step alone
+            with np.errstate(over="ignore"):  # of predictions that are about to run away
+                moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2))) if there.any() else np.inf
+            moved = np.inf if ran_away.any() else moved
             if moved <= tolerance:
                 return now
             if or_finest and moved < before / _CONVERGING and not finer._has_affordable_steps(places):

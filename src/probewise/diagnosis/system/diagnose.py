@@ -17,7 +17,7 @@ from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
-from probewise.diagnosis.system.finer_step import STANDS_STILL, finer_step_for_repair, searched_at_step
+from probewise.diagnosis.system.finer_step import finer_step_for_repair, searched_at_step
 from probewise.diagnosis.thinning import MOST_READINGS, positions_in_stretches
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
@@ -30,6 +30,7 @@ from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.sorted_rows import sorting_column
 from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
 from probewise.systems.row_order import note_on_row_order, rows_are_in_order
+from probewise.systems.system import STANDS_STILL
 from probewise.systems.table import median_sd_of_column
 
 _STEPS_TRIED = 8  # of the fit of the simulator, from each start

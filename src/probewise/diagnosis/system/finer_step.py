@@ -24,9 +24,7 @@ from probewise.effects import NamedEffect
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.progress import Progress, silent
 from probewise.systems import RunTable, System
-
-STANDS_STILL = 0.02
-"""Noise sds, rms, that predictions may move by when the step of the integration is halved."""
+from probewise.systems.system import STANDS_STILL
 
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
 _HAS_A_CHANCE = 0.01  # probability from which a combination is refitted at the finer step

@@ -36,7 +36,7 @@ EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to 
 ORDERS_WITHIN = 100.0
 REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
 # Effects that pairs are screened of, the best alone. A difference of two columns may explain what neither does. Of the
-# best twelve, as before, the pair was found in 1 of 6 recordings with seven other columns; of the best sixty in all.
+# best twelve, as before, it was found in none of 6 recordings with seven other columns; of the best sixty in all.
 PAIRED = 60
 MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
 # Share of a template that a null leaves, below which a large effect may show in another way than to first order. The

@@ -248,3 +248,11 @@ def test_a_battery_is_expected_to_stay_as_it_was():
     everywhere = plan_of_alternatives(candidate_scans(plan)[:3], after)
     assert set(everywhere.covariates) == {"battery_mv"}
     assert (everywhere.covariates["battery_mv"] == gone[-2]).all()
+
+
+def test_readings_without_noise_leave_a_number_beside_values_that_a_new_run_does_not_know():
+    """Slopes by an unknown value of 1e11 noise sds: a covariance of 1 + 1e22 is singular in floating-point numbers."""
+    slopes = 1e11 * np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 1e-3]])
+    first, second = (PredictiveNormal(mean, slopes) for mean in (np.zeros(3), 1e11 * np.array([0.0, 1.0, 0.0])))
+    nats = mutual_information_lower_bound([first, second], np.array([0.5, 0.5]))
+    assert nats == pytest.approx(np.log(2))  # two readings that must be equal are not

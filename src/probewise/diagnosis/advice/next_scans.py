@@ -27,6 +27,7 @@ _STRIDES = (2, 4)
 _PROMISING = 4  # scans per pair of rivals whose full predictive distribution is computed
 _ENOUGH = 40.0  # squared distance of predictions, in noise sds, beyond which more separation adds nothing
 _SETTLED = 0.05  # share of the entropy that may remain
+_LEAST_NOISE_2 = 1e-12  # of the largest variance of a reading
 _WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove
 _ANYTHING = 1e-6  # the same for the first scan
 _LEAST_WEIGHT = 0.05  # least weight of a rival, since its probability may be wrong
@@ -95,8 +96,13 @@ class PredictiveNormal:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of the readings, (n_points, n_points)."""
-        return np.asarray(np.eye(len(self.mean)) + self.factor @ self.factor.T)
+        """Covariance of the readings, (n_points, n_points).
+
+        The noise counts as at least 1e-6 of the largest sd: that of readings that are exact is lost to rounding.
+        """
+        of_factor = self.factor @ self.factor.T
+        noise_2 = max(1.0, _LEAST_NOISE_2 * float(of_factor.diagonal().max(initial=0.0)))
+        return np.asarray(noise_2 * np.eye(len(self.mean)) + of_factor)
 
 
 def measurement_separating_rivals(

@@ -83,6 +83,11 @@ class Extent:
     @cached_property
     def gap_s(self) -> float:
         """Median time between consecutive readings of a scan, s; 1 where no time passes."""
-        gaps = np.diff(self.plan.time_s)[np.diff(self.plan.scan) == 0]
-        gaps = gaps[gaps > rounding_error(self.plan.time_s)]
-        return float(np.median(gaps)) if gaps.size else 1.0
+        return median_gap_s(self.plan)
+
+
+def median_gap_s(plan: Plan) -> float:
+    """Return the median time between consecutive readings of a scan, s; 1 where no time passes."""
+    gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
+    gaps = gaps[gaps > rounding_error(plan.time_s)]
+    return float(np.median(gaps)) if gaps.size else 1.0

@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.rows_in_runs import RowsInRuns
 
-ROUNDING = 16
-"""Last digits of a time by which two times may differ by rounding alone."""
+_ROUNDING = 16  # last digits of a time by which two times may differ by rounding alone
 
 Line = tuple[Any, Any]
 """A value at the beginning of a gap between rows, and its rise over the gap or its slope in time."""
+
+
+def rounding_of_times(times: FloatArray) -> float:
+    """Return the difference of two times that may be that of rounding alone."""
+    return float(_ROUNDING * np.spacing(np.abs(times).max()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,7 @@ class Timeline:
     @cached_property
     def rounding(self) -> float:
         """Difference of two places that may be that of rounding alone."""
-        return float(ROUNDING * np.spacing(max(self.at[-1], np.abs(self.places.table.time_s).max())))
+        return rounding_of_times(np.append(self.places.table.time_s, self.at[-1]))
 
     def places_of(self, times: FloatArray, run: IntArray) -> FloatArray:
         """Place times as printed, (n_samples, n_columns), of runs `run` (n_columns,), on the line."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.systems.late_columns import ROUNDING, LateColumn, Line, Timeline
+from probewise.systems.late_columns import LateColumn, Line, Timeline, rounding_of_times
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Law, read_only_views
 
@@ -175,8 +175,9 @@ class LawInputs:
         for name, values in columns.items():
             slopes = name == time or (law.hold == "linear" and values.dtype == np.float64)
             (sloping if slopes else held)[name] = values_at_rows(values, rows)
+        timeline = Timeline(places)
         late = {
-            name: LateColumn.of(Timeline(places), columns[name], dead_time, linear=law.hold == "linear")
+            name: LateColumn.of(timeline, columns[name], dead_time, linear=law.hold == "linear")
             for name, dead_time in between.dead_times.items()
         }
         rises_of_columns = {name: np.diff(values, axis=1) for name, values in sloping.items()}
@@ -276,7 +277,7 @@ class LawInputs:
 
     def _next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
         """Return the time of the next jump or bend of an input after `now`, of that shape; infinite if none is left."""
-        rounding = ROUNDING * np.spacing(np.abs(self.places.table.time_s).max())
+        rounding = rounding_of_times(self.places.table.time_s)
         out: Any = np.inf
         for late in self.late.values():
             out = np.minimum(out, late.next_break(now, run))

@@ -289,9 +289,10 @@ class System:
             fine = finer.chain(table, effects).predict(theta, table)
             there = np.isfinite(coarse) & np.isfinite(fine)
             ran_away = np.isfinite(fine) & ~np.isfinite(coarse)  # at the longer step alone
-            with np.errstate(over="ignore"):  # of predictions that are about to run away
-                moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2))) if there.any() else np.inf
-            moved = np.inf if ran_away.any() else moved
+            moved = np.inf
+            if there.any() and not ran_away.any():
+                with np.errstate(over="ignore"):  # of predictions that are about to run away
+                    moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2)))
             if moved <= tolerance:
                 return now
             if or_finest and moved < before / _CONVERGING and not finer._has_affordable_steps(places):

@@ -40,18 +40,18 @@ class Alias:
 
 def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
     """Return the largest principal cosine of two templates (n_points, k), a fit projected out; 0 if it absorbs one."""
-    bases = [_projected_basis(problem.project(c), problem.law(c) / problem.sd)[0] for c in (first, second)]
+    bases = [_projected_basis(problem, problem.whiten(c))[0] for c in (first, second)]
     if not all(basis.size for basis in bases):
         return 0.0
     return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
 
 
-def _projected_basis(projected: FloatArray, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormalise a template with a fit projected out, (n_rows, k); no directions if the fit absorbs it.
+def _projected_basis(problem: Linearised, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Orthonormalise a whitened template, (n_points, k), with a fit projected out; nothing is left if it is absorbed.
 
-    `whitened` is the template before, (n_points, k). Returns the directions, (n_rows, n_directions), and the amounts of
-    the columns that make each, (k, n_directions).
+    Returns the directions, (n_rows, n_directions), and the amounts of the columns that make each, (k, n_directions).
     """
+    projected = problem.project_whitened(whitened)
     # Columns that the fit absorbs to within a thousandth are ignored.
     if not np.linalg.norm(projected) > 1e-3 * np.linalg.norm(whitened):
         return projected[:, :0], np.zeros((projected.shape[1], 0))
@@ -172,7 +172,7 @@ def _gained(nats: FloatArray) -> FloatArray:
 def _collinear_amounts(problem: Linearised, readings: ReadingsWithEffects, *names: str) -> list[Amounts]:
     """Return the most collinear changes by two effects, each of lambda 8."""
     columns = [readings.old.columns[:, readings.of_effect[name]] for name in names]
-    (first, of_first), (second, of_second) = (_projected_basis(problem.project_whitened(c), c) for c in columns)
+    (first, of_first), (second, of_second) = (_projected_basis(problem, c) for c in columns)
     if not (first.size and second.size):
         return [Amounts(name, np.zeros(c.shape[1])) for name, c in zip(names, columns, strict=True)]
     left, _, right = np.linalg.svd(first.T @ second)

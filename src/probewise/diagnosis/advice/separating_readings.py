@@ -106,7 +106,7 @@ class ReadingsWithEffects:
         n_known = len(apparatus.coordinates_of_new_run(model))
         old, further, of_run = [], [], []
         for entry in entries.values():
-            columns = problem.law(entry.changes(found, model.plan, predicted)[usable]) / problem.sd
+            columns = problem.whiten(entry.changes(found, model.plan, predicted)[usable])
             length = max(float(np.linalg.norm(columns)), 1e-300)
             old.append(columns / length)
             further.append(entry.changes(found, plan, expected) / problem.sd / length)
@@ -114,7 +114,7 @@ class ReadingsWithEffects:
             of_run.append(np.full(columns.shape[1], varies))
         ends = np.cumsum([columns.shape[1] for columns in old])
         return cls(
-            LinearReadings(problem.law(found.slopes) / problem.sd, np.concatenate(old, axis=1)),
+            LinearReadings(problem.whiten(found.slopes), np.concatenate(old, axis=1)),
             LinearReadings(slopes / problem.sd, np.concatenate(further, axis=1)),
             dict(zip(entries, np.split(np.arange(ends[-1]), ends[:-1]), strict=True)),
             np.isin(np.arange(model.n_params), apparatus.coordinates_of_new_run(model)),

@@ -34,7 +34,7 @@ def require_converged_fit(found: Fit, problem: Linearised) -> None:
         With the fit as its `partial`.
     """
     shift = problem.absorbing_shift(found, np.zeros(len(found.residuals)))
-    slopes = problem.law(found.slopes) / problem.sd
+    slopes = problem.whiten(found.slopes)
     left = 0.5 * float(np.sum((slopes @ shift) ** 2) + shift @ shift)
     if left > _FAR and np.abs(found.z).max() < FARTHEST - 0.1:
         raise NotConvergedError(

@@ -243,7 +243,7 @@ class Linearised:
 
     def absorbing_shift(self, found: Fit, change: FloatArray) -> FloatArray:
         """Return the shift of coordinates, (n_params,), at which predictions plus `change` (n_points,) fit best."""
-        slopes = self.law(found.slopes) / self.sd
+        slopes = self.whiten(found.slopes)
         left = self.law(found.residuals - change)[:, None]
         normal = self.law.normal_pseudo_residuals(left, np.array([self.sd * math.sqrt(self.law.fisher_information)]))[
             :, 0

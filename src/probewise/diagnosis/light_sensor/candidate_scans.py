@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, rounding_error
+from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.effects import orientation_deg
+from probewise.effects.extent import median_gap_s
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
@@ -85,7 +86,7 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
     """
     controls = plan.instrumentation.controls
     height_mm = plan.instrumentation.height_mm
-    gap_s, start_s = median_reading_interval_s(plan), earliest_start_s(plan)
+    gap_s, start_s = median_gap_s(plan), earliest_start_s(plan)
     out: list[Scan] = []
     for scan in rows_of_distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
@@ -175,10 +176,3 @@ def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
         key = (int(plan.pattern[rows[0]]), round(float(turned_deg[rows[0]]), 2), *sorted(places))
         seen.setdefault(key, rows)
     return list(seen.values())[:_MOST_SCANS]
-
-
-def median_reading_interval_s(plan: Plan) -> float:
-    """Return the median time between readings within scans, in seconds; 1 s if unknown."""
-    gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
-    gaps = gaps[gaps > rounding_error(plan.time_s)]
-    return float(np.median(gaps)) if gaps.size else 1.0

@@ -15,11 +15,11 @@ from scipy.special import ndtr
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.light_sensor.candidate_scans import (
     excerpts_of_scan,
-    median_reading_interval_s,
     rows_as_new_scan,
     rows_of_distinct_scans,
 )
 from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
+from probewise.effects.extent import median_gap_s
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 
@@ -104,7 +104,7 @@ def _pattern_under(plan: Plan, scan: IntArray) -> Pattern | None:
 
 
 def _rows_as_next_scan(plan: Plan, rows: IntArray, name: str) -> Plan:
-    return rows_as_new_scan(plan, rows, earliest_start_s(plan), median_reading_interval_s(plan), name)
+    return rows_as_new_scan(plan, rows, earliest_start_s(plan), median_gap_s(plan), name)
 
 
 def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:

@@ -132,12 +132,15 @@ def _told_by_later(chain: _Chain, given: BoolArray, y: FloatArray) -> tuple[Floa
 
 def walk_given_readings(law: NoiseLaw, residuals: FloatArray) -> FloatArray:
     """Return the expected random walk in residuals, given all of them, (n_points,); 0 without a walk."""
-    n = len(residuals)
     if not law.walk.size:
-        return np.zeros(n)
-    steps, weight = 1 / law.walk, law.kept / law.sd**2
-    bands = np.zeros((2, n))
-    bands[0] = steps + weight
-    bands[0, :-1] += steps[1:]
-    bands[1, :-1] = -steps[1:]
+        return np.zeros(len(residuals))
+    weight = law.kept / law.sd**2
+    bands = precision_bands_of_walk(law)
+    bands[0] += weight
     return np.asarray(solveh_banded(bands, weight * residuals, lower=True, check_finite=False))
+
+
+def precision_bands_of_walk(law: NoiseLaw) -> FloatArray:
+    """Return the diagonal and the one below of a random walk's precision, in 1 / sigma^2, (2, n_points)."""
+    steps = 1 / law.walk
+    return np.stack([steps + np.append(steps[1:], 0.0), np.append(-steps[1:], 0.0)])

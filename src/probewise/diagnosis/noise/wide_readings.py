@@ -17,6 +17,7 @@ from scipy.special import expit
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.noise.memory import precision_bands_of_walk
 
 _ROUNDS = 20
 _SAME = 0.01  # change of a reading's relative precision, and of sigma, at which the rounds end
@@ -42,8 +43,7 @@ def with_known_wide_readings(law: NoiseLaw, residuals: FloatArray) -> NoiseLaw:
     if not np.abs(residuals).max() < _FARTHEST:  # of predictions that ran away: impossible in any case
         return replace(law, wide=np.zeros(len(residuals)))
     kept, excess = ~law.lost, 1 - law.times**-2
-    steps, own = 1 / law.walk, law.sd**2
-    bands = np.stack([steps + np.append(steps[1:], 0.0), np.append(-steps[1:], 0.0)])
+    own, bands = law.sd**2, precision_bands_of_walk(law)
     sigma = math.inf
     precise = np.ones(len(own))  # expected precision of each reading, relative to a narrow one
     for k in range(_ROUNDS):

@@ -114,7 +114,7 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     `proposals` with the new ones added, the best for each combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
-    against = 0.0 if parent.names else state.complexity_penalty(parent.ssf_degrees_of_freedom)
+    against = state.penalty_of_extending(parent)
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)
     for noise, evidence in parent.leading_noises():
@@ -219,10 +219,12 @@ def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
 
     Of a difference of two columns, neither column alone need explain anything.
     """
-    odds: dict[Names, float] = {}
-    for (names, _), value in state.about_null.items():
-        if len(names) == 2 and names not in state.refitted_combinations | state.undetected:
-            odds[names] = max(odds.get(names, -np.inf), value + state.prior.log_prior_on_mean(names))
+    settled = state.refitted_combinations | state.undetected
+    odds: dict[Names, float] = {
+        names: value + state.prior.log_prior_on_mean(names)
+        for names, value in _largest_scores_about_null(state).items()
+        if len(names) == 2 and names not in settled
+    }
     # All against what was best before: equal pairs are refitted, or none.
     for names in _leading_and_not_far_behind(state, odds, width=BEAM, behind=STEERING):
         state.refit_stepwise(names)
@@ -238,9 +240,8 @@ def _leading_under_simplest_noise(state: SearchState, proposals: Mapping[Names, 
     if not state.refits.likeliest_law(best).has_memory:
         return []
     plain = state.noises.certain
-    missing = -np.inf
     odds = {
-        names: max(known.get((names, plain), missing) for known in (state.about_null, state.about_parts))
+        names: max(known.get((names, plain), -np.inf) for known in (state.about_null, state.about_parts))
         + state.prior.log_prior_on_mean(names)
         for names in proposals
         if not effects_out_of_vocabulary(names)
@@ -250,10 +251,16 @@ def _leading_under_simplest_noise(state: SearchState, proposals: Mapping[Names, 
 
 def _with_larger_pair_scores(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
     """Replace each proposal's score by the log evidence of the pair about the null, where that is larger."""
-    best: dict[Names, float] = {}
-    for (names, _), value in state.about_null.items():
-        best[names] = max(value, best.get(names, value))
+    best = _largest_scores_about_null(state)
     return {
         names: replace(proposal, score=best[names]) if best.get(names, proposal.score) > proposal.score else proposal
         for names, proposal in proposals.items()
     }
+
+
+def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
+    """Return the largest log evidence of each combination by screening about a null, over the noise models."""
+    best: dict[Names, float] = {}
+    for (names, _), value in state.about_null.items():
+        best[names] = max(value, best.get(names, value))
+    return best

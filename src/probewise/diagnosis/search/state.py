@@ -129,6 +129,10 @@ class SearchState:
             logsumexp(log_z) - logsumexp(log_z - (self.prior.complexity_penalty if each is None else each) * spared)
         )
 
+    def penalty_of_extending(self, parent: WeighedFit) -> float:
+        """Return the complexity penalty of the first effect that is added to a candidate, in nats; 0 if it has some."""
+        return 0.0 if parent.names else self.complexity_penalty(parent.ssf_degrees_of_freedom)
+
     def store_candidate(self, candidate: WeighedFit) -> WeighedFit:
         """Store a candidate in place of an earlier one of the same effects and number of Gaussians; return it."""
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
@@ -143,7 +147,7 @@ class SearchState:
         -------
         The best candidate of the resulting combination, possibly an earlier one; None if there is none.
         """
-        against = 0.0 if parent.names else self.complexity_penalty(parent.ssf_degrees_of_freedom)
+        against = self.penalty_of_extending(parent)
         if self.share_is_spent(self.share):
             return max(
                 self.candidates_of_combination(tuple(sorted((*parent.names, added)))),
@@ -215,9 +219,8 @@ class SearchState:
         """Refit a candidate with two more effects, and store the fit if it is significantly better; else None."""
         if self.share_is_spent(self.share):
             return None
-        against = 0.0 if held.names else self.complexity_penalty(held.ssf_degrees_of_freedom)
         try:
-            between, _ = self.refits.refit_with_effect(held, self.effects[first], against)
+            between, _ = self.refits.refit_with_effect(held, self.effects[first], self.penalty_of_extending(held))
             both, _ = self.refits.refit_with_effect(between, self.effects[second])
         except NotConvergedError:
             return None

@@ -18,7 +18,7 @@ from probewise.systems.forms.form import Act, ActInTime, Form, Say, mean_with_sd
 from probewise.systems.forms.frequencies import max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
-from probewise.systems.late_columns import ROUNDING
+from probewise.systems.late_columns import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
 
 _N_SIZES = 9
@@ -274,7 +274,7 @@ def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> Fl
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
         time = table.time_s[rows]
-        earlier = time - theta[:, :1] + ROUNDING * np.spacing(np.abs(time).max())
+        earlier = time - theta[:, :1] + rounding_of_times(time)
         before = np.clip(np.searchsorted(time, earlier, side="right") - 1, 0, None)
         before = np.where(theta[:, :1] == 0, np.arange(len(rows)), before)  # also of rows with the same time
         own = np.broadcast_to(values[:, rows], (len(out), len(rows)))

@@ -21,13 +21,12 @@ from probewise.systems.forms.form import Act, ChangePoints, Form, mean_with_sd
 from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
 from probewise.systems.forms.proposals_in_time import formula_forms_in_time
 from probewise.systems.forms.proposals_of_columns import formula_forms_of_columns
-from probewise.systems.forms.rates import rms_rate
+from probewise.systems.forms.rates import trial_rate
 from probewise.systems.motion import LawWithEffects
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
 _THRESHOLDS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of a state beyond which a term may act
-_GUESS = 1e-5  # of a state's rate: a trial term, too small to change the course of a law
 _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter one is kept
 
 
@@ -188,7 +187,7 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
             sizes = f"a = {mean_with_sd(mean[0], sd[0], '')}, at = {mean_with_sd(mean[1], sd[1], '')}"
             return f"the rate of {state} lacks a {text}, {sizes}: a proposal, not a known effect"
 
-        guess = _GUESS * rms_rate(about, state) / (high - low)
+        guess = trial_rate(about, state) / (high - low)
         entries = np.array([[[guess, at]] for at in np.quantile(values, _THRESHOLDS)])
         typical = about.typical_amplitude(Stage.RATE, act, entries, guess)
         if typical is None or not np.isfinite(typical):
@@ -213,6 +212,7 @@ def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if varies(values)]
     columns = {name: values for name, values in _varying_columns_by_name(about).items() if name not in states}
     variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
+    rate = trial_rate(about, state)
     known: list[FloatArray] = []
     for term in _terms_of_variables(variables):
         if term.text == f"sign({state})":
@@ -226,7 +226,7 @@ def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
 
         shape = np.asarray(term.evaluate(lambda name: states.get(name, about.table.covariates.get(name))))
         if _add_if_new(shape, known):
-            guess = _GUESS * rms_rate(about, state) / float(np.sqrt(np.mean(shape**2)))
+            guess = rate / float(np.sqrt(np.mean(shape**2)))
             yield from _single_term_form(about, "rate", state, Stage.RATE, act, term, guess)
 
 

@@ -126,7 +126,7 @@ def _rate_term_form(
         a = theta[:, :1]
         return value.with_term(state, lambda s, p, u: a * term(s[other]))
 
-    guess = 1e-5 * rms_rate(about, state) / scale
+    guess = trial_rate(about, state) / scale
     typical = about.typical_amplitude(Stage.RATE, act, np.full((1, 1, 1), guess), guess)
     if typical is None:
         return
@@ -149,7 +149,7 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
         return value.with_friction(state, theta[:, :1])
 
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
-    prior = about.log_uniform_size_prior(Stage.RATE, act, rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31))
+    prior = about.log_uniform_size_prior(Stage.RATE, act, _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31))
     if prior is not None:
         entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
         yield Form(
@@ -178,7 +178,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[str(time)] - origin) + phase))
 
-    guess = 1e-5 * rms_rate(about, state)
+    guess = trial_rate(about, state)
     typical = about.typical_amplitude(Stage.RATE, act, sine_and_cosine_entries(guess, frequencies), guess)
     if typical is None:
         return
@@ -275,7 +275,12 @@ def _spilling_in_words(others: Sequence[str], mean: FloatArray, sd: FloatArray) 
     )
 
 
-def rms_rate(about: ReferenceFit, state: str) -> float:
+def trial_rate(about: ReferenceFit, state: str) -> float:
+    """Return a rate of a state that is too small to change the course of a law."""
+    return 1e-5 * _rms_rate(about, state)
+
+
+def _rms_rate(about: ReferenceFit, state: str) -> float:
     """Return the rms rate of a state, by differences from row to row; 1 if that is 0."""
     values, time = about.states[state], about.table.time_s
     rates = []

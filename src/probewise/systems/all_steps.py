@@ -62,11 +62,12 @@ class Steps:
 
     places: RowsInRuns
     max_step: float
+    stiff: bool = False
 
     @cached_property
     def schedule(self) -> StepSchedule:
-        """Number of steps from each row of a run to the next, the same in all runs, and the Runge-Kutta method."""
-        return self.places.step_schedule(self.max_step)
+        """Number of steps from each row of a run to the next, the same in all runs, and the method."""
+        return self.places.step_schedule(self.max_step, stiff=self.stiff)
 
     @property
     def n_steps_by_gap(self) -> IntArray:
@@ -107,9 +108,9 @@ class Steps:
 
 
 @lru_cache(maxsize=16)
-def steps_for_table(table: RunTable, max_step: float) -> Steps:
+def steps_for_table(table: RunTable, max_step: float, *, stiff: bool = False) -> Steps:
     """Return the steps of an integration over a table, none longer than `max_step` at fourth order."""
-    return Steps(RowsInRuns(table), max_step)
+    return Steps(RowsInRuns(table), max_step, stiff)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +228,9 @@ def integrate_from_known_trajectories(
     n_samples = len(theta)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
-        states_by_name = integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step)
+        states_by_name = integrate_states(
+            motion, steps.places, parameters, columns, max_step=steps.max_step, stiff=steps.stiff
+        )
         n_parts = n_parts_of_schedule(motion, steps.schedule)
         return states_by_name, n_parts * evaluations_per_step(motion, steps.schedule.method)
     states, left, cost = None, np.arange(n_samples), 0

@@ -28,12 +28,14 @@ _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 class IntegrationTally:
     """Counts of a law's evaluations and of samples at which it raises an error; `cut_short` if work was skipped.
 
-    An evaluation is one of the rates of all samples and runs together.
+    An evaluation is one of the rates of all samples and runs together. `too_stiff`: parameters that may fit the
+    readings would need more integration steps than are taken.
     """
 
     n_failed: int = 0
     n_evaluations: int = 0
     cut_short: bool = False
+    too_stiff: bool = False
 
 
 @dataclass(eq=False)

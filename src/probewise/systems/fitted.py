@@ -58,8 +58,8 @@ class FittedSystem(NamedSamples):
         By effect, the mask of the samples in which the effect is absent, (n_samples,).
     level
         Smallest and largest of the readings predicted for the recording.
-    max_step
-        Largest integration step, if there is a law.
+    max_step, stiff
+        Largest integration step, if there is a law, and whether a linearly implicit method takes it.
     known
         The recording and fit by which the effects were scaled and given origins; None if there are noise effects at
         most.
@@ -81,6 +81,7 @@ class FittedSystem(NamedSamples):
     absent: Mapping[str, BoolArray] = field(default_factory=dict)
     level: tuple[float, float] = (0.0, 1.0)
     max_step: float = math.inf
+    stiff: bool = False
     known: StoredFit | None = None
     recording: str = ""
     source: str = ""
@@ -136,6 +137,7 @@ class FittedSystem(NamedSamples):
                 "reading": self.simulator.reading,
                 "unit": self.simulator.unit,
                 "max_step": self.max_step if math.isfinite(self.max_step) else None,
+                "stiff": self.stiff,
             },
             "recording": {"fingerprint": self.recording, "source": self.source},
             "parameters": [
@@ -195,6 +197,7 @@ class FittedSystem(NamedSamples):
                 },
                 level=(float(document["level"][0]), float(document["level"][1])),
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
+                stiff=bool(own.get("stiff", False)),
                 known=None if known is None else _stored_fit_from_json(known, simulator),
                 recording=str(document["recording"]["fingerprint"]),
                 source=str(document["recording"]["source"]),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
 from probewise.systems.law_inputs import BetweenRows, LawInputs, Pair, StepPart, values_at_rows
+from probewise.systems.rosenbrock import Rosenbrock
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
 from probewise.systems.simulator import Law, call_on_read_only, read_only_views
@@ -121,6 +122,7 @@ def integrate_readings(
     columns: Mapping[str, NDArray[Any]],
     *,
     max_step: float,
+    stiff: bool = False,
 ) -> FloatArray:
     """Integrate a law by a Runge-Kutta method; return the reading at every row, (n_samples, n_points).
 
@@ -136,8 +138,10 @@ def integrate_readings(
         (n_points,), or (n_samples, n_points) if an effect changes them; as recorded, of those that `motion` delays.
     max_step
         Largest step at fourth order, in the unit of time; see `StepSchedule.from_fourth_order_steps`.
+    stiff
+        Whether to integrate by a linearly implicit method.
     """
-    states = integrate_states(motion, places, parameters, columns, max_step=max_step)
+    states = integrate_states(motion, places, parameters, columns, max_step=max_step, stiff=stiff)
     return readings_of_states(motion.law, states, parameters, columns)
 
 
@@ -161,10 +165,11 @@ def integrate_states(
     columns: Mapping[str, NDArray[Any]],
     *,
     max_step: float,
+    stiff: bool = False,
 ) -> dict[str, FloatArray]:
     """Integrate a law as `integrate_readings` does; return every state at every row, by name, (n_samples, n_points)."""
     motion = LawWithEffects(motion) if isinstance(motion, Law) else motion
-    schedule = places.step_schedule(max_step)
+    schedule = places.step_schedule(max_step, stiff=stiff)
     at_row = np.concatenate([[0], np.cumsum(schedule.n_steps)])
     kept: dict[str, FloatArray] = {}
     k = 0
@@ -207,15 +212,18 @@ def states_by_step(
                 yield s
 
 
-def evaluations_per_step(motion: LawWithEffects, method: RungeKutta) -> int:
+def evaluations_per_step(motion: LawWithEffects, method: RungeKutta | Rosenbrock) -> int:
     """Return about how often a step of a law evaluates its rates, of all samples together.
 
     Friction asks for the direction of motion, and splits steps in which a state comes to rest or breaks loose: by half
     as much again, where samples of a search do so at different times.
     """
-    if not (motion.limits or motion.friction):
+    if isinstance(method, Rosenbrock):
+        n_stages = method.n_evaluations(len(motion.law.states))
+    elif motion.limits or motion.friction:
+        n_stages = len(method.b) if method is FOURTH_ORDER else N_LONGER * len(FOURTH_ORDER.b)
+    else:
         return len(method.b)
-    n_stages = len(method.b) if method is FOURTH_ORDER else N_LONGER * len(FOURTH_ORDER.b)
     return n_stages + n_stages // 2 if motion.friction else n_stages
 
 
@@ -246,7 +254,7 @@ def initial_states(
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """Steps of a law by a Runge-Kutta method within a gap between rows.
+    """Steps of a law, by a Runge-Kutta or a Rosenbrock method, within a gap between rows.
 
     `gap` is its time, (1 or n_samples, n_runs); `between` is a function of a share of the gap that returns parameters
     and columns. In the methods `begin` and `length` are shares of the gap: numbers, or one for each column of the
@@ -254,7 +262,7 @@ class Stepper:
     """
 
     motion: LawWithEffects
-    method: RungeKutta
+    method: RungeKutta | Rosenbrock
     between: Callable[[Any], Pair]
     gap: FloatArray
 
@@ -264,7 +272,8 @@ class Stepper:
         A motion that may come to a halt within a step takes one of eighth order as several of fourth order.
         """
         motion, between = self.motion, self.between
-        if self.method is not FOURTH_ORDER and (motion.limits or motion.friction):
+        explicit = isinstance(self.method, RungeKutta)
+        if explicit and self.method is not FOURTH_ORDER and (motion.limits or motion.friction):
             shorter, part = replace(self, method=FOURTH_ORDER), length / N_LONGER
             for k in range(N_LONGER):
                 s = shorter.step(s, begin + k * part, part)
@@ -310,7 +319,12 @@ class Stepper:
         self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]
     ) -> dict[str, Any]:
         """Return the states after one step of the method, with friction against the fixed directions `ways`."""
-        method, width, given = self.method, self.gap * length, self.between(begin)
+        method = self.method
+        if isinstance(method, Rosenbrock):
+            return method.advanced(
+                lambda at, share: self.motion.rates(at, *self.between(share), ways), s, begin, length, self.gap
+            )
+        width, given = self.gap * length, self.between(begin)
         rates = [self.motion.rates(s, *given, ways)]
         for k, terms in enumerate(method.stages[1:], 1):
             if method.c[k] != method.c[k - 1]:

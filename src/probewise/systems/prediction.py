@@ -153,7 +153,9 @@ def predict_system(
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = replace(cast(RunTable, recording.plan), first_row=_number_of_first_row(fitted, recording))
     system = replace(
-        System.of(fitted.simulator, _table_with_interpolated_inputs(fitted.simulator, own)), max_step=fitted.max_step
+        System.of(fitted.simulator, _table_with_interpolated_inputs(fitted.simulator, own)),
+        max_step=fitted.max_step,
+        stiff=fitted.stiff,
     )
     chain = system.chain(own, bind_effects(fitted, own))
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)

@@ -8,6 +8,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from probewise._arrays import IntArray
+from probewise.systems.rosenbrock import Rosenbrock
 
 _DEARER = (
     1.5  # evaluations of the eighth order, in those of the fourth, up to which its far smaller error is worth them
@@ -60,10 +61,10 @@ def eighth_order_method() -> RungeKutta:
 
 @dataclass(frozen=True, eq=False)
 class StepSchedule:
-    """The number of steps in each gap between rows, (n_gaps,), and the Runge-Kutta method that takes the steps."""
+    """The number of steps in each gap between rows, (n_gaps,), and the method that takes the steps."""
 
     n_steps: IntArray
-    method: RungeKutta
+    method: RungeKutta | Rosenbrock
 
     @classmethod
     def from_fourth_order_steps(cls, n_steps: IntArray) -> StepSchedule:

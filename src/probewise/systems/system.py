@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,7 +22,7 @@ from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_tr
 from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.mistakes import user_function_error
-from probewise.systems.motion import LawWithEffects, integrate_readings, readings_of_states
+from probewise.systems.motion import LawWithEffects, evaluations_per_step, integrate_readings, readings_of_states
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
@@ -32,6 +33,7 @@ STANDS_STILL = 0.02
 """Noise sds, rms, that predictions may move by when the step of the integration is halved."""
 
 _MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
+_CHEAPER = 2.0  # evaluations of the explicit method for one of a linearly implicit one, from which that is taken
 _CONVERGING = 4.0  # factor by which halving the step reduces the change at least, if the law is smooth
 
 
@@ -47,6 +49,8 @@ class System:
         Names of the runs.
     max_step
         Largest integration step, if there is a law.
+    stiff
+        Whether the law is integrated by a linearly implicit method.
     caller
         Caller of `simulate`, if there is no law.
     first
@@ -60,6 +64,7 @@ class System:
     simulator: Simulator
     runs: tuple[str, ...]
     max_step: float = np.inf
+    stiff: bool = False
     caller: Caller | None = None
     first: FloatArray | None = None
     tally: IntegrationTally = field(default_factory=IntegrationTally)
@@ -107,10 +112,8 @@ class System:
             except Exception as error:
                 raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
-        gaps = RowsInRuns(table).gaps
-        typical = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
         assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or typical)
+        system = replace(bare, max_step=simulator.law.max_step_s or _typical_gap(RowsInRuns(table)))
         system.require_working_law(table)
         return system
 
@@ -261,6 +264,8 @@ class System:
     ) -> System:
         """Return the system with a step so short that halving it changes predictions by a tolerance (rms) at most.
 
+        Where a linearly implicit method needs less than half the evaluations, the system is `stiff`.
+
         Parameters
         ----------
         table
@@ -282,7 +287,51 @@ class System:
         """
         if self.simulator.law is None:
             return self
-        places, now = RowsInRuns(table), self
+        places, wrong = RowsInRuns(table), None
+        found: System | None = None
+        try:
+            found = self._halved_until_still(places, theta, effects, tolerance=tolerance, or_finest=or_finest)
+        except ParameterError as error:
+            wrong = error
+        cost = math.inf if found is None else found._cost_of_integration(places)
+        stiff = replace(self, max_step=max(self.max_step, _typical_gap(places)), stiff=True)
+        if found is not self and not self.stiff and cost > _CHEAPER * stiff._cost_of_integration(places):
+            try:
+                stiff = stiff._halved_until_still(places, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
+            except ParameterError:
+                pass
+            else:
+                return stiff
+        if found is None:
+            assert wrong is not None
+            raise wrong
+        return found
+
+    def _cost_of_integration(self, places: RowsInRuns) -> float:
+        """Return the number of evaluations of the rates, of all samples and runs together."""
+        law = self.simulator.law
+        assert law is not None
+        schedule = places.step_schedule(self.max_step, stiff=self.stiff)
+        return float(schedule.n_steps.sum() * evaluations_per_step(LawWithEffects(law), schedule.method))
+
+    def _halved_until_still(
+        self,
+        places: RowsInRuns,
+        theta: FloatArray,
+        effects: Sequence[NamedEffect[Any]],
+        *,
+        tolerance: float,
+        or_finest: bool = False,
+        most: float = math.inf,
+    ) -> System:
+        """Return the system with the step halved as `with_converged_step` says, by its own method.
+
+        Raises
+        ------
+        ParameterError
+            If predictions still change with 4,096 more steps than rows in the longest run, or at a cost above `most`.
+        """
+        table, now = places.table, self
         coarse, before = now.chain(table, effects).predict(theta, table), np.inf
         while True:
             finer = replace(now, max_step=now.max_step / 2)
@@ -298,7 +347,7 @@ class System:
             if or_finest and moved < before / _CONVERGING and not finer._has_affordable_steps(places):
                 return now
             now, coarse, before = finer, fine, moved
-            if not now._has_affordable_steps(places):
+            if not now._has_affordable_steps(places) or now._cost_of_integration(places) > most:
                 raise ParameterError(
                     "rates",
                     f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
@@ -308,8 +357,15 @@ class System:
     def _has_affordable_steps(self, places: RowsInRuns) -> bool:
         """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
         return bool(
-            places.step_schedule(self.max_step).n_steps.sum() <= _MOST_STEPS + len(places.row_by_position_and_run)
+            places.step_schedule(self.max_step, stiff=self.stiff).n_steps.sum()
+            <= _MOST_STEPS + len(places.row_by_position_and_run)
         )
+
+
+def _typical_gap(places: RowsInRuns) -> float:
+    """Return the median time between two rows of a run that are not at the same time; 1 without any."""
+    gaps = places.gaps
+    return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
 
 
 def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
@@ -377,7 +433,7 @@ class SystemChain:
         try:
             states, cost = integrate_from_known_trajectories(
                 law_and_inputs_of_samples,
-                steps_for_table(plan, system.max_step),
+                steps_for_table(plan, system.max_step, stiff=system.stiff),
                 system.trajectories,
                 effects=(system.runs, self.effects),
                 theta=theta,

@@ -38,7 +38,7 @@ def _difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]
 
 def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Convert predictions at these points, (n_params + 1, n_points), to that at z and slopes (n_points, n_params)."""
-    with np.errstate(invalid="ignore"):  # of a start from which the model diverges: not finite, and not taken
+    with np.errstate(invalid="ignore", over="ignore"):  # at a start from which the model diverges, which is not taken
         return batch[0], (batch[1:] - batch[0]).T / steps
 
 

@@ -18,6 +18,7 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.system.finer_step import finer_step_for_repair, searched_at_step
+from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
 from probewise.diagnosis.thinning import MOST_READINGS, positions_in_stretches
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
@@ -88,12 +89,13 @@ def diagnose_system(
         return searched, diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
 
     searched, diagnosis = fit_and_diagnose(simulator)
-    step = finer_step_for_repair(diagnosis)
-    if step is None:
+    needed = finer_step_for_repair(diagnosis)
+    if needed is None:
         return diagnosis
+    step, stiff = needed
     assert simulator.law is not None
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
-    finer = searched_at_step(searched, step, progress=progress)
+    finer = searched_at_step(searched, step, stiff=stiff, progress=progress)
     if finer is not None:
         return diagnosis_of_search(finer, thorough=thorough, progress=progress, rng=rng)
     return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)))[1]
@@ -236,6 +238,12 @@ def _notes_on_integration(tally: IntegrationTally, most: int) -> Iterator[str]:
             "combination of effects that promised something was fitted; with a larger max_step_s, shorter runs or "
             "fewer rows the search is complete"
         )
+    if tally.too_stiff:
+        yield (
+            "the law is stiff: parameters that may fit the readings would need more integration steps than are taken, "
+            "and count as impossible; their intervals may be too narrow; set max_step_s, or bring simulate with an "
+            "integrator"
+        )
     if tally.n_failed:
         yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"
 
@@ -267,7 +275,7 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:
-    """Fit a system to readings, at an integration step at which predictions no longer change.
+    """Fit a system to readings, at an integration step at which likely predictions no longer change.
 
     Returns
     -------
@@ -284,6 +292,10 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
             break
         system = finer
         found = fit(Model(system, (), recording.plan), recording, found.z, law)
+        sd = _noise_sd_of(system.simulator, table, recording, found)
+    finer = with_step_for_likely_parameters(system, table, recording, found, sd)
+    if finer is not system:
+        system, found = finer, fit(Model(finer, (), recording.plan), recording, found.z, law)
         sd = _noise_sd_of(system.simulator, table, recording, found)
     return system, found, sd
 

@@ -30,8 +30,8 @@ _N_HALVED = 4  # posterior samples of the repaired law for which the step is hal
 _HAS_A_CHANCE = 0.01  # probability from which a combination is refitted at the finer step
 
 
-def finer_step_for_repair(diagnosis: Diagnosis) -> float | None:
-    """Return the finer integration step that the repaired law needs, or the finest within reach.
+def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
+    """Return the finer integration step that the repaired law needs, or the finest within reach, and if it is stiff.
 
     None if the step used was fine enough, or the simulator has no law, or the repair no effects.
     """
@@ -46,10 +46,13 @@ def finer_step_for_repair(diagnosis: Diagnosis) -> float | None:
         still = system.with_converged_step(table, theta, effects, tolerance=tolerance, or_finest=True)
     except ParameterError:  # a friction or a bound that no step meets exactly
         return None
-    return still.max_step if still.max_step < system.max_step else None
+    needed = still.max_step, still.stiff
+    return needed if needed != (system.max_step, system.stiff) else None
 
 
-def searched_at_step(searched: Searched, max_step: float, *, progress: Progress = silent) -> Searched | None:
+def searched_at_step(
+    searched: Searched, max_step: float, *, stiff: bool = False, progress: Progress = silent
+) -> Searched | None:
     """Return a search with the combinations that have a chance refitted at another step, from their own parameters.
 
     None if one of them, the most probable first, gains or loses more than a nat: then errors of the integration may
@@ -59,14 +62,14 @@ def searched_at_step(searched: Searched, max_step: float, *, progress: Progress 
     ----------
     searched
         The search of a law.
-    max_step
-        The step, in the unit of time.
+    max_step, stiff
+        The step, in the unit of time, and whether a linearly implicit method takes it.
     progress
         Called at every refit.
     """
     prepared = searched.prepared
     apparatus = cast(SimulatorApparatus, prepared.apparatus)
-    finer = replace(cast(System, prepared.null), max_step=max_step)
+    finer = replace(cast(System, prepared.null), max_step=max_step, stiff=stiff)
     fits, unknown = dict(searched.evidences.fits), dict(searched.evidences.unknown)
     with_a_chance = _combinations_with_a_chance(searched)
     asked = [*with_a_chance, *([] if () in with_a_chance else [()])]  # the null is part of every report
@@ -92,7 +95,7 @@ def searched_at_step(searched: Searched, max_step: float, *, progress: Progress 
         prepared=replace(
             prepared,
             null=finer,
-            apparatus=replace(apparatus, finer=replace(apparatus.system, max_step=max_step)),
+            apparatus=replace(apparatus, finer=replace(apparatus.system, max_step=max_step, stiff=stiff)),
         ),
         nulls=dict.fromkeys(searched.nulls, finer),
     ).with_evidences(replace(searched.evidences, fits=fits, unknown=unknown))

@@ -83,6 +83,7 @@ def fitted_system_from_samples(
         absent=model.absent,
         level=(float(np.min(level)), float(np.max(level))),
         max_step=system.max_step,
+        stiff=system.stiff,
         known=known,
         recording=hashlib.sha256(run_table_csv(cast(RunTable, recording.plan)).encode()).hexdigest()[:16],
         source=recording.source,

@@ -68,7 +68,12 @@ class ReferenceFit:
         columns = columns_without_reading(system.simulator, self.table)
         parameters = system.parameters(self.theta, self.table)
         found = integrate_states(
-            system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step
+            system.simulator.law,
+            RowsInRuns(self.table),
+            parameters,
+            columns,
+            max_step=system.max_step,
+            stiff=system.stiff,
         )
         return {state: values[0] for state, values in found.items()}
 

@@ -1,0 +1,74 @@
+"""The integration step that likely parameters need: a time constant far below the time between readings."""
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.system.diagnose import fit_system, recording_from_table
+from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
+from probewise.systems import Law, RunTable, Simulator, System
+
+SD = 0.05
+TIMES = np.arange(60.0)
+HEATED = np.where(TIMES % 20 < 10, 1.0, 0.0)
+PRIORS = {"tau_s": ("log", 0.01, 100), "gain": (0, 10)}
+LAW = Law({"x": 0.0}, lambda s, p, u: {"x": (p["gain"] * u["power"] - s["x"]) / p["tau_s"]})
+
+
+def _readings(tau, gain):
+    """Return the state at every second by the closed form: the power is held from row to row."""
+    x = [0.0]
+    for power in HEATED[:-1]:
+        x.append(gain * power + (x[-1] - gain * power) * np.exp(-1.0 / tau))
+    return np.array(x)
+
+
+def _table(tau, seed):
+    y = _readings(tau, 3.0) + SD * np.random.default_rng(seed).normal(size=len(TIMES))
+    return RunTable({"t_s": TIMES, "power": HEATED, "y": y}, time="t_s", run=None)
+
+
+def _simulator(law=LAW):
+    return Simulator("y", "K", PRIORS, law=law, time="t_s")
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    table, simulator = _table(0.15, 3), _simulator()
+    recording = recording_from_table(simulator, table)
+    return table, recording, *fit_system(System.of(simulator, table), recording)
+
+
+def test_the_step_serves_all_time_constants_that_the_readings_allow(stiff):
+    table, _, system, _, _ = stiff
+    assert system.stiff
+    for tau in (0.011, 0.05, 0.2):  # with a tenth of a second they differ by less than the noise
+        predicted = system.chain(table, ()).predict(np.array([[tau, 3.0]]), table)[0]
+        np.testing.assert_allclose(predicted, _readings(tau, 3.0), atol=0.2 * SD)
+    assert not system.tally.too_stiff
+
+
+def test_the_step_of_the_best_fit_alone_would_not(stiff):
+    """So the test above can fail: the explicit step that is still at the best fit runs away at 0.011 s."""
+    table, _, _, _, sd = stiff
+    first = System.of(_simulator(), table).with_converged_step(table, np.array([[0.15, 3.0]]), tolerance=0.02 * sd)
+    assert not first.stiff
+    predicted = first.chain(table, ()).predict(np.array([[0.011, 3.0]]), table)[0]
+    assert not np.allclose(predicted, _readings(0.011, 3.0), atol=10 * SD)
+
+
+def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():
+    table, simulator = _table(8.0, 4), _simulator()
+    recording = recording_from_table(simulator, table)
+    system, found, sd = fit_system(System.of(simulator, table), recording)
+    assert not system.stiff
+    # The step fails at 0.01 s, which the readings exclude: there it may.
+    assert with_step_for_likely_parameters(system, table, recording, found, sd) is system
+    assert not np.isfinite(system.chain(table, ()).predict(np.array([[0.01, 3.0]]), table)).all()
+
+
+def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
+    table, recording, _, found, sd = stiff
+    monkeypatch.setattr("probewise.systems.system._MOST_STEPS", 20)
+    first = System.of(_simulator(), table)
+    assert not first.tally.too_stiff
+    assert with_step_for_likely_parameters(first, table, recording, found, sd).tally.too_stiff

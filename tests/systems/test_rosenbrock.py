@@ -1,0 +1,92 @@
+"""The linearly implicit method: its order, its stability, and steps of several runs, against closed forms."""
+
+import numpy as np
+import pytest
+
+from probewise.systems.motion import LawWithEffects, Stepper
+from probewise.systems.rosenbrock import RODAS
+from probewise.systems.simulator import Law
+
+END = 2.0
+
+
+def _after(law, n_steps, *, gap=END, between=None):
+    """Return the states after a gap in a number of steps."""
+    stepper = Stepper(
+        LawWithEffects(law), RODAS, between or (lambda share: ({}, {"t": gap * share})), np.atleast_2d(gap)
+    )
+    s = {name: np.full(np.shape(stepper.gap), float(value)) for name, value in law.states.items()}
+    with np.errstate(all="ignore"):
+        for k in range(n_steps):
+            s = stepper.step(s, k / n_steps, 1 / n_steps)
+    return s
+
+
+def _grows(s, p, u):  # x = tan(t / 2 + 1/4) has this rate; y = sin(t) that one
+    return {"x": 0.5 * (1 + s["x"] ** 2), "y": np.cos(u["t"]) - 3.0 * (s["y"] - np.sin(u["t"]))}
+
+
+def test_the_error_falls_by_the_fourth_order_in_a_bent_law_with_an_input_in_time():
+    law = Law({"x": np.tan(0.25), "y": 0.0}, _grows)
+
+    def error(n_steps):
+        s = _after(law, n_steps)
+        return np.array([s["x"][0, 0] - np.tan(1.25), s["y"][0, 0] - np.sin(END)])
+
+    orders = np.log2(np.abs(error(16) / error(32)))
+    assert (orders > 3.6).all()
+    assert np.abs(error(32)).max() < 2e-5
+
+
+@pytest.mark.parametrize("rate", [1e2, 1e5, 1e9])
+def test_what_decays_within_a_step_is_gone_after_a_few(rate):
+    """L-stability: an explicit method would multiply it by (rate times step)^4 / 24."""
+    s = _after(Law({"x": 1.0}, lambda s, p, u: {"x": -rate * s["x"]}), 4)
+    assert abs(s["x"][0, 0]) < 1e-3
+
+
+def test_a_fast_state_that_follows_a_slow_one_needs_no_short_steps():
+    """Robertson's kind of stiffness in two linear states: eigenvalues near -1e6 and -1/2."""
+
+    def rates(s, p, u):
+        return {"fast": 1e6 * (s["slow"] - s["fast"]), "slow": -0.5 * s["fast"]}
+
+    s = _after(Law({"fast": 0.0, "slow": 1.0}, rates), 8)
+    # By the exponential of the matrix; the fast state lags the slow one by half a millionth of its rate.
+    slow = np.exp(-0.5 * END)
+    assert s["slow"][0, 0] == pytest.approx(slow, rel=1e-5)
+    assert s["fast"][0, 0] == pytest.approx(slow, rel=1e-5)
+
+
+def test_three_states_are_as_two_beside_another():
+    def rates(s, p, u):
+        return {"x": 0.5 * (1 + s["x"] ** 2), "v": -40.0 * s["w"], "w": 40.0 * s["v"] - 2.0 * s["w"]}
+
+    start = {"x": 0.25, "v": 1.0, "w": 0.0}
+    three = _after(Law(start, rates), 50)
+    one = _after(Law({"x": 0.25}, lambda s, p, u: {"x": rates({**s, "v": 0.0, "w": 0.0}, p, u)["x"]}), 50)
+    two = _after(
+        Law({"v": 1.0, "w": 0.0}, lambda s, p, u: {k: v for k, v in rates({"x": 0.0, **s}, p, u).items() if k != "x"}),
+        50,
+    )
+    for name, value in {**one, **two}.items():
+        np.testing.assert_allclose(three[name], value, rtol=1e-8)
+
+
+def test_a_run_that_ended_stands_still_and_one_that_runs_away_leaves_the_others():
+    def rates(s, p, u):
+        return {"x": s["x"] ** 2 * p["k"] - s["x"]}
+
+    stepper = Stepper(
+        LawWithEffects(Law({"x": 1.0}, rates)),
+        RODAS,
+        lambda share: ({"k": np.array([[0.0], [1e200]])}, {}),
+        np.array([[1.0, 0.0, 2.0]]),
+    )
+    s = {"x": np.array([[1.0, 7.0, 1.0], [1.0, 7.0, 1e200]])}
+    with np.errstate(all="ignore"):
+        for k in range(10):
+            s = stepper.step(s, k / 10, 0.1)
+    np.testing.assert_allclose(s["x"][0], [np.exp(-1.0), 7.0, np.exp(-2.0)], rtol=1e-4)
+    assert s["x"][1, 1] == 7.0
+    assert not np.isfinite(s["x"][1, 2])

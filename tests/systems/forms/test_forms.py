@@ -11,6 +11,7 @@ from probewise.effects import is_out_of_vocabulary
 from probewise.errors import ParameterError
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.proposals import formula_forms
 from probewise.systems.forms.readings import sign_of_change, values_at_earlier_times
 from probewise.systems.motion import LawWithEffects
@@ -262,6 +263,42 @@ def test_an_input_is_cut_off_below_as_well_as_above():
     said = [form.sentence(np.array([level]), np.array([0.01])) for level in (0.7, -0.6)]
     assert "rises no further" in said[0]
     assert "falls no further" in said[1]
+
+
+@pytest.mark.parametrize("wild", [1e3, -1e3])
+def test_a_wild_cell_of_an_input_moves_no_ceiling(wild):
+    """Its level is where the other values are; beside 1,000 all levels were floors, beside -1,000 ceilings."""
+    drive = TABLE.columns["drive"].copy()
+    drive[7] = wild
+    table = TABLE.with_columns({"drive": drive})
+    system = System.of(_simulator(), table)
+    about = ReferenceFit(system, table, np.zeros(system.n_params), SD)
+    form = bind_forms(about)["input_saturation:drive"]
+    offset, gain = about.theta[0]
+    for level, cut in ((0.7, np.minimum), (-0.6, np.maximum), (form.nothing[0], np.minimum)):
+        theta = np.concatenate([about.theta[0], [level]])[None, :]
+        found = system.chain(table, [form]).predict(theta, table)[0]
+        np.testing.assert_allclose(found, offset + gain * cut(drive, level))
+
+
+@pytest.mark.parametrize(
+    ("values", "ends"),
+    [
+        ([0.0, 1.0], (0.0, 1.0, 1.0)),
+        ([0.0, 0.4, 1.0, np.nan, 9999.0], (0.0, 1.0, 9999.0)),
+        ([-9999.0, 0.0, 0.4, 1.0, 9999.0], (0.0, 1.0, 9999.0)),
+        ([0.0, 1.0, 2.0, 3.0, 9.0], (0.0, 3.0, 9.0)),
+        ([0.0, 1.0, 2.0, 3.0, 7.0], (0.0, 7.0, 7.0)),
+        ([0.0, 0.0, 0.0, 5.0], (0.0, 5.0, 5.0)),
+    ],
+)
+def test_levels_are_between_the_values_that_are_not_wild(values, ends):
+    found = clipping_levels(np.array(values))
+    assert (found.low, found.high, found.top) == ends
+
+
+def test_values_that_are_all_the_same_have_no_levels():
+    assert clipping_levels(np.full(5, 2.0)) is None
 
 
 def _names_in_units(of_law, time, column, reading):

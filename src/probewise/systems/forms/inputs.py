@@ -71,7 +71,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
         yield from _amplitude_form(
             about, f"input_gain:{name}", _column_changer(name, _scaled_column), 1e-4, "1", says, covariate
         )
-        yield from _clipped_column_form(about, name, low, high)
+        yield from _clipped_column_form(about, name)
         says = partial(_fill_sentence, f"{name} has no effect within {{}} of 0")
         if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # if larger, it is an offset
             yield from _log_uniform_form(
@@ -189,8 +189,8 @@ def _log_uniform_form(
         )
 
 
-def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float) -> Iterator[Form]:
-    ends = clipping_levels(low, high)
+def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
+    ends = clipping_levels(about.table.covariates[name])
     if ends is None:
         return
 

@@ -207,7 +207,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
 
 def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator[Form]:
     """Yield a bound of a state: the rate beyond it is lost, or a state that it drives takes up a share (overflow)."""
-    ends = clipping_levels(float(np.nanmin(values)), float(np.nanmax(values)))
+    ends = clipping_levels(values)
     if ends is None:
         return
     others = [other for other in about.states if other != state]

@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 
 from probewise.errors import FileError, ParameterError
 from probewise.systems import Law, RunTable, Simulator, System
+from probewise.systems.converged_step import with_converged_step
 from probewise.systems.motion import LawWithEffects, Limit, RowsInRuns, integrate_states
 
 
@@ -145,7 +146,7 @@ def test_the_step_is_halved_until_readings_stand_still():
     )
     table = _table(np.linspace(0, 10, 30))
     system = System.of(simulator, table)
-    still = system.with_converged_step(table, system.theta(system.starts[:1]), tolerance=1e-5)
+    still = with_converged_step(system, table, system.theta(system.starts[:1]), tolerance=1e-5)
     finer = System(simulator, system.runs, still.max_step / 16)
     theta = system.theta(system.starts[:1])
     far = np.abs(still.chain(table, ()).predict(theta, table) - finer.chain(table, ()).predict(theta, table))

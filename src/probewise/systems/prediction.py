@@ -30,10 +30,11 @@ from probewise.recordings.prediction import prediction_summary
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
+from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
-from probewise.systems.system import STANDS_STILL, System, SystemChain
+from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, covariate_of_column, relative_sds_of_column
 
 _OF_A_COLUMN = "sensitivity:", "depends:"  # effects, besides those on an input, that name a column last
@@ -215,8 +216,8 @@ def _chain_with_converged_step(chain: SystemChain, theta: FloatArray, table: Run
     effects = cast(Sequence[NamedEffect[Any]], chain.effects)
     extreme = theta[np.unique([theta.argmin(axis=0), theta.argmax(axis=0)])]
     try:
-        system = chain.system.with_converged_step(
-            table, extreme, effects, tolerance=STANDS_STILL * noise_sd, or_finest=True
+        system = with_converged_step(
+            chain.system, table, extreme, effects, tolerance=STANDS_STILL * noise_sd, or_finest=True
         )
     except ParameterError:  # a friction or a bound that no step meets exactly
         return chain

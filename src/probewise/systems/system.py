@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,19 +21,13 @@ from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_tr
 from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.mistakes import user_function_error
-from probewise.systems.motion import LawWithEffects, evaluations_per_step, integrate_readings, readings_of_states
+from probewise.systems.motion import LawWithEffects, integrate_readings, readings_of_states
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
-STANDS_STILL = 0.02
-"""Noise sds, rms, that predictions may move by when the step of the integration is halved."""
-
-_MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
-_CHEAPER = 2.0  # evaluations of the explicit method for one of a linearly implicit one, from which that is taken
-_CONVERGING = 4.0  # factor by which halving the step reduces the change at least, if the law is smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +106,7 @@ class System:
                 raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or _typical_gap(RowsInRuns(table)))
+        system = replace(bare, max_step=simulator.law.max_step_s or RowsInRuns(table).typical_gap)
         system.require_working_law(table)
         return system
 
@@ -252,120 +245,6 @@ class System:
     def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
         """Return the chain of the system with effects, ordered by stage; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
-
-    def with_converged_step(
-        self,
-        table: RunTable,
-        theta: FloatArray,
-        effects: Sequence[NamedEffect[Any]] = (),
-        *,
-        tolerance: float,
-        or_finest: bool = False,
-    ) -> System:
-        """Return the system with a step so short that halving it changes predictions by a tolerance (rms) at most.
-
-        Where a linearly implicit method needs less than half the evaluations, the system is `stiff`.
-
-        Parameters
-        ----------
-        table
-            The rows.
-        theta
-            Parameters of the system and of the effects, (n_samples, n_params); samples without finite predictions do
-            not count, unless half the step makes them finite.
-        effects
-            Effects added to the law.
-        tolerance
-            Tolerance, in the unit of a reading.
-        or_finest
-            Return the finest step within reach, instead of an error, if predictions converge but still change by more.
-
-        Raises
-        ------
-        ParameterError
-            If predictions still change with 4,096 more steps than rows in the longest run.
-        """
-        if self.simulator.law is None:
-            return self
-        places, wrong = RowsInRuns(table), None
-        found: System | None = None
-        try:
-            found = self._halved_until_still(places, theta, effects, tolerance=tolerance, or_finest=or_finest)
-        except ParameterError as error:
-            wrong = error
-        cost = math.inf if found is None else found._cost_of_integration(places)
-        stiff = replace(self, max_step=max(self.max_step, _typical_gap(places)), stiff=True)
-        if found is not self and not self.stiff and cost > _CHEAPER * stiff._cost_of_integration(places):
-            try:
-                stiff = stiff._halved_until_still(places, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
-            except ParameterError:
-                pass
-            else:
-                return stiff
-        if found is None:
-            assert wrong is not None
-            raise wrong
-        return found
-
-    def _cost_of_integration(self, places: RowsInRuns) -> float:
-        """Return the number of evaluations of the rates, of all samples and runs together."""
-        law = self.simulator.law
-        assert law is not None
-        schedule = places.step_schedule(self.max_step, stiff=self.stiff)
-        return float(schedule.n_steps.sum() * evaluations_per_step(LawWithEffects(law), schedule.method))
-
-    def _halved_until_still(
-        self,
-        places: RowsInRuns,
-        theta: FloatArray,
-        effects: Sequence[NamedEffect[Any]],
-        *,
-        tolerance: float,
-        or_finest: bool = False,
-        most: float = math.inf,
-    ) -> System:
-        """Return the system with the step halved as `with_converged_step` says, by its own method.
-
-        Raises
-        ------
-        ParameterError
-            If predictions still change with 4,096 more steps than rows in the longest run, or at a cost above `most`.
-        """
-        table, now = places.table, self
-        coarse, before = now.chain(table, effects).predict(theta, table), np.inf
-        while True:
-            finer = replace(now, max_step=now.max_step / 2)
-            fine = finer.chain(table, effects).predict(theta, table)
-            there = np.isfinite(coarse) & np.isfinite(fine)
-            ran_away = np.isfinite(fine) & ~np.isfinite(coarse)  # at the longer step alone
-            moved = np.inf
-            if there.any() and not ran_away.any():
-                with np.errstate(over="ignore"):  # of predictions that are about to run away
-                    moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2)))
-            if moved <= tolerance:
-                return now
-            if or_finest and moved < before / _CONVERGING and not finer._has_affordable_steps(places):
-                return now
-            now, coarse, before = finer, fine, moved
-            if not now._has_affordable_steps(places) or now._cost_of_integration(places) > most:
-                raise ParameterError(
-                    "rates",
-                    f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
-                    "a law that some thousand steps integrate: set max_step_s, or bring simulate with an integrator",
-                )
-
-    def _has_affordable_steps(self, places: RowsInRuns) -> bool:
-        """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
-        return bool(
-            places.step_schedule(self.max_step, stiff=self.stiff).n_steps.sum()
-            <= _MOST_STEPS + len(places.row_by_position_and_run)
-        )
-
-
-def _typical_gap(places: RowsInRuns) -> float:
-    """Return the median time between two rows of a run that are not at the same time; 1 without any."""
-    gaps = places.gaps
-    return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
 
 
 def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:

@@ -6,6 +6,7 @@ import pytest
 from probewise.diagnosis.system.diagnose import fit_system, recording_from_table
 from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
+from probewise.systems.converged_step import with_converged_step
 
 SD = 0.05
 TIMES = np.arange(60.0)
@@ -50,7 +51,7 @@ def test_the_step_serves_all_time_constants_that_the_readings_allow(stiff):
 def test_the_step_of_the_best_fit_alone_would_not(stiff):
     """So the test above can fail: the explicit step that is still at the best fit runs away at 0.011 s."""
     table, _, _, _, sd = stiff
-    first = System.of(_simulator(), table).with_converged_step(table, np.array([[0.15, 3.0]]), tolerance=0.02 * sd)
+    first = with_converged_step(System.of(_simulator(), table), table, np.array([[0.15, 3.0]]), tolerance=0.02 * sd)
     assert not first.stiff
     predicted = first.chain(table, ()).predict(np.array([[0.011, 3.0]]), table)[0]
     assert not np.allclose(predicted, _readings(0.011, 3.0), atol=10 * SD)
@@ -68,7 +69,7 @@ def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():
 
 def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
     table, recording, _, found, sd = stiff
-    monkeypatch.setattr("probewise.systems.system._MOST_STEPS", 20)
+    monkeypatch.setattr("probewise.systems.converged_step._MOST_STEPS", 20)
     first = System.of(_simulator(), table)
     assert not first.tally.too_stiff
     assert with_step_for_likely_parameters(first, table, recording, found, sd).tally.too_stiff

@@ -17,8 +17,8 @@ from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, name_of_first
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
+from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
-from probewise.systems.system import STANDS_STILL
 from probewise.systems.table import median_sd_of_column
 
 _NOISE = 0.01  # of the range of the readings, if no noise is declared
@@ -57,7 +57,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     system = System.of(simulator, own)
     z, predicted, where = _point_where_readings_vary(system, own)
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
-    system = system.with_converged_step(own, system.theta(z[None, :]), tolerance=STANDS_STILL * sd)
+    system = with_converged_step(system, own, system.theta(z[None, :]), tolerance=STANDS_STILL * sd)
     about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in bind_forms(about).items() if name_of_first_copy(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]

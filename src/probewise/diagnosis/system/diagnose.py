@@ -26,12 +26,12 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.calls import IntegrationTally
+from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.sorted_rows import sorting_column
 from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
 from probewise.systems.row_order import note_on_row_order, rows_are_in_order
-from probewise.systems.system import STANDS_STILL
 from probewise.systems.table import median_sd_of_column
 
 _STEPS_TRIED = 8  # of the fit of the simulator, from each start
@@ -287,7 +287,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     found = _fit_from_best_starts(system, recording, law)
     sd = _noise_sd_of(system.simulator, table, recording, found)
     for _ in range(4):
-        finer = system.with_converged_step(table, system.theta(found.z[None, :]), tolerance=STANDS_STILL * sd)
+        finer = with_converged_step(system, table, system.theta(found.z[None, :]), tolerance=STANDS_STILL * sd)
         if finer is system:
             break
         system = finer

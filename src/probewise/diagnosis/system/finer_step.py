@@ -24,7 +24,7 @@ from probewise.effects import NamedEffect
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.progress import Progress, silent
 from probewise.systems import RunTable, System
-from probewise.systems.system import STANDS_STILL
+from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
 _HAS_A_CHANCE = 0.01  # probability from which a combination is refitted at the finer step
@@ -43,7 +43,7 @@ def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
     tolerance = STANDS_STILL * float(np.median(model.noise_sd))
     try:
         theta = model.theta[:_N_HALVED]
-        still = system.with_converged_step(table, theta, effects, tolerance=tolerance, or_finest=True)
+        still = with_converged_step(system, table, theta, effects, tolerance=tolerance, or_finest=True)
     except ParameterError:  # a friction or a bound that no step meets exactly
         return None
     needed = still.max_step, still.stiff

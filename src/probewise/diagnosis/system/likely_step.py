@@ -19,7 +19,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.systems import RunTable, System
-from probewise.systems.system import STANDS_STILL
+from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 
 _LINE = np.arange(-3.0, 3.01, 0.25)  # standard-normal coordinates at which the step is tried
 _WRONG = 1.0  # noise sds, rms, by which half the step changes predictions where the step fails
@@ -75,7 +75,7 @@ def with_step_for_likely_parameters(
         while abs(z[k]) < -_LINE[0] and density > best - _LIKELY:
             further, before = z + stride * towards * (np.arange(len(z)) == k), density
             try:
-                finer = system.with_converged_step(table, system.theta(further[None, :]), tolerance=tolerance)
+                finer = with_converged_step(system, table, system.theta(further[None, :]), tolerance=tolerance)
             except ParameterError:
                 system.tally.too_stiff = True
                 break

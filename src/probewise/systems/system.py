@@ -64,8 +64,10 @@ class System:
     trajectories: TrajectoryCache = field(default_factory=TrajectoryCache, repr=False)
 
     @classmethod
-    def of(cls, simulator: Simulator, table: RunTable) -> System:
+    def of(cls, simulator: Simulator, table: RunTable, *, stiff: bool = False) -> System:
         """Build the system for the runs of a table, and determine how the simulator can be called.
+
+        A law is integrated by a linearly implicit method if `stiff`.
 
         Raises
         ------
@@ -106,7 +108,7 @@ class System:
                 raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or RowsInRuns(table).typical_gap)
+        system = replace(bare, max_step=simulator.law.max_step_s or RowsInRuns(table).typical_gap, stiff=stiff)
         system.require_working_law(table)
         return system
 
@@ -129,7 +131,12 @@ class System:
                 parameters = self.parameters(self.theta(z[None, :]), table)
                 readings.append(
                     integrate_readings(
-                        LawWithEffects(law), RowsInRuns(table), parameters, columns, max_step=self.max_step
+                        LawWithEffects(law),
+                        RowsInRuns(table),
+                        parameters,
+                        columns,
+                        max_step=self.max_step,
+                        stiff=self.stiff,
                     )
                 )
             except ProbewiseError:

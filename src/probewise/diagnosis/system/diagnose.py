@@ -82,8 +82,8 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
 
-    def fit_and_diagnose(simulator: Simulator) -> tuple[Searched, Diagnosis]:
-        prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
+    def fit_and_diagnose(simulator: Simulator, *, stiff: bool = False) -> tuple[Searched, Diagnosis]:
+        prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
         searched = search_prepared(prepared, progress=told)
         return searched, diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
@@ -98,7 +98,7 @@ def diagnose_system(
     finer = searched_at_step(searched, step, stiff=stiff, progress=progress)
     if finer is not None:
         return diagnosis_of_search(finer, thorough=thorough, progress=progress, rng=rng)
-    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)))[1]
+    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff)[1]
 
 
 def prepare_system(
@@ -109,14 +109,18 @@ def prepare_system(
     notes: Sequence[str] = (),
     progress: Progress = silent,
     with_effects: bool = True,
+    stiff: bool = False,
 ) -> Prepared:
-    """Fit the simulator, and build the engine's input; effects are scaled to the fit, none unless `with_effects`."""
+    """Fit the simulator, and build the engine's input; effects are scaled to the fit, none unless `with_effects`.
+
+    A law is integrated by a linearly implicit method if `stiff`, or where it needs one.
+    """
     recording = replace(
         recording_from_table(simulator, table),
         source=source or simulator.source,
         notes=(*notes, *note_on_row_order(simulator, table)),
     )
-    system = System.of(simulator, table)
+    system = System.of(simulator, table, stiff=stiff)
     if with_effects and len(table) < 2:  # nothing can change along it
         raise ParameterError("the table", "one row", f"{system.least_readings} rows or more, not all readings equal")
     plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)

@@ -10,8 +10,6 @@ cases that changed are counted, with the two-sided probability of such a differe
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import lzma
 import tempfile
 from collections.abc import Callable, Mapping
@@ -21,16 +19,10 @@ from typing import Any
 from scipy.stats import binomtest
 
 from probewise.campaign import read_campaign
-from probewise.challenge.scoring import credible_set_holds_truth, is_out_of_vocabulary
-from probewise.challenge.table import (
-    is_confidently_wrong,
-    is_leading_name_right,
-    names_effect_on_mean,
-    score,
-)
+from probewise.challenge.scoring import Result, credible_set_holds_truth, is_out_of_vocabulary
+from probewise.challenge.table import is_confidently_wrong, is_leading_name_right, names_effect_on_mean, score
 from probewise.recordings import write_text_atomically
-
-Result = Mapping[str, Any]
+from probewise.recordings.table import csv_text_of_rows
 
 COUNTED: Mapping[str, tuple[Callable[[Result], bool], Callable[[Result], bool]]] = {
     "clean, alarm at .05": (lambda r: r["kind"] == "clean", lambda r: r["p_value"] <= 0.05),
@@ -79,11 +71,7 @@ def changed_counts(earlier: list[Result], later: list[Result]) -> list[dict[str,
 
 def as_csv(rows: list[dict[str, Any]]) -> str:
     """Return rows as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text_of_rows(rows[0], (row.values() for row in rows))
 
 
 def main() -> None:

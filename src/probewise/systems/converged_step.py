@@ -16,8 +16,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
+from probewise.systems.all_steps import Steps, steps_for_table
 from probewise.systems.motion import LawWithEffects, evaluations_per_step
-from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.system import System
 from probewise.systems.table import RunTable
 
@@ -65,17 +65,16 @@ def with_converged_step(
     """
     if system.simulator.law is None:
         return system
-    places = RowsInRuns(table)
     found: System | ParameterError
     try:
-        found = _halved_until_still(system, places, theta, effects, tolerance=tolerance, or_finest=or_finest)
-        cost = _cost_of_integration(found, places)
+        found = _halved_until_still(system, table, theta, effects, tolerance=tolerance, or_finest=or_finest)
+        cost = _cost_of_integration(found, table)
     except ParameterError as error:
         found, cost = error, math.inf
-    stiff = replace(system, max_step=max(system.max_step, places.typical_gap), stiff=True)
-    if found is not system and not system.stiff and cost > _CHEAPER * _cost_of_integration(stiff, places):
+    stiff = replace(system, max_step=max(system.max_step, _steps(system, table).places.typical_gap), stiff=True)
+    if found is not system and not system.stiff and cost > _CHEAPER * _cost_of_integration(stiff, table):
         try:
-            return _halved_until_still(stiff, places, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
+            return _halved_until_still(stiff, table, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
         except ParameterError:  # it is not still either, or not at that cost
             pass
     if isinstance(found, ParameterError):
@@ -85,7 +84,7 @@ def with_converged_step(
 
 def _halved_until_still(
     system: System,
-    places: RowsInRuns,
+    table: RunTable,
     theta: FloatArray,
     effects: Sequence[NamedEffect[Any]],
     *,
@@ -100,7 +99,7 @@ def _halved_until_still(
     ParameterError
         If predictions still change with 4,096 more steps than rows in the longest run, or at a cost above `most`.
     """
-    table, now = places.table, system
+    now = system
     coarse, before = now.chain(table, effects).predict(theta, table), np.inf
     while True:
         finer = replace(now, max_step=now.max_step / 2)
@@ -113,10 +112,10 @@ def _halved_until_still(
                 moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2)))
         if moved <= tolerance:
             return now
-        if or_finest and moved < before / _CONVERGING and not _has_affordable_steps(finer, places):
+        if or_finest and moved < before / _CONVERGING and not _has_affordable_steps(finer, table):
             return now
         now, coarse, before = finer, fine, moved
-        if not _has_affordable_steps(now, places) or _cost_of_integration(now, places) > most:
+        if not _has_affordable_steps(now, table) or _cost_of_integration(now, table) > most:
             raise ParameterError(
                 "rates",
                 f"readings still move by {moved:.3g} rms {system.simulator.unit} when the step is halved",
@@ -124,15 +123,20 @@ def _halved_until_still(
             )
 
 
-def _cost_of_integration(system: System, places: RowsInRuns) -> float:
+def _steps(system: System, table: RunTable) -> Steps:
+    """Return the steps by which a system predicts a table."""
+    return steps_for_table(table, system.max_step, stiff=system.stiff)
+
+
+def _cost_of_integration(system: System, table: RunTable) -> float:
     """Return the number of evaluations of the rates, of all samples and runs together."""
     law = system.simulator.law
     assert law is not None
-    schedule = places.step_schedule(system.max_step, stiff=system.stiff)
+    schedule = _steps(system, table).schedule
     return float(schedule.n_steps.sum() * evaluations_per_step(LawWithEffects(law), schedule.method))
 
 
-def _has_affordable_steps(system: System, places: RowsInRuns) -> bool:
+def _has_affordable_steps(system: System, table: RunTable) -> bool:
     """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
-    n_steps = places.step_schedule(system.max_step, stiff=system.stiff).n_steps.sum()
-    return bool(n_steps <= _MOST_STEPS + len(places.row_by_position_and_run))
+    steps = _steps(system, table)
+    return bool(steps.schedule.n_steps.sum() <= _MOST_STEPS + len(steps.places.row_by_position_and_run))

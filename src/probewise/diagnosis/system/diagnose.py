@@ -290,18 +290,18 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     law = white_noise_of_recording(recording)
     found = _fit_from_best_starts(system, recording, law)
     sd = _noise_sd_of(system.simulator, table, recording, found)
+
+    def refitted(finer: System) -> tuple[System, Fit, float]:
+        again = fit(Model(finer, (), recording.plan), recording, found.z, law)
+        return finer, again, _noise_sd_of(finer.simulator, table, recording, again)
+
     for _ in range(4):
         finer = with_converged_step(system, table, system.theta(found.z[None, :]), tolerance=STANDS_STILL * sd)
         if finer is system:
             break
-        system = finer
-        found = fit(Model(system, (), recording.plan), recording, found.z, law)
-        sd = _noise_sd_of(system.simulator, table, recording, found)
+        system, found, sd = refitted(finer)
     finer = with_step_for_likely_parameters(system, table, recording, found, sd)
-    if finer is not system:
-        system, found = finer, fit(Model(finer, (), recording.plan), recording, found.z, law)
-        sd = _noise_sd_of(system.simulator, table, recording, found)
-    return system, found, sd
+    return (system, found, sd) if finer is system else refitted(finer)
 
 
 def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -> Fit:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from probewise.systems import Law, RunTable
-from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_for_table
-from probewise.systems.motion import LawWithEffects, Limit, RowsInRuns, integrate_states
+from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
+from probewise.systems.motion import LawWithEffects, Limit, integrate_states
+from probewise.systems.steps import steps_for_table
 
 
 def _pendulum(s, p, u):
@@ -65,7 +66,7 @@ class _Case:
 
     def stepped(self, theta):
         motion, own, columns = self.problem(theta)(np.arange(len(theta)))
-        return integrate_states(motion, RowsInRuns(self.table), own, columns, max_step=0.02)
+        return integrate_states(motion, steps_for_table(self.table, 0.02), own, columns)
 
 
 @pytest.mark.parametrize("effect", [_plain, _rubbed, _stopped, _forced])

@@ -7,7 +7,9 @@ from scipy.integrate import solve_ivp
 from probewise.errors import FileError, ParameterError
 from probewise.systems import Law, RunTable, Simulator, System
 from probewise.systems.converged_step import with_converged_step
-from probewise.systems.motion import LawWithEffects, Limit, RowsInRuns, integrate_states
+from probewise.systems.motion import LawWithEffects, Limit, integrate_states
+from probewise.systems.rows_in_runs import RowsInRuns
+from probewise.systems.steps import steps_for_table
 
 
 def _pendulum(s, p, u):
@@ -21,7 +23,7 @@ def _table(times, **columns):
 def _states(motion, table, parameters, max_step):
     own = {name: np.full((1, 1), value) for name, value in parameters.items()}
     columns = {name: values for name, values in table.columns.items() if name != "y"}
-    return {k: v[0] for k, v in integrate_states(motion, RowsInRuns(table), own, columns, max_step=max_step).items()}
+    return {k: v[0] for k, v in integrate_states(motion, steps_for_table(table, max_step), own, columns).items()}
 
 
 def test_a_pendulum_swings_as_an_adaptive_integrator_says():

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,7 @@ from probewise.systems.motion import (
     step_in_part,
     time_gaps,
 )
-from probewise.systems.rows_in_runs import RowsInRuns
-from probewise.systems.runge_kutta import StepSchedule
-from probewise.systems.table import RunTable
+from probewise.systems.steps import Steps
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
 _NEWTONS = 8  # iterations with a sample's own Jacobian
@@ -54,63 +51,6 @@ _FEW_NEAR, _FEW_FAR = 300, 40
 
 LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Mapping[str, FloatArray], Mapping[str, NDArray[Any]]]]
 """Function of the numbers of some samples: their law with its effects, their parameters, and the columns."""
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """Integration steps over a table, each taken in all runs together; position k is the k-th row of every run."""
-
-    places: RowsInRuns
-    max_step: float
-    stiff: bool = False
-
-    @cached_property
-    def schedule(self) -> StepSchedule:
-        """Number of steps from each row of a run to the next, the same in all runs, and the method."""
-        return self.places.step_schedule(self.max_step, stiff=self.stiff)
-
-    @property
-    def n_steps_by_gap(self) -> IntArray:
-        """Number of steps from each row of a run to the next, (n_places - 1,); the same in all runs."""
-        return self.schedule.n_steps
-
-    @cached_property
-    def gap_of_step(self) -> IntArray:
-        """Number of the gap in which each step lies, (n_steps,); gap k is between rows k and k + 1 of every run."""
-        return np.repeat(np.arange(len(self.n_steps_by_gap)), self.n_steps_by_gap)
-
-    @cached_property
-    def n_steps_before_position(self) -> IntArray:
-        """Number of steps from the first row of a run to its row at each position, (n_places,)."""
-        return np.concatenate([[0], np.cumsum(self.n_steps_by_gap)])
-
-    @property
-    def n_runs(self) -> int:
-        """Number of runs."""
-        return int(self.places.row_by_position_and_run.shape[1])
-
-    @cached_property
-    def begin_share_of_gap(self) -> FloatArray:
-        """Share of its gap between rows at which each step begins, (n_steps * n_runs,), ordered by step, then run."""
-        gap = self.gap_of_step
-        share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.n_steps_by_gap[gap]
-        return np.repeat(share, self.n_runs)
-
-    @cached_property
-    def length_share_of_gap(self) -> FloatArray:
-        """Share of its gap between rows that each step takes, (n_steps * n_runs,), ordered by step, then run."""
-        return np.repeat(1.0 / self.n_steps_by_gap[self.gap_of_step], self.n_runs)
-
-    def states_at_rows(self, states: FloatArray) -> FloatArray:
-        """Select states (n_states, n_samples, n_steps + 1, n_runs) at every row: (n_states, n_samples, n_points)."""
-        place, run = self.places.position_and_run_by_row
-        return np.asarray(states[:, :, self.n_steps_before_position[place], run])
-
-
-@lru_cache(maxsize=16)
-def steps_for_table(table: RunTable, max_step: float, *, stiff: bool = False) -> Steps:
-    """Return the steps of an integration over a table, none longer than `max_step` at fourth order."""
-    return Steps(RowsInRuns(table), max_step, stiff)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +168,7 @@ def integrate_from_known_trajectories(
     n_samples = len(theta)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
-        states_by_name = integrate_states(
-            motion, steps.places, parameters, columns, max_step=steps.max_step, stiff=steps.stiff
-        )
+        states_by_name = integrate_states(motion, steps, parameters, columns)
         n_parts = n_parts_of_schedule(motion, steps.schedule)
         return states_by_name, n_parts * evaluations_per_step(motion, steps.schedule.method)
     states, left, cost = None, np.arange(n_samples), 0
@@ -248,7 +186,7 @@ def integrate_from_known_trajectories(
             refused = True
     if left.size:
         motion, parameters, columns = law_and_inputs(left)
-        every = states_by_step(motion, steps.places, parameters, columns, steps.schedule)
+        every = states_by_step(motion, steps, parameters, columns)
         there = np.stack([[*s.values()] for s in every], axis=2)
         memory.n_refused += refused
         if states is None:

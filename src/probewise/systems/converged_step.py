@@ -16,7 +16,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
-from probewise.systems.all_steps import Steps, steps_for_table
 from probewise.systems.motion import LawWithEffects, evaluations_per_step
 from probewise.systems.system import System
 from probewise.systems.table import RunTable
@@ -71,7 +70,7 @@ def with_converged_step(
         cost = _cost_of_integration(found, table)
     except ParameterError as error:
         found, cost = error, math.inf
-    stiff = replace(system, max_step=max(system.max_step, _steps(system, table).places.typical_gap), stiff=True)
+    stiff = replace(system, max_step=max(system.max_step, system.steps(table).places.typical_gap), stiff=True)
     if found is not system and not system.stiff and cost > _CHEAPER * _cost_of_integration(stiff, table):
         try:
             return _halved_until_still(stiff, table, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
@@ -123,20 +122,15 @@ def _halved_until_still(
             )
 
 
-def _steps(system: System, table: RunTable) -> Steps:
-    """Return the steps by which a system predicts a table."""
-    return steps_for_table(table, system.max_step, stiff=system.stiff)
-
-
 def _cost_of_integration(system: System, table: RunTable) -> float:
     """Return the number of evaluations of the rates, of all samples and runs together."""
     law = system.simulator.law
     assert law is not None
-    schedule = _steps(system, table).schedule
+    schedule = system.steps(table).schedule
     return float(schedule.n_steps.sum() * evaluations_per_step(LawWithEffects(law), schedule.method))
 
 
 def _has_affordable_steps(system: System, table: RunTable) -> bool:
     """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
-    steps = _steps(system, table)
+    steps = system.steps(table)
     return bool(steps.schedule.n_steps.sum() <= _MOST_STEPS + len(steps.places.row_by_position_and_run))

@@ -16,6 +16,7 @@ from probewise.systems.rosenbrock import Rosenbrock
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
 from probewise.systems.simulator import Law, call_on_read_only, read_only_views
+from probewise.systems.steps import Steps
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -117,12 +118,9 @@ class LawWithEffects:
 
 def integrate_readings(
     motion: LawWithEffects,
-    places: RowsInRuns,
+    steps: Steps,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
-    *,
-    max_step: float,
-    stiff: bool = False,
 ) -> FloatArray:
     """Integrate a law by a Runge-Kutta method; return the reading at every row, (n_samples, n_points).
 
@@ -130,18 +128,14 @@ def integrate_readings(
     ----------
     motion
         The law with the contributions of effects.
-    places
-        The rows by position in runs.
+    steps
+        The integration steps and their method.
     parameters
         (n_samples, 1), or (n_samples, n_points) if they vary by row.
     columns
         (n_points,), or (n_samples, n_points) if an effect changes them; as recorded, of those that `motion` delays.
-    max_step
-        Largest step at fourth order, in the unit of time; see `StepSchedule.from_fourth_order_steps`.
-    stiff
-        Whether to integrate by a linearly implicit method.
     """
-    states = integrate_states(motion, places, parameters, columns, max_step=max_step, stiff=stiff)
+    states = integrate_states(motion, steps, parameters, columns)
     return readings_of_states(motion.law, states, parameters, columns)
 
 
@@ -160,20 +154,16 @@ def readings_of_states(
 
 def integrate_states(
     motion: LawWithEffects | Law,
-    places: RowsInRuns,
+    steps: Steps,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
-    *,
-    max_step: float,
-    stiff: bool = False,
 ) -> dict[str, FloatArray]:
     """Integrate a law as `integrate_readings` does; return every state at every row, by name, (n_samples, n_points)."""
     motion = LawWithEffects(motion) if isinstance(motion, Law) else motion
-    schedule = places.step_schedule(max_step, stiff=stiff)
-    at_row = np.concatenate([[0], np.cumsum(schedule.n_steps)])
+    places, at_row = steps.places, steps.n_steps_before_position
     kept: dict[str, FloatArray] = {}
     k = 0
-    for number, s in enumerate(states_by_step(motion, places, parameters, columns, schedule)):
+    for number, s in enumerate(states_by_step(motion, steps, parameters, columns)):
         if number != at_row[k]:
             continue
         for state, values in s.items():
@@ -187,12 +177,12 @@ def integrate_states(
 
 def states_by_step(
     motion: LawWithEffects,
-    places: RowsInRuns,
+    steps: Steps,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
-    schedule: StepSchedule,
 ) -> Iterator[dict[str, FloatArray]]:
     """Integrate the law: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
+    places, schedule = steps.places, steps.schedule
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
     start = initial_states(motion.law, places, parameters, n_samples)
     gaps = time_gaps(places, columns)

@@ -8,8 +8,6 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.systems.rosenbrock import RODAS
-from probewise.systems.runge_kutta import StepSchedule
 from probewise.systems.table import RunTable
 
 
@@ -50,12 +48,3 @@ class RowsInRuns:
         for rows in self.table.rows_by_scan():
             place[rows] = np.arange(len(rows))
         return place, self.table.scan
-
-    def step_schedule(self, max_step: float, *, stiff: bool = False) -> StepSchedule:
-        """Return the number of steps from each position to the next, and their method, for a largest step.
-
-        The method is linearly implicit if `stiff`, else explicit.
-        """
-        longest = self.gaps.max(axis=1, initial=0.0)
-        n_steps = np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
-        return StepSchedule(n_steps, RODAS) if stiff else StepSchedule.from_fourth_order_steps(n_steps)

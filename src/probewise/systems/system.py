@@ -17,13 +17,14 @@ from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
-from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_for_table
+from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
 from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.mistakes import user_function_error
 from probewise.systems.motion import LawWithEffects, integrate_readings, readings_of_states
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Simulator
+from probewise.systems.steps import Steps, steps_for_table
 from probewise.systems.table import RunTable
 
 _N_STARTS = 8
@@ -112,6 +113,10 @@ class System:
         system.require_working_law(table)
         return system
 
+    def steps(self, table: RunTable) -> Steps:
+        """Return the steps by which the law is integrated over a table."""
+        return steps_for_table(table, self.max_step, stiff=self.stiff)
+
     def require_working_law(self, table: RunTable) -> None:
         """Raise an error unless the law integrates to finite readings at some point of the prior.
 
@@ -129,16 +134,7 @@ class System:
         for z in self.starts:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
-                readings.append(
-                    integrate_readings(
-                        LawWithEffects(law),
-                        RowsInRuns(table),
-                        parameters,
-                        columns,
-                        max_step=self.max_step,
-                        stiff=self.stiff,
-                    )
-                )
+                readings.append(integrate_readings(LawWithEffects(law), self.steps(table), parameters, columns))
             except ProbewiseError:
                 raise
             except Exception as error:
@@ -319,7 +315,7 @@ class SystemChain:
         try:
             states, cost = integrate_from_known_trajectories(
                 law_and_inputs_of_samples,
-                steps_for_table(plan, system.max_step, stiff=system.stiff),
+                system.steps(plan),
                 system.trajectories,
                 effects=(system.runs, self.effects),
                 theta=theta,

@@ -14,7 +14,6 @@ from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.motion import integrate_states
 from probewise.systems.row_order import rows_are_in_order
-from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import call_on_read_only, read_only_views
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
@@ -67,14 +66,7 @@ class ReferenceFit:
             return {}
         columns = columns_without_reading(system.simulator, self.table)
         parameters = system.parameters(self.theta, self.table)
-        found = integrate_states(
-            system.simulator.law,
-            RowsInRuns(self.table),
-            parameters,
-            columns,
-            max_step=system.max_step,
-            stiff=system.stiff,
-        )
+        found = integrate_states(system.simulator.law, system.steps(self.table), parameters, columns)
         return {state: values[0] for state, values in found.items()}
 
     @cached_property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -111,7 +111,7 @@ class StepPart:
     """
 
     columns: IntArray | None
-    inputs: Callable[[Any], Pair]
+    inputs: StepInputs
     begin: Any
     length: Any
 

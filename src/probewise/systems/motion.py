@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray
-from probewise.systems.law_inputs import BetweenRows, LawInputs, Pair, StepPart, values_at_rows
+from probewise._arrays import FloatArray, IntArray
+from probewise.systems.law_inputs import BetweenRows, LawInputs, StepInputs, StepPart, values_at_rows
 from probewise.systems.rosenbrock import Rosenbrock
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
 from probewise.systems.simulator import Law, call_on_read_only, read_only_views
 from probewise.systems.steps import Steps
+
+_MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -71,6 +73,8 @@ class LawWithEffects:
         """Return, by state with friction, the direction of motion in the next step: 1, -1, or 0 if it sticks."""
         if not self.friction:
             return {}
+        if all((s[state] != 0).all() for state in self.friction):
+            return {state: np.sign(s[state]) for state in self.friction}
         free = self.rates(s, p, u, {})
         return {
             state: np.where(
@@ -253,7 +257,7 @@ class Stepper:
 
     motion: LawWithEffects
     method: RungeKutta | Rosenbrock
-    between: Callable[[Any], Pair]
+    between: StepInputs
     gap: FloatArray
 
     def step(self, s: dict[str, Any], begin: Any, length: Any) -> dict[str, Any]:
@@ -261,49 +265,83 @@ class Stepper:
 
         A motion that may come to a halt within a step takes one of eighth order as several of fourth order.
         """
-        motion, between = self.motion, self.between
+        motion = self.motion
         explicit = isinstance(self.method, RungeKutta)
         if explicit and self.method is not FOURTH_ORDER and (motion.limits or motion.friction):
             shorter, part = replace(self, method=FOURTH_ORDER), length / N_LONGER
             for k in range(N_LONGER):
                 s = shorter.step(s, begin + k * part, part)
             return s
-        ways = motion.directions_of_motion(s, *between(begin))
+        ways = motion.directions_of_motion(s, *self.between(begin))
         after = self._step_without_split(s, begin, length, ways)
         for state, way in ways.items():
-            at_rest = way == 0
-
-            def margin_to_transition(
-                at: Mapping[str, Any], share: Any, state: str = state, way: Any = way, at_rest: Any = at_rest
-            ) -> Any:
-                """Return the margin, negative after the transition, until the state comes to rest or breaks loose."""
-                moving = way * at[state]
-                if not at_rest.any():
-                    return moving
-                free = motion.rates(at, *between(share), {})[state]
-                return np.where(at_rest, motion.friction[state] - np.abs(free), moving)
-
-            first, last = margin_to_transition(s, begin), margin_to_transition(after, begin + length)
-            ends = last < 0
-            if not ends.any():
-                continue
-            until = np.where(ends, _zero_of_straight_line(0.0, first, 1.0, last), 1.0)
-            there = self._step_without_split(s, begin, until * length, ways)
-            left = margin_to_transition(there, begin + until * length)
-            closer = np.where(
-                left > 0,
-                _zero_of_straight_line(until, left, 1.0, last),
-                _zero_of_straight_line(0.0, first, until, left),
-            )
-            until = np.where(ends, closer, 1.0)
-            there = self._step_without_split(s, begin, until * length, ways)
-            there[state] = np.where(ends, 0.0, there[state])
-            anew = motion.directions_of_motion(there, *between(begin + until * length))
-            free = motion.rates(after, *between(begin + length), {})[state]
-            anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
-            after = self._step_without_split(there, begin + until * length, (1 - until) * length, anew)
-            ways = anew
+            after, ways = self._split_at_transitions(state, way, s, after, begin, length, ways)
         return motion.clip_and_stop_states(ways, after) if ways or motion.limits else after
+
+    def _split_at_transitions(
+        self,
+        state: str,
+        way: Any,
+        s: dict[str, Any],
+        after: dict[str, Any],
+        begin: Any,
+        length: Any,
+        ways: dict[str, Any],
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Split steps from `s` to `after` where friction brings a state to rest or lets it go.
+
+        The state begins them in the direction `way`; `ways` are the directions of all states that `after` results from.
+
+        Returns
+        -------
+        The states after the steps, and the directions of motion at their end.
+        """
+        motion, between, at_rest = self.motion, self.between, way == 0
+
+        def margin_to_transition(at: Mapping[str, Any], share: Any) -> Any:
+            """Return the margin, negative after the transition, until the state comes to rest or breaks loose."""
+            moving = way * at[state]
+            if not at_rest.any():
+                return moving
+            free = motion.rates(at, *between(share), {})[state]
+            return np.where(at_rest, motion.friction[state] - np.abs(free), moving)
+
+        last = margin_to_transition(after, begin + length)
+        ends = last < 0
+        if not ends.any():
+            return after, ways
+        n_columns, some = ends.shape[1], np.flatnonzero(ends.any(axis=0))
+        if n_columns > _MANY_COLUMNS and 2 * len(some) <= n_columns:
+            split = self._of_some(some)._split_at_transitions(
+                state,
+                way[:, some],
+                {name: values[:, some] for name, values in s.items()},
+                {name: values[:, some] for name, values in after.items()},
+                _of_columns(begin, some),
+                _of_columns(length, some),
+                {name: values[:, some] for name, values in ways.items()},
+            )
+            return _with_columns(after, some, split[0]), _with_columns(ways, some, split[1])
+        first = margin_to_transition(s, begin)
+        until = np.where(ends, _zero_of_straight_line(0.0, first, 1.0, last), 1.0)
+        there = self._step_without_split(s, begin, until * length, ways)
+        left = margin_to_transition(there, begin + until * length)
+        closer = np.where(
+            left > 0,
+            _zero_of_straight_line(until, left, 1.0, last),
+            _zero_of_straight_line(0.0, first, until, left),
+        )
+        until = np.where(ends, closer, 1.0)
+        there = self._step_without_split(s, begin, until * length, ways)
+        there[state] = np.where(ends, 0.0, there[state])
+        anew = motion.directions_of_motion(there, *between(begin + until * length))
+        free = motion.rates(after, *between(begin + length), {})[state]
+        anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
+        return self._step_without_split(there, begin + until * length, (1 - until) * length, anew), anew
+
+    def _of_some(self, columns: IntArray) -> Stepper:
+        """Return the steps of some of the columns of the states' arrays."""
+        return replace(self, between=self.between.of_some(columns), gap=_of_columns(self.gap, columns))
 
     def _step_without_split(
         self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]
@@ -328,9 +366,19 @@ def step_in_part(stepper: Stepper, part: StepPart, s: dict[str, Any]) -> dict[st
     if part.columns is None:
         return stepper.step(s, part.begin, part.length)
     after = stepper.step({state: values[:, part.columns] for state, values in s.items()}, part.begin, part.length)
+    return _with_columns(s, part.columns, after)
+
+
+def _of_columns(values: Any, columns: IntArray) -> Any:
+    """Return some columns of values by column, (n_columns,) or (n, n_columns); a number is that of all columns."""
+    return values[..., columns] if np.ndim(values) and values.shape[-1] > 1 else values
+
+
+def _with_columns(s: Mapping[str, Any], columns: IntArray, new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arrays by state, (n_samples, n_columns), with the values `new` in some of their columns."""
     out = {state: values.copy() for state, values in s.items()}
-    for state, values in after.items():
-        out[state][:, part.columns] = values
+    for state, values in new.items():
+        out[state][:, columns] = values
     return out
 
 

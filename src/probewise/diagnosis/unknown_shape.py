@@ -97,6 +97,11 @@ class SensorAndShape:
         return False
 
     @property
+    def may_be_far_off(self) -> bool:
+        """True: without a missing effect the shape may be found at another place."""
+        return True
+
+    @property
     def has_exchangeable_gaussians(self) -> bool:
         """Whether the sensor's Gaussians are exchangeable."""
         return self.sensor.has_exchangeable_gaussians

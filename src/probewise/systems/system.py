@@ -237,6 +237,11 @@ class System:
         """Whether predictions near a point cost little once it was predicted itself: for a law."""
         return self.caller is None
 
+    @property
+    def may_be_far_off(self) -> bool:
+        """False: effects are screened about its fit."""
+        return False
+
     def admits(self, effect: NamedEffect[Any]) -> bool:
         """Return whether an effect acts at a stage of this system: False for one on rates without a law."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None

@@ -81,6 +81,11 @@ class CalibratedSensor(ABC):
         return False
 
     @property
+    def may_be_far_off(self) -> bool:
+        """False: a fit of a sensor without a missing effect is near enough to screen the effects about it."""
+        return False
+
+    @property
     def has_exchangeable_gaussians(self) -> bool:
         """Whether its Gaussians are exchangeable."""
         return False

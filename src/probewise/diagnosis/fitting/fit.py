@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -163,6 +164,7 @@ def fit(
     *,
     max_steps: int = 30,
     tolerance: float = 5e-3,
+    hopeless_above: float = math.inf,
 ) -> Fit:
     """Find the maximum of the posterior, with the noise sd that is most likely at each point.
 
@@ -181,8 +183,13 @@ def fit(
         Largest number of steps.
     tolerance
         Gain of a step, in nats, below which to stop.
+    hopeless_above
+        Objective above which a fit is of no use: one that would stay above it if all steps left gained as much as the
+        last is given up.
     """
-    (found,) = fit_each_start(model, recording, [start], law, max_steps=max_steps, tolerance=tolerance)
+    (found,) = fit_each_start(
+        model, recording, [start], law, max_steps=max_steps, tolerance=tolerance, hopeless_above=hopeless_above
+    )
     return found
 
 
@@ -194,12 +201,13 @@ def fit_each_start(
     *,
     max_steps: int = 30,
     tolerance: float = 5e-3,
+    hopeless_above: float = math.inf,
 ) -> list[Fit]:
     """Fit as `fit` does from each of several starts; return the fits in that order.
 
     If many predictions cost little more than one, the fits advance together, in batches that fit a processor's cache.
     """
-    walks = [_fit_coroutine(model, recording, start, law, max_steps, tolerance) for start in starts]
+    walks = [_fit_coroutine(model, recording, start, law, max_steps, tolerance, hopeless_above) for start in starts]
     at_once = 1
     if model.sensor.predicts_in_bulk:
         at_once = max(_AT_ONCE // (len(_DAMPINGS) * (model.n_params + 1) * len(recording.readings)), 1)
@@ -219,7 +227,13 @@ def fit_each_start(
 
 
 def _fit_coroutine(
-    model: Model, recording: Recording, start: FloatArray, law: NoiseLaw, max_steps: int, tolerance: float
+    model: Model,
+    recording: Recording,
+    start: FloatArray,
+    law: NoiseLaw,
+    max_steps: int,
+    tolerance: float,
+    hopeless_above: float,
 ) -> Generator[FloatArray, FloatArray, Fit]:
     """Fit from one start: yields points (n, n_params), is sent their predictions (n, n_points), returns the fit."""
     usable = recording.usable
@@ -245,7 +259,7 @@ def _fit_coroutine(
     if not (np.isfinite(best) and np.isfinite(slopes).all()):  # no finite starting point
         return Fit(model, z, predicted, readings - predicted, slopes, sd=np.inf, objective=np.inf)
     settled = False
-    for _ in range(max_steps):
+    for k in range(max_steps):
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
         sigma = law.likeliest_sigma(whitened)
         variance = float(sigma[0]) ** 2 / law.fisher_information
@@ -286,7 +300,7 @@ def _fit_coroutine(
             predicted, slopes = _prediction_and_slopes(all_predicted[at], about[at][1])
         else:
             predicted, slopes = yield from request_slopes(z)
-        if settled:
+        if settled or best - gained * (max_steps - k - 1) > hopeless_above:
             break
     sd = float(law.likeliest_sigma(law(readings - predicted)[:, None])[0])
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)

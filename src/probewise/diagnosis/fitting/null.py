@@ -87,6 +87,11 @@ class Null(Protocol):
         return False
 
     @property
+    def may_be_far_off(self) -> bool:
+        """Whether a fit without a missing effect may be so far off that screening about it is no guide; else False."""
+        return False
+
+    @property
     def starts(self) -> FloatArray:
         """Coordinates to fit from, (n_starts, n_params)."""
         ...

@@ -34,6 +34,9 @@ EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to 
 # Nats behind the best: an SSF order so far back is not searched. An effect may look like another Gaussian, and be
 # explained better by its name at fewer of them.
 ORDERS_WITHIN = 100.0
+# Nats behind the best refit of a law: a fit that stays so far behind is given up. Where an effect gains hundreds of
+# nats, others gain some of them slowly, and most steps of a search were theirs.
+HOPELESS = 40.0
 REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
 # Effects that pairs are screened of, the best alone. A difference of two columns may explain what neither does. Of the
 # best twelve, as before, it was found in none of 6 recordings with seven other columns; of the best sixty in all.

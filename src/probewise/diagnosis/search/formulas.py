@@ -21,7 +21,10 @@ from probewise.progress import Progress, silent
 
 _LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
 _MOST = 8  # formulas that are refitted
-_WITHIN = 12.0  # nats behind the best of what was refitted, within which screening must see a formula
+# Nats behind the best of what was refitted, within which screening must see a formula: alone, where an effect of
+# hundreds of nats is seen wrongly by a dozen, and beside the best single effect, whose fit is near.
+_WITHIN_ALONE = 12.0
+_WITHIN_BESIDE = 3.0
 
 
 def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> Searched:
@@ -40,15 +43,14 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
     progress("weighing formulas")
     every = {**prepared.effects, **proposals}
     prior = prepared.apparatus.prior_odds(every)
-    score = _log_evidence_by_formula(searched, proposals)
-    odds = {
-        name: value + prior.log_prior_on_mean((name,)) - prior.log_prior_on_mean(()) for name, value in score.items()
-    }
+    promises = _promise_by_formula(searched, proposals)
+    own = {name: prior.log_prior_on_mean((name,)) - prior.log_prior_on_mean(()) for name in promises}
+    odds = {name: value + own[name] for name, value in promises.items()}
     best = max(
         fit.log_z + searched.prior.log_prior_on_mean(names) for (_, names), fit in searched.evidences.fits.items()
     )
     ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
-    kept = {name: proposals[name] for name in ranked if odds[name] > best - _WITHIN}
+    kept = {name: proposals[name] for name in ranked if odds[name] > best}
     if not kept:
         return searched
     more = replace(prepared, effects={**prepared.effects, **kept})
@@ -62,20 +64,21 @@ def needs_more_than_memoryless_noise(searched: Searched) -> bool:
     return 1.0 - sum(plain) > _LEFT_FROM
 
 
-def _log_evidence_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
+def _promise_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
     """Return, by formula, its log evidence by screening, added to the null or to the best single effect, if larger.
 
-    The log prior of that null or effect is included, that of the formula is not.
+    The log prior of that null or effect is included, that of the formula is not; with it come the nats by which it may
+    be behind.
     """
     usable, null = searched.prepared.usable_rows, searched.null
     singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]
-    parents = [null, *sorted(singles, key=lambda fit: -fit.log_z)[:1]]
+    parents = [(null, _WITHIN_ALONE), *((fit, _WITHIN_BESIDE) for fit in sorted(singles, key=lambda f: -f.log_z)[:1])]
     memory, out = TemplateCache(usable), dict[str, float]()
     bank: TemplateBank = memory.coarse_bank(null.found, list(proposals.values()))
-    for parent in parents:
+    for parent, within in parents:
         for _, evidence in parent.leading_noises():
             scores = log_bayes_factors_by_label(Linearised.of(parent.found, evidence.likeliest_law), bank)
             for name, own in scores.items():
-                value = evidence.log_z + searched.prior.log_prior_on_mean(parent.names) + log_mean_exp(own)
+                value = evidence.log_z + searched.prior.log_prior_on_mean(parent.names) + log_mean_exp(own) + within
                 out[name] = max(value, out.get(name, value))
     return out

@@ -20,7 +20,14 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.search.constants import ALIASED_NATS, FEW_VARIANTS, SAME_MODE, STEERING, VARIANTS_TRIED
+from probewise.diagnosis.search.constants import (
+    ALIASED_NATS,
+    FEW_VARIANTS,
+    HOPELESS,
+    SAME_MODE,
+    STEERING,
+    VARIANTS_TRIED,
+)
 from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.twins import TwinSwap, are_proportional
 from probewise.diagnosis.search.weighed_fit import WeighedFit
@@ -221,7 +228,18 @@ class Refits:
             if best.settled:
                 return checked_finite_fit(best)
             starts = best.z[None, :]
-        return checked_finite_fit(fit(model, recording, starts[0], law, max_steps=max_steps))
+        return checked_finite_fit(
+            fit(model, recording, starts[0], law, max_steps=max_steps, hopeless_above=self._hopeless_above(model))
+        )
+
+    def _hopeless_above(self, model: Model) -> float:
+        """Return the objective above which a fit is too far behind the best refit to matter; infinite without a law.
+
+        A law is integrated at every step of a fit. Elsewhere a fit costs too little to be worth giving up.
+        """
+        if not model.sensor.predicts_cheaply_nearby:
+            return math.inf
+        return min((candidate.found.objective for candidate, _ in self.known.values()), default=math.inf) + HOPELESS
 
     def _refit_variant(
         self,

@@ -28,7 +28,7 @@ from probewise.diagnosis.search.constants import (
     SAME_MODE,
     WITH_UNKNOWN,
 )
-from probewise.diagnosis.search.forward_selection import select_forward
+from probewise.diagnosis.search.forward_selection import proposals_for, select_forward
 from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls, noise_sd_about_given_null
 from probewise.diagnosis.search.orders import refit_at_other_orders
@@ -37,7 +37,7 @@ from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.searched import Evidences, MisfitTemplates, Posterior, Searched, posterior_of
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.unknown import UnknownEffects
-from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.progress import Progress, silent
 
@@ -89,8 +89,8 @@ def search(
         else after.refits
     )
     noises, templates, own = refits.noises, refits.templates, prepared.apparatus.user_effect_names(on_mean)
-    if prepared.null is not None and prepared.null.nuisance_names:
-        own = frozenset(on_mean)  # about a shape that is far off without the right effect, screening is no guide
+    if prepared.null is not None and prepared.null.may_be_far_off:
+        own = frozenset(on_mean)
     spent = prepared.apparatus.refit_budget_share_spent()
 
     def share_is_spent(share: float) -> bool:
@@ -159,16 +159,23 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
 
     After six, all other screened evidences are reduced (`state.optimism`) by the least amount by which a refit fell
     short of its screened evidence. Screening is linear: where an effect gains hundreds of nats, the gain of another one
-    beside it may be wrong by a hundred.
+    beside it may be wrong by a hundred. About a given null, whose fits are comparable, such a combination is first
+    screened again about its largest refitted part.
     """
     shortfalls: list[float] = []
-    for k in range(MOST_REFITTED_LATE):
-        progress("refitting what screening believes in", k, MOST_REFITTED_LATE)
+    screened = set[WeighedFit]()
+    while len(shortfalls) < MOST_REFITTED_LATE:
+        progress("refitting what screening believes in", len(shortfalls), MOST_REFITTED_LATE)
         by_mean = posterior().marginal_over_noise
         settled = {(), ("unknown",)} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
         if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
             return
+        part = state.largest_refitted_part(names)
+        if state.refits.sensor is not None and part.names and part not in screened:
+            screened.add(part)
+            proposals_for(state, part, {})
+            continue
         promised = state.log_evidence(names)
         state.refit_stepwise(names)
         shortfalls.append(promised - state.log_evidence(names))

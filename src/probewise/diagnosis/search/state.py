@@ -193,14 +193,18 @@ class SearchState:
                     self.store_candidate(again)
                     self.refits.replace_fit(held, again)
 
+    def largest_refitted_part(self, names: Names) -> WeighedFit:
+        """Return the candidate with most of some effects and no others, the most probable one."""
+        parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
+        return max(parts, key=lambda c: (len(c.names), c.log_z))
+
     def refit_stepwise(self, names: Names) -> None:
         """Refit a combination by adding its effects one by one to its largest refitted subset.
 
         An effect that is insignificant by itself is tried together with the next one: two may explain what neither
         does, such as the difference of two columns. If that fails, the combination is recorded as undetected.
         """
-        parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
-        held = max(parts, key=lambda c: (len(c.names), c.log_z))
+        held = self.largest_refitted_part(names)
         missing = [n for n in names if n not in held.names]
         while missing:
             added = missing.pop(0)

@@ -433,6 +433,20 @@ def test_a_wave_whose_frequency_changes_is_begun_from_its_two_columns():
     np.testing.assert_allclose(found, expected, atol=0.01 * a)
 
 
+def test_a_long_table_asks_for_no_more_waves_of_changing_frequency_than_a_short_one():
+    """20,000 rows tell 3,333 waves apart; the bank of the sweeps of all of them would take 850 MB."""
+    times = np.linspace(0.0, 1000.0, 20_000)
+    columns = {"t_s": times, "drive": np.sin(times), "y": np.zeros(len(times))}
+    table = RunTable(columns, time="t_s", run=None)
+    system = System.of(replace(_simulator(), run=None), table)
+    about = ReferenceFit(system, table, np.zeros(system.n_params), SD)
+    (swept,) = [form for form in formula_forms(about) if ":sin(2 pi hz (u" in form.name]
+    hz = swept.bank()[:, 0, swept.prior.names.index("hz")]
+    assert 35 < hz.max() * 1000.0 <= 40
+    assert np.diff(np.unique(hz)).max() * 1000.0 < 0.51
+    assert len(hz) < 3000
+
+
 def test_two_settlings_add_up_at_the_start_of_each_run():
     form = _proposed("t since the start of the run")
     found = form.apply(np.zeros((1, N_ROWS)), np.array([[0.5, -0.8, 0.2, 2.0]]), TABLE)[0]

@@ -123,11 +123,13 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
     before = np.zeros(len(plan))
     before[usable] = found.predicted
-    inside = np.flatnonzero(scan_indicator(plan, effect.scans)) if effect.scans else slice(None)
-    there = plan.take(inside) if isinstance(inside, np.ndarray) else plan
+    inside = np.flatnonzero(scan_indicator(plan, effect.scans)) if effect.scans else np.arange(len(plan))
+    there = plan.take(inside) if effect.scans else plan
+    kept = np.isin(usable, inside, assume_unique=True)
+    at = np.searchsorted(inside, usable[kept])
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
-    change = np.zeros((n_rows, len(plan)))
+    change = np.zeros((n_rows, len(usable)))  # of all rows of a long plan it may be gigabytes
     step = max(_AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):
         rows = slice(first, min(first + step, n_rows))
@@ -140,8 +142,8 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
             if seen is None
             else model.chain.readings_from_simulated_view(seen, theta, there)
         )
-        change[rows, inside] = read - before[inside]
-    columns = change[:, usable].T
+        change[rows, kept] = read[:, at] - before[usable[kept]]
+    columns = change.T
     columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + np.abs(before).max()))] = 0.0  # NaN too
     largest = np.abs(before).max()
     none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))

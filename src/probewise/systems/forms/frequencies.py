@@ -26,24 +26,28 @@ def trial_frequencies(
     most: int = _MOST_FREQUENCIES,
     rows_each: int = 2,
     least_waves: float = 1.0,
+    most_waves: float = np.inf,
 ) -> FloatArray:
     """Return trial frequencies along a covariate, (n_trial,), rising evenly from `least_waves` / range.
 
     A wave slower than one in the range is never seen as a whole: nothing tells it from a drift or a bend. They go up to
-    one wave in `rows_each` rows, and to 2 `least_waves` / range at least, in steps of about half the resolution; where
-    that gives fewer than 8 or more than `most`, there are 8 or `most`. `groups` are the rows of each run.
+    one wave in `rows_each` rows or `most_waves` / range, and to 2 `least_waves` / range at least, in steps of about
+    half the resolution; where that gives fewer than 8 or more than `most`, there are 8 or `most`. `groups` are the rows
+    of each run.
     """
     reach = float(np.ptp(values))
     highest = _frequency_of_median_gap(values, groups, rows_each)
-    highest = min(highest, len(distinct_values(values)) / (rows_each * reach))
+    highest = min(highest, len(distinct_values(values)) / (rows_each * reach), most_waves / reach)
     n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
     return np.asarray(np.linspace(least_waves / reach, max(highest, 2 * least_waves / reach), n))
 
 
-def trial_frequencies_in_time(about: ReferenceFit, most: int = _MOST_FREQUENCIES, rows_each: int = 2) -> FloatArray:
+def trial_frequencies_in_time(
+    about: ReferenceFit, most: int = _MOST_FREQUENCIES, rows_each: int = 2, *, most_waves: float = np.inf
+) -> FloatArray:
     """Return `trial_frequencies` along the times of the readings, (n_trial,); other rows resolve nothing."""
     times, groups = _times_of_readings(about)
-    return trial_frequencies(times, groups, most, rows_each)
+    return trial_frequencies(times, groups, most, rows_each, most_waves=most_waves)
 
 
 def max_n_trial_frequencies(n_points: int) -> int:

@@ -20,7 +20,9 @@ from probewise.systems.table import RunTable
 _MOST_SQUARE_WAVES = 160  # periods of a square wave that are tried
 _ROWS_OF_A_WAVE = 6  # least rows per period: with fewer a square wave is not told from a sinusoid
 _SOFT = 0.5  # steepness of its edges to begin with: at 1 it is nearly a sinusoid
-_MOST_SWEPT = 80  # mean frequencies of a wave whose frequency changes, up to 40 waves in the recording
+# Mean number of waves in the recording, up to which a wave whose frequency changes is tried, in steps of a half: faster
+# ones would need tens of thousands of templates, gigabytes in a long table.
+_MOST_SWEPT = 40
 _SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the recording: phases to within a radian
 _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart they are in the row of those
 
@@ -79,8 +81,8 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
 def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a sinusoid in the reading whose frequency rises or falls linearly along the recording."""
     own, table = about.system.simulator, about.table
-    frequencies = trial_frequencies_in_time(about, _MOST_SWEPT, _ROWS_OF_A_WAVE)
     begin, end = float(table.time_s.min()), float(table.time_s.max())
+    frequencies = trial_frequencies_in_time(about, 2 * _MOST_SWEPT, _ROWS_OF_A_WAVE, most_waves=_MOST_SWEPT)
     middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:

@@ -98,6 +98,14 @@ def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path
     assert "states temp_c" in said
 
 
+def test_a_rate_under_another_name_than_its_state_is_told(capsys, tmp_path):
+    law = FILE.partition("def simulate")[0] + (
+        'states = {"temp_c": "start_c"}\n\ndef rates(s, p, u):\n    return {"temp": -s["temp_c"]}\n'
+    )
+    said = refused(capsys, tmp_path, law)
+    assert "rates returns no 'temp_c'; allowed: a dict with a rate for each state, under its name: temp_c" in said
+
+
 def test_a_mistake_in_observe_is_told_of_observe(capsys, tmp_path):
     law = FILE.partition("def simulate")[0] + (
         'states = {"warm": 0.0}\ndef rates(s, p, u):\n    return {"warm": -s["warm"] / p["tau_s"]}\n'

@@ -20,6 +20,7 @@ from probewise.systems import (
 )
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit
+from probewise.systems.prediction import as_recording
 
 RNG = 7
 
@@ -351,3 +352,12 @@ def test_a_prediction_over_longer_gaps_does_not_run_away_with_the_fastest_sample
     found = predict_system(fitted, table, rng=np.random.default_rng(1))
     held = table["drive"][:-1]
     np.testing.assert_allclose(found.mean[1:], held, atol=2e-3)  # after 30 s, ten time constants, the drive is reached
+
+
+def test_an_infinite_reading_is_refused_with_its_row():
+    """The table keeps a column with such a cell as text; its first cells are numbers all the same."""
+    table = RunTable({"power_w": [1.0, 2.0, 3.0], "temp_c": ["20.1", "", "inf"]}, time=None, run=None)
+    with pytest.raises(ParameterError, match=r"in row 4 is 'inf'; allowed: a number in each row"):
+        as_recording(
+            Simulator("temp_c", "degC", {"gain": (0, 1)}, simulate=lambda p, u: p["gain"] * u["power_w"]), table
+        )

@@ -33,10 +33,18 @@ def user_function_error(
     if simulator.law is not None and simulator.law.observe is not None:
         raised_in = {frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)}
         what = "observe" if getattr(simulator.law.observe, "__code__", None) in raised_in else what
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename in where]
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [f.lineno for f in frames if f.filename in where]
     said = " ".join(str(error).split())
     said = said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."
     found = f"{what} raises {type(error).__name__}: {said}".rstrip(": ")
+    law, outside = simulator.law, not frames or frames[-1].filename not in where
+    if law is not None and isinstance(error, KeyError) and outside and error.args and error.args[0] in law.states:
+        return FileError(
+            simulator.source or what,
+            f"rates returns no {error.args[0]!r}",
+            f"a dict with a rate for each state, under its name: {', '.join(law.states)}",
+        )
     texts = [name for name, values in columns.items() if values.dtype != np.float64]
     if isinstance(error, KeyError):
         names = ", ".join(columns)

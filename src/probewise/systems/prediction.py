@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -84,7 +85,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     if readings is None:
         readings = np.full(len(table), np.nan)
     elif readings.dtype != np.float64:
-        bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_float_or_empty(cell)), 0)
+        bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_number_or_missing(cell)), 0)
         raise ParameterError(
             f"reading {simulator.reading!r} in row {bad + 2}",
             str(readings[bad]),
@@ -103,12 +104,12 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     return recording
 
 
-def _is_float_or_empty(text: str) -> bool:
+def _is_number_or_missing(text: str) -> bool:
+    """Return whether a cell is a finite number, or one of the ways to write that there is none."""
     try:
-        float(text)
+        return not math.isinf(float(text))
     except ValueError:
         return text == ""
-    return True
 
 
 def predict_system(

@@ -12,8 +12,9 @@ from probewise.errors import ParameterError
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.clipping import clipping_levels
+from probewise.systems.forms.lags import values_at_earlier_times
 from probewise.systems.forms.proposals import formula_forms
-from probewise.systems.forms.readings import sign_of_change, values_at_earlier_times
+from probewise.systems.forms.readings import sign_of_change
 from probewise.systems.motion import LawWithEffects
 
 SD = 0.01

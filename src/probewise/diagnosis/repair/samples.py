@@ -25,6 +25,7 @@ from probewise.diagnosis.repair.linear_amplitudes import LinearAmplitudes
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 from probewise.diagnosis.repair.surrogate import SurrogatePosterior
+from probewise.diagnosis.repair.variant_weights import weights_beside_other_effects
 from probewise.effects import (
     NUISANCES,
     Extent,
@@ -140,7 +141,8 @@ def sample_model(
     recording
         What was fitted.
     weights
-        By effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,).
+        By effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,), when it
+        was added.
     rng
         Source of randomness.
     annealed
@@ -150,6 +152,7 @@ def sample_model(
         Called with the progress of annealing.
     """
     law, n_samples = noise.likeliest_law, N_SAMPLES
+    weights = weights_beside_other_effects(found, law, np.flatnonzero(recording.usable), weights)
     z = np.clip(_posterior_draws(found, noise, recording, annealed, progress, rng=rng), -FARTHEST, FARTHEST)
     # Samples that are not annealed serve for the effects only: their noise is that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]

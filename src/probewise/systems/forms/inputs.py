@@ -16,8 +16,8 @@ from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, ActInTime, Form, Say, mean_with_sd
 from probewise.systems.forms.frequencies import max_n_trial_frequencies, trial_frequencies
+from probewise.systems.forms.lags import delayed_values, values_at_earlier_times
 from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
-from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
 from probewise.systems.late_columns import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
 

@@ -14,6 +14,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms import modulations
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, Form, mean_with_sd
+from probewise.systems.forms.lags import late_forms
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.table import RunTable
 
@@ -103,8 +104,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
             unit=unit,
         )
         yield from _settling_form(about)
-        yield from _lag_form(about)
-        yield from _delay_form(about)
+        yield from late_forms(about)
     for name, values in table.covariates.items():
         if name not in (reading, about.system.simulator.noise.sd) and varies(values):
             how = modulations.column_proportional_modulation(name, table)
@@ -172,86 +172,6 @@ def _settling_form(about: ReferenceFit) -> Iterator[Form]:
             f"with a time constant of {mean_with_sd(mean[1], sd[1], time_unit)}"
         ),
     )
-
-
-def _lag_form(about: ReferenceFit) -> Iterator[Form]:
-    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
-        tau = theta[:, 0]
-        for rows in table.rows_by_scan():
-            gaps = np.diff(table.time_s[rows])
-            with np.errstate(divide="ignore"):
-                carry = np.where(tau[:, None] > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)[:, None]), 0.0)
-            for k in range(1, len(rows)):
-                out[:, rows[k]] = carry[:, k - 1] * out[:, rows[k - 1]] + (1 - carry[:, k - 1]) * out[:, rows[k]]
-        return out
-
-    prior = about.log_uniform_size_prior(Stage.LAG, act, about.median_gap * np.geomspace(0.02, 200.0, 33))
-    if prior is not None:
-        time_unit = about.time_unit
-        yield Form(
-            "lag",
-            Stage.LAG,
-            marginals={"tau_s": prior},
-            units=(time_unit,),
-            covariates=("previous",),
-            act=act,
-            entries=_log_spaced_entries(prior),
-            amplitudes=(),
-            says=lambda mean, sd: (
-                f"{about.system.simulator.reading} lags with a time constant of "
-                f"{mean_with_sd(mean[0], sd[0], time_unit)}"
-            ),
-            absent={0: 0.0},
-            needs_rising_time=True,
-        )
-
-
-def _delay_form(about: ReferenceFit) -> Iterator[Form]:
-    prior = about.log_uniform_size_prior(Stage.LAG, delayed_values, about.median_gap * np.geomspace(1e-3, 100.0, 41))
-    if prior is not None:
-        time_unit = about.time_unit
-        yield Form(
-            "delay",
-            Stage.LAG,
-            marginals={"tau_s": prior},
-            units=(time_unit,),
-            covariates=("previous",),
-            act=delayed_values,
-            entries=_log_spaced_entries(prior),
-            amplitudes=(),
-            says=lambda mean, sd: (
-                f"{about.system.simulator.reading} is delayed by {mean_with_sd(mean[0], sd[0], time_unit)}"
-            ),
-            absent={0: 0.0},
-            needs_rising_time=True,
-        )
-
-
-def delayed_values(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Return readings or a column, (n_points,) or (n_samples, n_points), delayed within runs by theta[:, 0]."""
-    values = np.atleast_2d(values)
-    out = np.empty((max(len(values), len(theta)), values.shape[1]))
-    for rows in table.rows_by_scan():
-        out[:, rows] = values_at_earlier_times(table.time_s[rows], values[:, rows], theta[:, 0])
-    return out
-
-
-def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
-    """Interpolate values (1 or n_samples, n), given at times (n,), at times earlier by `by`: (n_samples, n).
-
-    Before the first time, the first value holds.
-    """
-    if len(time) < 2:
-        return np.broadcast_to(values, (len(by), len(time)))
-    asked = time[None, :] - by[:, None]
-    after = np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1)
-    gap = time[after] - time[after - 1]
-    share = np.clip((asked - time[after - 1]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
-    values = np.broadcast_to(values, asked.shape)
-    low, high = np.take_along_axis(values, after - 1, axis=1), np.take_along_axis(values, after, axis=1)
-    # Where two rows have the same time, interpolation would take the last for the first.
-    return np.where(by[:, None] == 0, values, low + share * (high - low))
 
 
 def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
@@ -402,10 +322,6 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
         ),
         absent={0: float(top + 1e3 * span)},
     )
-
-
-def _log_spaced_entries(prior: LogUniform) -> FloatArray:
-    return np.asarray(np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None])
 
 
 WORDS = {

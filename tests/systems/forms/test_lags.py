@@ -1,0 +1,136 @@
+"""Readings that come late, between rows that are not dense: against integration and the exact reading."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from probewise.diagnosis.system.diagnose import diagnose_system, prepare_system
+from probewise.systems import Law, RunTable, Simulator
+from probewise.systems.forms.lags import delayed_readings, lagged_readings
+from probewise.systems.forms.splines import Spline
+
+_RNG = np.random.default_rng(1)
+_T = np.sort(_RNG.uniform(0, 10, 60))
+
+
+def _reading(t):
+    return np.sin(t) + 0.1 * t
+
+
+def _rows(t=_T):
+    return RunTable({"t": t, "y": _reading(t)}, time="t", run=None)
+
+
+def test_a_spline_goes_through_its_values_and_is_exact_for_a_parabola():
+    x = 1.0 - 0.5 * _T + 0.3 * _T**2
+    spline = Spline(_T, x[None])
+    gaps = np.arange(len(_T) - 1)[None]
+    np.testing.assert_allclose(spline.at(gaps, np.zeros(gaps.shape))[0], x[:-1])
+    np.testing.assert_allclose(spline.at(gaps, np.diff(_T)[None])[0], x[1:], atol=1e-9)
+    middle = 0.5 * (_T[1:] + _T[:-1])
+    np.testing.assert_allclose(
+        spline.at(gaps, 0.5 * np.diff(_T)[None])[0], 1 - 0.5 * middle + 0.3 * middle**2, atol=1e-9
+    )
+    np.testing.assert_allclose(spline.slopes[0], -0.5 + 0.6 * _T, atol=1e-8)
+
+
+def test_a_spline_has_no_kink_in_its_slope_or_bend():
+    spline = Spline(_T, _RNG.normal(size=(2, len(_T))))
+    after, before, third = spline.derivatives
+    np.testing.assert_allclose(before[:, :-1], after[:, 1:], rtol=1e-6, atol=1e-6 * np.abs(after).max())
+    np.testing.assert_allclose(third[:, [0, -1]] * spline.gaps[[0, -1]], 0.0, atol=1e-6 * np.abs(after).max())
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_a_few_rows_are_enough_for_a_spline(n):
+    spline = Spline(_T[:n], 2.0 * _T[None, :n])
+    np.testing.assert_allclose(spline.slopes, np.full((1, n), 2.0 if n > 1 else 0.0))
+
+
+@pytest.mark.parametrize("tau", [0.01, 0.3, 2.0, 50.0])
+def test_a_smooth_reading_lags_as_its_differential_equation_says(tau):
+    exact = solve_ivp(
+        lambda t, s: (_reading(t) - s) / tau, (_T[0], _T[-1]), [_reading(_T[0])],
+        t_eval=_T, rtol=1e-9, atol=1e-11, method="Radau",
+    ).y[0]  # fmt: skip
+    smooth, held = lagged_readings(_reading(_T)[None], np.array([[tau, 1.0], [tau, 0.0]]), _rows())
+    np.testing.assert_allclose(smooth, exact, atol=2e-3)
+    assert np.abs(held - exact).max() > 3 * np.abs(smooth - exact).max()
+
+
+def test_a_reading_that_is_held_between_rows_lags_by_the_share_of_each_gap():
+    x, tau, expected = _reading(_T), 0.4, [_reading(_T[0])]
+    for gap, value in zip(np.diff(_T), x[1:], strict=True):
+        expected.append(expected[-1] + (1 - np.exp(-gap / tau)) * (value - expected[-1]))
+    np.testing.assert_allclose(lagged_readings(x[None], np.array([[tau, 0.0]]), _rows())[0], expected)
+
+
+@pytest.mark.parametrize("tau", [0.05, 0.7])
+def test_a_smooth_reading_is_delayed_between_its_rows(tau):
+    exact = _reading(np.maximum(_T - tau, _T[0]))
+    smooth, straight = delayed_readings(_reading(_T)[None], np.array([[tau, 1.0], [tau, 0.0]]), _rows())
+    np.testing.assert_allclose(smooth, exact, atol=3e-3)
+    np.testing.assert_allclose(straight, np.interp(np.maximum(_T - tau, _T[0]), _T, _reading(_T)), atol=1e-12)
+
+
+@pytest.mark.parametrize("smooth", [0.0, 1.0])
+def test_no_lag_and_no_delay_change_nothing_also_where_rows_share_a_time(smooth):
+    t = np.repeat(np.arange(5.0), 2)
+    table = RunTable({"t": t, "y": t}, time="t", run=None)
+    x = _RNG.normal(size=(1, 10))
+    for act in (lagged_readings, delayed_readings):
+        np.testing.assert_array_equal(act(x, np.array([[0.0, smooth]]), table), x)
+    assert np.isfinite(lagged_readings(x, np.array([[0.3, smooth]]), table)).all()
+    assert np.isfinite(delayed_readings(x, np.array([[0.3, smooth]]), table)).all()
+
+
+def test_each_sample_lags_as_it_would_alone():
+    x = _RNG.normal(size=(3, len(_T)))
+    theta = np.array([[0.2, 1.0], [1.5, 0.0], [0.7, 1.0]])
+    for act in (lagged_readings, delayed_readings):
+        together = act(x, theta, _rows())
+        for k in range(3):
+            np.testing.assert_allclose(together[k], act(x[k : k + 1], theta[k : k + 1], _rows())[0])
+
+
+def _cups(every_min, tau_min, delay_min=0.0):
+    """Two cups that are stirred in a bath that swings, read every so many minutes by a thermometer."""
+    t = np.arange(0.0, 60.0, every_min)
+    rng, rows = np.random.default_rng(4), []
+    for start in (70.0, 30.0):
+
+        def rates(at, s):
+            bath = 40 + 10 * np.sin(2 * np.pi * at / 17)
+            return [(bath - s[0]) / 8.0, (s[0] - s[1]) / max(tau_min, 1e-3)]
+
+        dense = solve_ivp(rates, (0, 60), [start, start], dense_output=True, rtol=1e-8, atol=1e-8, method="Radau").sol
+        seen = dense(np.maximum(t - delay_min, 0.0))[1 if tau_min else 0]
+        rows.append(seen + 0.1 * rng.normal(size=len(t)))
+    bath = np.tile(40 + 10 * np.sin(2 * np.pi * t / 17), 2)
+    columns = {"t_min": np.tile(t, 2), "cup": np.repeat([1.0, 2.0], len(t)), "bath": bath, "y": np.concatenate(rows)}
+    law = Law({"c": "start"}, lambda s, p, u: {"c": (u["bath"] - s["c"]) / p["tau"]}, hold="linear")
+    simulator = Simulator(
+        "y", "degC", {"start": ("normal", 50, 30), "tau": ("log", 1, 100)}, per_run=["start"], law=law,
+        time="t_min", run="cup",
+    )  # fmt: skip
+    return simulator, RunTable(columns, time="t_min", run="cup")
+
+
+def test_a_lag_and_a_delay_have_a_smooth_variant_where_rows_are_not_dense_beside_the_noise():
+    sparse = prepare_system(*_cups(0.8, 0.6)).effects
+    assert all(len(sparse[name].variants()) == 2 for name in ("lag", "delay"))
+    assert all("smooth" in sparse[name].fixed for name in ("lag", "delay"))
+    dense = prepare_system(*_cups(0.06, 0.6)).effects
+    assert len(dense["delay"].variants()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tau", "delay"), [(0.6, 0.0), (0.0, 0.5)])
+def test_a_thermometer_that_is_read_once_in_its_time_constant_is_told_from_one_that_comes_late(tau, delay):
+    found = diagnose_system(*_cups(0.8, tau, delay), rng=np.random.default_rng(0))
+    name = "lag" if tau else "delay"
+    assert found.combination == (name,)
+    (stated,) = next(effect.parameters for effect in found.report.effects if effect.name == name)
+    low, high = stated.interval95
+    assert low < tau + delay < high
+    assert high - low < 0.2

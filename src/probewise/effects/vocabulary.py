@@ -123,12 +123,17 @@ class NamedEffect(Effect[V], Protocol[V]):
         return ()
 
     def variants(self) -> tuple[Self, ...]:
-        """List the effect with each of its discrete choices made, all equally probable a priori.
+        """List the effect with each of its discrete choices made, of prior odds `relative_odds`.
 
         A choice is a scan, a mounting or an interval between readings, which no gradient-based fit can find.
         Variants differ in their `scans` or `patterns`, or only in their priors.
         """
         return (self,)
+
+    @property
+    def relative_odds(self) -> float:
+        """Prior odds of this variant against the first one; by default all are equally probable."""
+        return 1.0
 
     def variant_masks(self, plan: Plan) -> VariantMasks | None:
         """Return the masks of variants that differ only in the readings they act on; None, the default, for others."""

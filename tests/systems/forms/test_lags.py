@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from probewise.diagnosis.evidence.templates import EffectTemplates
 from probewise.diagnosis.system.diagnose import diagnose_system, prepare_system
 from probewise.systems import Law, RunTable, Simulator
 from probewise.systems.forms.lags import delayed_readings, lagged_readings
@@ -122,6 +123,13 @@ def test_a_lag_and_a_delay_have_a_smooth_variant_where_rows_are_not_dense_beside
     assert all("smooth" in sparse[name].fixed for name in ("lag", "delay"))
     dense = prepare_system(*_cups(0.06, 0.6)).effects
     assert len(dense["delay"].variants()) == 1
+
+
+def test_the_smooth_variant_has_a_twentieth_of_the_prior_of_the_first():
+    """So that a lag and a delay are no less probable where rows are held than what explains the same readings."""
+    variants = prepare_system(*_cups(0.8, 0.6)).effects["lag"].variants()
+    templates = EffectTemplates((), (), variants, np.array([0, 0, 1]))
+    np.testing.assert_allclose(templates.variant_probabilities(np.log([3.0, 1.0, 4.0])), [20 / 21, 1 / 21])
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -44,9 +45,14 @@ class EffectTemplates:
         variant: NamedEffect[Any] = self.variants[self.choice[at]]
         return variant
 
+    @cached_property
+    def variant_odds(self) -> FloatArray:
+        """Prior odds of each variant against the first, (n_variants,)."""
+        return np.array([variant.relative_odds for variant in self.variants])
+
     def variant_probabilities(self, scores: FloatArray) -> FloatArray:
         """Return the posterior probability of each variant, (n_variants,), from log Bayes factors (n_entries,)."""
-        shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants))
+        shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants)) * self.variant_odds
         return np.asarray(shares / shares.sum())
 
 

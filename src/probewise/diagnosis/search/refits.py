@@ -198,14 +198,16 @@ class Refits:
         likeliest = (int(np.argmax(templates.variant_probabilities(own_scores))) for _, own_scores in seen[1:])
         tried = list(dict.fromkeys([*_variants_to_refit(templates, weights), *likeliest]))
         refitted = [self._refit_variant(parent, effect, templates, k, seen) for k in tried]
+        odds = templates.variant_odds
         # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = _variant_to_show(log_z, [templates.variants[k] for k in tried])
         if np.isfinite(log_z[best]):  # otherwise no variant could be fitted, and weights are unchanged
-            weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
-            weights[tried] = np.exp(log_z - log_z[best])
+            weights = weights / weights[tried[0]] * odds[tried[0]] * np.exp(log_z[0] - log_z[best])
+            weights[tried] = odds[tried] * np.exp(log_z - log_z[best])
             weights /= weights.sum()
-        log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights)) - against
+        of_best = math.log(weights[tried[best]]) - math.log(odds[tried[best]])
+        log_share = parent.log_share - of_best - math.log(odds.sum()) - against
         log_share += math.log(effect.n_peaks)
         # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
         # a change point is far better known. To first order: only where that leads to the variant of the best refit.

@@ -116,6 +116,8 @@ class Form:
         Whether its parameters, all with the same prior, are about as large as each other: see `SharedScalePrior`.
     exchangeable
         Whether it is the sum of two terms of the same kind and priors, so that each mode is there twice.
+    relative_odds
+        Prior odds of this one of several alternatives against the first.
     """
 
     name: str
@@ -138,6 +140,7 @@ class Form:
     suggested: FloatArray | None = None
     shared_scale: bool = False
     exchangeable: bool = False
+    relative_odds: float = 1.0
 
     @cached_property
     def prior(self) -> Product | SharedScalePrior:

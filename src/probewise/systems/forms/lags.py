@@ -23,6 +23,7 @@ from probewise.systems.table import RunTable
 _N_SIZES = 9
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
 _FIXED = 1e-9  # width of its prior
+_ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
 
 
@@ -61,6 +62,7 @@ def _with_smooth_variant(
             absent={0: 0.0},
             needs_rising_time=True,
             fixed=(_SMOOTH,),
+            relative_odds=_ODDS_OF_SMOOTH if smooth > 0.5 else 1.0,
         )
 
     at_rows, smooth = variant(0.5 * _FIXED), variant(1.0 - 0.5 * _FIXED)

@@ -39,6 +39,14 @@ def test_a_control_is_swept_held_and_switched_between_its_ends():
     assert set(power["1 power_w middle"].tolist()) == {3.0}
 
 
+def test_a_control_is_swept_in_values_that_can_be_set():
+    """In thousandths of its range, from 2 to 4 W: two decimals would be too few, sixteen cannot be set."""
+    swept = offered()["1 power_w up"].table.columns["power_w"]
+    np.testing.assert_array_equal(swept, np.round(swept, 3))
+    np.testing.assert_allclose(swept, np.linspace(2.0, 4.0, len(swept)), atol=0.0005)
+    assert len(np.unique(swept)) == len(swept)
+
+
 def test_a_slow_run_takes_twice_the_time():
     time = offered()["1 slow"].table.time_s
     np.testing.assert_allclose(np.ptp(time), 2 * np.ptp(TABLE.time_s[:12]))

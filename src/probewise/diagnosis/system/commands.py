@@ -114,7 +114,20 @@ def _variations_of_run(
     for name, (low, high) in ends.items():
         for kind, (said, shape) in shapes.items():
             text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{0.5 * (low + high):.4g}")
-            yield f"{name} {kind}", f"take {of} with {name} {text}", {name: shape(low, high)}, 1.0
+            yield (
+                f"{name} {kind}",
+                f"take {of} with {name} {text}",
+                {name: _rounded_to_range(shape(low, high), low, high)},
+                1.0,
+            )
+
+
+def _rounded_to_range(values: FloatArray, low: float, high: float) -> FloatArray:
+    """Round values to a thousandth of a range or finer, so that they can be set; those at its ends stay."""
+    if not low < high:
+        return values
+    decimals = int(np.ceil(3 - np.log10(high - low)))
+    return np.where((values == low) | (values == high), values, np.round(values, decimals))
 
 
 def _planned_run(

@@ -194,6 +194,19 @@ def test_forms_of_a_rate_add_to_the_law():
     assert {"drag:x", "friction:x", "forcing:x", "periodic_forcing:x", "cubic:x:x", "quadratic:x:x"} <= forms.keys()
 
 
+@pytest.mark.parametrize(
+    ("a", "told"), [(0.7, "a damping term -a x, a = 0.700 ± 0.020"), (-0.7, "a term +b x, b = -a = 0.700 ± 0.020")]
+)
+def test_a_term_that_adds_to_a_rate_is_told_without_a_double_negative(a, told):
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"rate": (0.0, 2.0)},
+        law=Law({"x": 0.0}, lambda s, p, u: {"x": p["rate"] + 0 * s["x"]}, max_step_s=0.2),
+        time="t_s", run="run", noise=Noise(sd=SD),
+    )  # fmt: skip
+    damping = bind_forms(_about(simulator))["damping:x"]
+    assert damping.sentence(np.array([a]), np.array([0.02])) == f"the rate of x lacks {told}"
+
+
 def test_an_input_that_is_held_comes_late_also_where_rows_are_far_apart_and_close():
     """x' = u - x, u held and late by tau: exactly, in each gap what was held before for tau, then what is held now."""
     t_s = np.cumsum(np.random.default_rng(3).choice([0.02, 0.14], 40))

@@ -126,6 +126,12 @@ def _rate_term_form(
         a = theta[:, :1]
         return value.with_term(state, lambda s, p, u: a * term(s[other]))
 
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        _, minus, of = what.partition(" -a ")
+        if minus and mean[0] < 0:  # a term that adds to the rate, told without a double negative
+            return f"the rate of {state} lacks a term +b {of}, b = -a = {mean_with_sd(-mean[0], sd[0], '')}"
+        return f"the rate of {state} lacks {what}, a = {mean_with_sd(mean[0], sd[0], '')}"
+
     guess = trial_rate(about, state) / scale
     typical = about.typical_amplitude(Stage.RATE, act, np.full((1, 1, 1), guess), guess)
     if typical is None:
@@ -140,7 +146,7 @@ def _rate_term_form(
         act=act,
         entries=np.full((1, 1, 1), typical),
         amplitudes=(0,),
-        says=lambda mean, sd: f"the rate of {state} lacks {what}, a = {mean_with_sd(mean[0], sd[0], '')}",
+        says=says,
     )
 
 

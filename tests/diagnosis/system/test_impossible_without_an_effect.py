@@ -112,6 +112,6 @@ def test_a_late_reading_of_an_impossible_one_is_impossible_without_a_warning():
     )
     prepared = prepare_system(simulator, table_for(simulator, {"t": t, "y": 0.5 * t + 0.01 * np.sin(9 * t)}))
     model = Model(prepared.null, (prepared.effects["delay"],), prepared.recording.plan)
-    at_a_half, beyond = model.predict(np.array([[-0.67, 0.5], [1.0, 0.5]]))
+    at_a_half, beyond = model.predict(np.array([[-0.67, 0.5, 0.0], [1.0, 0.5, 0.0]]))
     assert np.isfinite(at_a_half).all()
     assert not np.isfinite(beyond).all()

@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.system.diagnose import fit_system, prepare_system, recording_from_table
+from probewise.diagnosis.system.diagnose import (
+    _notes_on_integration,
+    fit_system,
+    prepare_system,
+    recording_from_table,
+)
 from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
+from probewise.systems.calls import IntegrationTally
 from probewise.systems.converged_step import with_converged_step
 
 SD = 0.05
@@ -83,3 +89,10 @@ def test_a_law_that_is_said_to_be_stiff_is_searched_so():
     predicted = prepared.null.chain(table, ()).predict(np.array([[0.01, 3.0], [8.0, 3.0]]), table)
     np.testing.assert_allclose(predicted[1], _readings(8.0, 3.0), atol=0.1 * SD)
     assert np.isfinite(predicted).all()
+
+
+@pytest.mark.parametrize("sets_step", [True, False])
+def test_a_search_that_was_cut_short_advises_a_larger_step_only_where_one_was_set(sets_step):
+    (note,) = _notes_on_integration(IntegrationTally(cut_short=True), 1000, sets_step=sets_step)
+    assert "in 1,000 evaluations" in note
+    assert ("max_step_s" in note) is sets_step

@@ -220,7 +220,9 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         return ()
     caller, tally = apparatus.system.caller, apparatus.system.tally
     if caller is None:
-        return tuple(_notes_on_integration(tally, apparatus.evaluations_of_a_search))
+        law = apparatus.system.simulator.law
+        sets_step = law is not None and law.max_step_s is not None
+        return tuple(_notes_on_integration(tally, apparatus.evaluations_of_a_search, sets_step=sets_step))
     out = []
     if caller.cut_short:
         out.append(
@@ -235,12 +237,13 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _notes_on_integration(tally: IntegrationTally, most: int) -> Iterator[str]:
+def _notes_on_integration(tally: IntegrationTally, most: int, *, sets_step: bool) -> Iterator[str]:
     if tally.cut_short:
+        way_out = "a larger max_step_s, shorter runs" if sets_step else "shorter runs"
         yield (
             f"integrating the law takes long: in {most:,} evaluations of its rates not every "
-            "combination of effects that promised something was fitted; with a larger max_step_s, shorter runs or "
-            "fewer rows the search is complete"
+            f"combination of effects that promised something was fitted; with {way_out} or fewer rows the search is "
+            "complete"
         )
     if tally.too_stiff:
         yield (

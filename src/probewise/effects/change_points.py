@@ -63,6 +63,11 @@ class ChangePointEffect(NamedEffect[V]):
         """Return the mask of the readings taken after each sample's change point, (n_samples, n_points)."""
         return np.asarray(plan.time_s > theta[:, -1:])
 
+    @property
+    def has_change_point(self) -> bool:
+        """True."""
+        return True
+
     def variants(self) -> tuple[Self, ...]:
         """Return one variant for each interval between consecutive `times_s`."""
         return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))

@@ -131,6 +131,11 @@ class NamedEffect(Effect[V], Protocol[V]):
         return (self,)
 
     @property
+    def has_change_point(self) -> bool:
+        """Whether its variants are the intervals of a change point; by default not."""
+        return False
+
+    @property
     def relative_odds(self) -> float:
         """Prior odds of this variant against the first one; by default all are equally probable."""
         return 1.0

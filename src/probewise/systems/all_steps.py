@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.systems.law_inputs import LawInputs
+from probewise.systems.law_inputs import LawInputs, of_columns
 from probewise.systems.motion import (
     LawWithEffects,
     Stepper,
@@ -344,7 +344,15 @@ def _stepping_function(
     passing = time_gaps(steps.places, columns)[:, gap]
     passing = passing.reshape(len(passing), -1)
     parts = [
-        (part, Stepper(motion, steps.schedule.method, part.inputs, _of_columns(passing, part.columns)))
+        (
+            part,
+            Stepper(
+                motion,
+                steps.schedule.method,
+                part.inputs,
+                passing if part.columns is None else of_columns(passing, part.columns),
+            ),
+        )
         for part in inputs.parts_of_steps(inputs.of_steps(gap), gap, begin, length, whole=False)
     ]
 
@@ -358,10 +366,6 @@ def _stepping_function(
 
     n_steps = len(gap) * steps.n_runs
     return states_after_each_step, sum(n_steps if part.columns is None else len(part.columns) for part, _ in parts)
-
-
-def _of_columns(values: FloatArray, columns: IntArray | None) -> FloatArray:
-    return values if columns is None else np.asarray(values[:, columns])
 
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:

@@ -88,16 +88,13 @@ class StepInputs:
     def of_some(self, columns: IntArray) -> StepInputs:
         """Return the inputs of some of the columns of the arrays."""
 
-        def chosen(values: Any) -> Any:
-            return values[..., columns] if values.shape[-1] > 1 else values
-
         def chosen_lines(lines: Mapping[str, Line]) -> dict[str, Line]:
-            return {name: (chosen(low), chosen(rise)) for name, (low, rise) in lines.items()}
+            return {name: (of_columns(low, columns), of_columns(rise, columns)) for name, (low, rise) in lines.items()}
 
         return StepInputs(
-            read_only_views({name: chosen(values) for name, values in self.constant.items()}),
+            read_only_views({name: of_columns(values, columns) for name, values in self.constant.items()}),
             chosen_lines(self.moving),
-            read_only_views({name: chosen(values) for name, values in self.held.items()}),
+            read_only_views({name: of_columns(values, columns) for name, values in self.held.items()}),
             chosen_lines(self.sloping),
         )
 
@@ -304,6 +301,11 @@ class LawInputs:
             else:
                 constant[name] = constant[name] + own
         return StepInputs(read_only_views(constant), moving, read_only_views(held), sloping)
+
+
+def of_columns(values: Any, columns: IntArray) -> Any:
+    """Return some columns of values by column, (n_columns,) or (n, n_columns); a number is that of all columns."""
+    return values[..., columns] if np.ndim(values) and values.shape[-1] > 1 else values
 
 
 def values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.systems.law_inputs import BetweenRows, LawInputs, StepInputs, StepPart, values_at_rows
+from probewise.systems.law_inputs import BetweenRows, LawInputs, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.rosenbrock import Rosenbrock
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
@@ -317,8 +317,8 @@ class Stepper:
                 way[:, some],
                 {name: values[:, some] for name, values in s.items()},
                 {name: values[:, some] for name, values in after.items()},
-                _of_columns(begin, some),
-                _of_columns(length, some),
+                of_columns(begin, some),
+                of_columns(length, some),
                 {name: values[:, some] for name, values in ways.items()},
             )
             return _with_columns(after, some, split[0]), _with_columns(ways, some, split[1])
@@ -341,7 +341,7 @@ class Stepper:
 
     def _of_some(self, columns: IntArray) -> Stepper:
         """Return the steps of some of the columns of the states' arrays."""
-        return replace(self, between=self.between.of_some(columns), gap=_of_columns(self.gap, columns))
+        return replace(self, between=self.between.of_some(columns), gap=of_columns(self.gap, columns))
 
     def _step_without_split(
         self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]
@@ -367,11 +367,6 @@ def step_in_part(stepper: Stepper, part: StepPart, s: dict[str, Any]) -> dict[st
         return stepper.step(s, part.begin, part.length)
     after = stepper.step({state: values[:, part.columns] for state, values in s.items()}, part.begin, part.length)
     return _with_columns(s, part.columns, after)
-
-
-def _of_columns(values: Any, columns: IntArray) -> Any:
-    """Return some columns of values by column, (n_columns,) or (n, n_columns); a number is that of all columns."""
-    return values[..., columns] if np.ndim(values) and values.shape[-1] > 1 else values
 
 
 def _with_columns(s: Mapping[str, Any], columns: IntArray, new: Mapping[str, Any]) -> dict[str, Any]:

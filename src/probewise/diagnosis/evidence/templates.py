@@ -127,8 +127,6 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     n_rows = bank.shape[0] * bank.shape[1]
     own = {e.name: effect_values(e, found.z[None, plain.coordinate_slice(e.name)]) for e in plain.effects}
     sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
-    before = np.zeros(len(plan))
-    before[usable] = found.predicted
     inside = np.flatnonzero(scan_indicator(plan, effect.scans)) if effect.scans else np.arange(len(plan))
     there = plan.take(inside) if effect.scans else plan
     kept = np.isin(usable, inside, assume_unique=True)
@@ -148,10 +146,10 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
             if seen is None
             else model.chain.readings_from_simulated_view(seen, theta, there)
         )
-        change[rows, kept] = read[:, at] - before[usable[kept]]
+        change[rows, kept] = read[:, at] - found.predicted[kept]
     columns = change.T
-    columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + np.abs(before).max()))] = 0.0  # NaN too
-    largest = np.abs(before).max()
+    largest = np.abs(found.predicted).max(initial=0.0)
+    columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + largest))] = 0.0  # NaN too
     none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
     columns[:, np.abs(columns).max(axis=0) < none] = 0.0
     return np.split(columns, len(bank), axis=1)

@@ -41,7 +41,7 @@ def weights_beside_other_effects(
         return weights
     out = dict(weights)
     for effect in effects:
-        if len(effect.variants()) == len(weights[effect.name]) > 1 and _has_change_point(effect):
+        if effect.has_change_point and len(effect.variants()) == len(weights[effect.name]) > 1:
             without = _fit_without(found, effect.name, usable)
             templates = templates_of_effect(without, effect, usable)
             bank = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(found.residuals))
@@ -49,10 +49,6 @@ def weights_beside_other_effects(
             if np.isfinite(scores).all():
                 out[effect.name] = templates.variant_probabilities(scores)
     return out
-
-
-def _has_change_point(effect: object) -> bool:
-    return bool(getattr(effect, "change_points", None) or getattr(effect, "between_s", None))
 
 
 def _fit_without(found: Fit, name: str, usable: IntArray) -> Fit:

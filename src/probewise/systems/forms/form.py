@@ -19,6 +19,7 @@ from probewise.sensor import Stage
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.table import RunTable
 
+_FLAG_WIDTH = 1e-9  # of its prior
 _FEW = 48  # positions of a change point that are enough to detect one
 
 Act = Callable[[Any, FloatArray, RunTable], Any]
@@ -205,6 +206,11 @@ class Form:
         """Names of further columns that it needs: always ()."""
         return ()
 
+    @property
+    def has_change_point(self) -> bool:
+        """Whether its variants are the intervals of a change point."""
+        return self.change_points is not None
+
     def variants(self) -> tuple[Form, ...]:
         """Return itself and its alternatives, or one variant for each interval in which its change point may lie.
 
@@ -257,6 +263,12 @@ class Form:
         chosen = rng.choice(len(weights), len(theta), p=weights)
         drawn = at[chosen] + np.diff(at)[chosen] * rng.random(len(theta))
         return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
+
+
+def flag_with_prior(on: bool) -> tuple[float, Uniform]:
+    """Return the value of a parameter that tells two variants of a form apart, 0 or 1 to 1e-9, and its prior."""
+    value = 1.0 - 0.5 * _FLAG_WIDTH if on else 0.5 * _FLAG_WIDTH
+    return value, Uniform(value - 0.5 * _FLAG_WIDTH, value + 0.5 * _FLAG_WIDTH)
 
 
 def mean_with_sd(mean: float, sd: float, unit: str) -> str:

@@ -12,17 +12,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray
-from probewise.priors import LogUniform, Uniform
+from probewise._arrays import FloatArray, IntArray
+from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, Form, mean_with_sd
+from probewise.systems.forms.form import Act, Form, flag_with_prior, mean_with_sd
 from probewise.systems.forms.splines import Spline
 from probewise.systems.table import RunTable
 
 _N_SIZES = 9
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
-_FIXED = 1e-9  # width of its prior
 _ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
 
@@ -48,24 +47,25 @@ def _with_smooth_variant(
 ) -> Form:
     sizes = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)
 
-    def variant(smooth: float) -> Form:
+    def variant(smooth: bool) -> Form:
+        flag, prior_of_flag = flag_with_prior(smooth)
         return Form(
             name,
             Stage.LAG,
-            marginals={"tau_s": prior, _SMOOTH: Uniform(smooth - 0.5 * _FIXED, smooth + 0.5 * _FIXED)},
+            marginals={"tau_s": prior, _SMOOTH: prior_of_flag},
             units=(time_unit, "1"),
             covariates=("previous",),
             act=act,
-            entries=np.stack([sizes, np.full(_N_SIZES, smooth)], axis=1)[:, None, :],
+            entries=np.stack([sizes, np.full(_N_SIZES, flag)], axis=1)[:, None, :],
             amplitudes=(),
             says=lambda mean, sd: f"{says} {mean_with_sd(mean[0], sd[0], time_unit)}",
             absent={0: 0.0},
             needs_rising_time=True,
             fixed=(_SMOOTH,),
-            relative_odds=_ODDS_OF_SMOOTH if smooth > 0.5 else 1.0,
+            relative_odds=_ODDS_OF_SMOOTH if smooth else 1.0,
         )
 
-    at_rows, smooth = variant(0.5 * _FIXED), variant(1.0 - 0.5 * _FIXED)
+    at_rows, smooth = variant(False), variant(True)
     value = about.predicted[None, :]
     apart = act(value, at_rows.entries[:, 0], about.table) - act(value, smooth.entries[:, 0], about.table)
     size = np.sqrt(np.nansum(apart[:, about.has_reading] ** 2, axis=1)) / about.sd
@@ -135,7 +135,7 @@ def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray
     if len(time) < 2:
         return np.broadcast_to(values, (len(by), len(time)))
     asked = time[None, :] - by[:, None]
-    after = np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1)
+    after = _index_of_next_row(time, asked)
     gap = time[after] - time[after - 1]
     share = np.clip((asked - time[after - 1]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
     values = np.broadcast_to(values, asked.shape)
@@ -144,11 +144,16 @@ def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray
     return np.where(by[:, None] == 0, values, low + share * (high - low))
 
 
+def _index_of_next_row(time: FloatArray, asked: FloatArray) -> IntArray:
+    """Return the index of the row after each time asked for, (n_samples, n), from 1 to that of the last row."""
+    return np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1)
+
+
 def _smooth_values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
     """Return what `values_at_earlier_times` does, by a spline."""
     if len(time) < 2:
         return np.broadcast_to(values, (len(by), len(time)))
     asked = np.maximum(time[None, :] - by[:, None], time[0])
-    gap = np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1) - 1
+    gap = _index_of_next_row(time, asked) - 1
     found = Spline(time, values).at(gap, asked - time[gap])
     return np.where(by[:, None] == 0, np.broadcast_to(values, asked.shape), found)

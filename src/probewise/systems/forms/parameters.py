@@ -8,17 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from probewise._arrays import FloatArray, varies
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, ActInTime, Form
+from probewise.systems.forms.form import Act, ActInTime, Form, flag_with_prior
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.forms.readings import modulated_form
 from probewise.systems.table import RunTable
 
 _AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
-_FIXED = 1e-9  # width of its prior
 _QUARTILES = np.array([0.25, 0.75])
 _FAR = 0.3  # change of a parameter by its own size, as large as the misfit asks for, at which the variants differ
 _MOST_NATS = 50.0  # largest logarithm of a factor
@@ -91,9 +90,10 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
         by_factor = ", and in proportion to itself (exponentially)" if mean[1] > 0.5 else ""
         return form.says(mean, sd) + by_factor
 
-    def variant(as_factor: float) -> Form:
-        which = np.full((*form.entries.shape[:2], 1), as_factor)
-        marginals = {**form.marginals, _AS_FACTOR: Uniform(as_factor - 0.5 * _FIXED, as_factor + 0.5 * _FIXED)}
+    def variant(as_factor: bool) -> Form:
+        flag, prior = flag_with_prior(as_factor)
+        which = np.full((*form.entries.shape[:2], 1), flag)
+        marginals = {**form.marginals, _AS_FACTOR: prior}
         return replace(
             form,
             marginals=marginals,
@@ -104,14 +104,10 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
             fixed=(_AS_FACTOR,),
         )
 
-    linear = variant(0.5 * _FIXED)
+    linear = variant(False)
     there = about.system.parameters(about.theta, about.table)[name]
     most = float(np.abs(how.at_rows(form.entries[0, :1], about.table)).max()) * max(about.misfit, 1.0)
-    return (
-        linear
-        if most < _FAR * float(np.abs(there).min())
-        else replace(linear, alternatives=(variant(1.0 - 0.5 * _FIXED),))
-    )
+    return linear if most < _FAR * float(np.abs(there).min()) else replace(linear, alternatives=(variant(True),))
 
 
 def _parameter_shifter(name: str, how: Modulation) -> Act:

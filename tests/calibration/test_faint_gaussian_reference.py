@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import cast
 
@@ -21,6 +22,8 @@ from probewise.nested.weights import n_effective
 from probewise.priors import LogUniform, Uniform
 from probewise.recordings import Recording
 
+SortedDraws = Callable[[int, int, int, np.random.Generator], tuple[FloatArray, float]]
+
 
 class _Silent:
     """A recording that says nothing: the posterior is the prior, the evidence one."""
@@ -29,18 +32,33 @@ class _Silent:
         return np.zeros(len(theta))
 
 
-def _sorted_draws(prior: SSFPrior, n: int, n_bright: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
-    """Draw from the prior, sort the Gaussians by mass, keep those of which so many are bright; and their share."""
-    space = prior.coordinates
-    theta = space.leave(space.enter(prior.from_unit_cube(rng.random((40 * n, len(prior.names))))))[0]
-    kept = theta[count_bright_gaussians(theta) == n_bright]
-    return kept[rng.integers(len(kept), size=n)], len(kept) / len(theta)
+N_PRIOR_DRAWS = 400_000
+
+
+@pytest.fixture(scope="module")
+def sorted_draws(recording: Recording) -> SortedDraws:
+    """Draws from the prior of an order, Gaussians sorted by mass, of which so many are bright; and their share."""
+
+    @functools.cache
+    def draws_of_prior(order: int) -> tuple[FloatArray, IntArray]:
+        prior = default_prior(recording, order)
+        space = prior.coordinates
+        unit = np.random.default_rng(35 + order).random((N_PRIOR_DRAWS, len(prior.names)))
+        theta = space.leave(space.enter(prior.from_unit_cube(unit)))[0]
+        return theta, count_bright_gaussians(theta)
+
+    def draw(order: int, n_bright: int, n: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
+        theta, n_bright_of_draws = draws_of_prior(order)
+        kept = theta[n_bright_of_draws == n_bright]
+        return kept[rng.integers(len(kept), size=n)], len(kept) / len(theta)
+
+    return draw
 
 
 PARTS = [(2, 1), (3, 1), (3, 2)]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def references(
     recording: Recording, make_compensation: Callable[..., CompensatedShapeProposal]
 ) -> dict[tuple[int, int], FaintGaussianReferenceDensity]:
@@ -59,12 +77,12 @@ def _possible_rows(prior: SSFPrior, drawn: FloatArray, n_bright: int) -> IntArra
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
-    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], sorted_draws: SortedDraws, n: int, m: int
 ) -> None:
     """Mean weight the prior's share, and moments of its own draws; four standard errors: one false alarm in 16 000."""
     rng = np.random.default_rng(31)
     reference = references[n, m]
-    rest, below = _sorted_draws(default_prior(recording, n - 1), 20_000, m, rng)
+    rest, below = sorted_draws(n - 1, m, 20_000, rng)
     drawn = reference.draw(rest, rng=rng)
     weight = np.zeros(len(drawn))
     alive = _possible_rows(reference.prior, drawn, m)
@@ -72,8 +90,9 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
     drawn[alive] = coordinates.leave(coordinates.enter(drawn[alive]))[0]
     weight[alive] = below * np.exp(-reference.log_density_over_prior(drawn[alive]))
     assert 0.2 < len(alive) / len(drawn) < 1.0
-    plain, share = _sorted_draws(reference.prior, 20_000, m, rng)
-    assert abs(weight.mean() - share) < 4 * np.hypot(weight.std(), np.sqrt(share / 40)) / np.sqrt(len(weight))
+    plain, share = sorted_draws(n, m, 20_000, rng)
+    error_of_mean = np.hypot(weight.std() / np.sqrt(len(weight)), np.sqrt(share / N_PRIOR_DRAWS))
+    assert abs(weight.mean() - share) < 4 * error_of_mean
 
     def asked(theta: FloatArray) -> FloatArray:
         """The first is narrower along x' than the last, the last sits left of it."""
@@ -86,7 +105,7 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
 
 
 def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
-    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], sorted_draws: SortedDraws
 ) -> None:
     """Where the recording says nothing: mean weight the share of the prior with one bright Gaussian, four errors."""
     rng, space = np.random.default_rng(36), LabelSymmetricCoordinates(references[2, 1].prior)
@@ -96,7 +115,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
         for width in (0.4, 0.9)
     )
     seeded = MixedReferenceDensity(references[2, 1], peaks, 0.0)
-    drawn = seeded.draw(_sorted_draws(default_prior(recording, 1), 10_000, 1, rng)[0], rng=rng)
+    drawn = seeded.draw(sorted_draws(1, 1, 10_000, rng)[0], rng=rng)
     weight = np.zeros(len(drawn))
     alive = _possible_rows(seeded.prior, drawn, 1)
     coordinates = seeded.prior.coordinates
@@ -111,11 +130,11 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_undoing_a_compensated_gaussian_gives_the_others_back(
-    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], sorted_draws: SortedDraws, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(33)
     reference = references[n, m]
-    rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
+    rest, _ = sorted_draws(n - 1, m, 200, rng)
     drawn = reference.with_compensated_gaussian(rest, rng=rng)
     possible = np.isfinite(drawn).all(axis=1)
     drawn, rest = drawn[possible], rest[possible]
@@ -170,10 +189,10 @@ def test_the_pool_grows_until_enough_of_its_shapes_are_effective(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_a_split_keeps_light_centre_and_covariance(
-    references: dict[tuple[int, int], FaintGaussianReferenceDensity], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReferenceDensity], sorted_draws: SortedDraws, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(32)
-    rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
+    rest, _ = sorted_draws(n - 1, m, 200, rng)
     for label in range(m):
         split = references[n, m].split_gaussian_off_bright_one(rest, label, rng=rng)
         alive = np.isfinite(split).all(axis=1)
@@ -196,7 +215,11 @@ def test_only_a_uniform_prior_of_light_has_a_reference(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
-    make_compensation: Callable[..., CompensatedShapeProposal], recording: Recording, n: int, m: int
+    make_compensation: Callable[..., CompensatedShapeProposal],
+    sorted_draws: SortedDraws,
+    recording: Recording,
+    n: int,
+    m: int,
 ) -> None:
     """Where the recording says nothing: means and mean squares in the prior's cube, within five errors of uniform ones.
 
@@ -206,7 +229,7 @@ def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
     reference = FaintGaussianReferenceDensity(
         prior, cast("SensorProblem", _Silent()), make_compensation(n, rng, spread=2e-3), m
     )
-    here, _ = _sorted_draws(prior, 3000, m, rng)
+    here, _ = sorted_draws(n, m, 3000, rng)
     start = here
     for _ in range(12):
         there, log_drawn = reference.propose_moves(here, rng=rng)

@@ -52,7 +52,7 @@ def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [1, 9, 26])
+@pytest.mark.parametrize("number", [1, 9])
 def test_a_case_goes_through_strict_json_into_every_row(number):
     """And one of them again: it depends on its seed and number alone."""
     found = run_case(Task(1, number))

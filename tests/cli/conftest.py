@@ -1,17 +1,14 @@
 """A sensor model made by hand, and recordings small enough for a test."""
 
-import io
 import signal
 
 import numpy as np
 import pytest
 from mixtures import fixed_mixture
-from PIL import Image
 
 from probewise._signals import ENDING
 from probewise.calibration import FittedSensor, write_sensor
 from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
-from probewise.report import exploration
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, footprint_of, mean_ssf_field
 
@@ -63,12 +60,3 @@ def recording_file(tmp_path):
     path = tmp_path / "small.csv"
     write_recording(small_recording(), path)
     return path
-
-
-@pytest.fixture
-def quick_frames(monkeypatch):
-    """Draw every step of a run as one black pixel."""
-    dot = io.BytesIO()
-    Image.new("RGB", (1, 1)).save(dot, "PNG")
-    for drawing in ("robot_view_png", "robot_views_by_model_png"):
-        monkeypatch.setattr(exploration, drawing, lambda *_, **__: dot.getvalue())

@@ -124,7 +124,7 @@ def test_an_investigation_goes_on_from_whatever_stands_on_the_disk(thin_plan, tm
     chance = np.random.default_rng(int(os.environ.get("PROBEWISE_KILL_SEED", "1")))
     of_round = {n: [k for k, target in enumerate(standing) if Path(target).name == f"{n}.csv"] for n in (1, 2)}
     results = [k for k, target in enumerate(standing) if Path(target).parent.name != "rounds"]
-    moments = [0, 1, *(int(chance.choice(some)) for some in (*of_round.values(), results) for _ in range(2))]
+    moments = [0, 1, *(int(chance.choice(some)) for some in (*of_round.values(), results, results))]
     for k in moments:
         out = tmp_path / "standing" / str(k)
         more = ["--resume"] if (out / "rounds" / "settings.json").exists() else []

@@ -86,6 +86,7 @@ def test_a_search_does_not_replace_the_sensor_that_it_was_given(sensor_file, tmp
     assert "sensor_kept.json" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_calibration_does_not_replace_the_description_of_its_recording(recording_file, tmp_path, capsys):
     recording = recording_file.rename(tmp_path / "sensor.csv")
     recording_file.with_suffix(".json").rename(tmp_path / "sensor.json")

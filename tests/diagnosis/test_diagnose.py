@@ -112,7 +112,7 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
     """What differs between ways to come holds hysteresis and more; were it not spoken for, a tenth would be unknown."""
     found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=seed), rng=np.random.default_rng(0))

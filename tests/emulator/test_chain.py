@@ -30,6 +30,7 @@ def built_otherwise(text):
     return text
 
 
+@pytest.mark.usefixtures("quick_frames")
 def test_an_arm_that_is_built_otherwise_finds_the_circle_and_never_touches_the_table(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     text = shipped_geometry_path().read_text(encoding="utf-8")

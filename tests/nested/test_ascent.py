@@ -75,6 +75,7 @@ def peak_of(known: problems.Known) -> float:
     return height(-np.linalg.solve(curvature, gradient))
 
 
+@pytest.mark.slow
 def test_along_the_arm_of_a_heavy_tail_the_draws_reach_the_middle(on_an_arm: NestedResult) -> None:
     """The arm is a hundred times as long as wide; at its middle the log likelihood is 0."""
     assert on_an_arm.log_likelihood.max() < -10
@@ -83,6 +84,7 @@ def test_along_the_arm_of_a_heavy_tail_the_draws_reach_the_middle(on_an_arm: Nes
     assert n_calls < 5000
 
 
+@pytest.mark.slow
 def test_what_lies_at_the_end_of_the_arm_is_weighed_and_doubts_the_run(on_an_arm: NestedResult) -> None:
     problem = Cross(-math.inf)
     missing = find_missed_hills(on_an_arm, problem, max_calls=on_an_arm.n_calls, rng=np.random.default_rng(3))

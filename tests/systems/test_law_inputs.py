@@ -59,8 +59,15 @@ def _spring_about(hold):
     return _about(law, ("k", "c"), TABLE, (_SPRING, _FRICTION))
 
 
-ABOUT = {hold: _spring_about(hold) for hold in ("previous", "linear")}
-FORMS = {hold: bind_forms(about) for hold, about in ABOUT.items()}
+@pytest.fixture(scope="module")
+def about_of():
+    """The spring of which the force is held, or on straight lines, by the word of the law."""
+    return {hold: _spring_about(hold) for hold in ("previous", "linear")}
+
+
+@pytest.fixture(scope="module")
+def forms_of(about_of):
+    return {hold: bind_forms(about) for hold, about in about_of.items()}
 
 
 def _predicted(about, form, settings):
@@ -137,11 +144,11 @@ CASES = {
 
 @pytest.mark.parametrize("hold", ["previous", "linear"])
 @pytest.mark.parametrize("name", CASES)
-def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold):
+def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold, about_of, forms_of):
     """A column that is held or on straight lines, as the law says, late or not; time; a jump at its time; a run."""
     setting, how = CASES[name]
-    about = ABOUT[hold]
-    found = _predicted(about, FORMS[hold][name], np.array([setting]))[0]
+    about = about_of[hold]
+    found = _predicted(about, forms_of[hold][name], np.array([setting]))[0]
     expected = _spring_by_solve_ivp(hold, **how(hold))
     size = np.abs(expected - about.predicted).max()
     assert size > 0.1
@@ -150,16 +157,16 @@ def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold):
 
 @pytest.mark.parametrize("hold", ["previous", "linear"])
 @pytest.mark.parametrize("name", ["depends:k:force", "drifts:k", "steps:k", DELAY])
-def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name, hold):
-    about, setting = ABOUT[hold], np.array(CASES[name][0])
+def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name, hold, about_of, forms_of):
+    about, setting = about_of[hold], np.array(CASES[name][0])
     settings = setting * (1 + 0.02 * np.random.default_rng(1).normal(size=(5, len(setting))))
     refusing = TrajectoryCache(n_refused=99)  # it is stepped
     stepped = replace(about, system=replace(about.system, trajectories=refusing))
-    expected = _predicted(stepped, FORMS[hold][name], settings)
+    expected = _predicted(stepped, forms_of[hold][name], settings)
     own = replace(about, system=replace(about.system, trajectories=TrajectoryCache()))
     own.system.chain(TABLE, ()).predict(own.theta, TABLE)
     for _ in range(2):
-        np.testing.assert_allclose(_predicted(own, FORMS[hold][name], settings), expected, atol=1e-9)
+        np.testing.assert_allclose(_predicted(own, forms_of[hold][name], settings), expected, atol=1e-9)
     assert own.system.trajectories.n_refused == 0
     assert not refusing.known
 
@@ -198,16 +205,16 @@ def test_a_late_column_is_held_exactly_one_row_later_where_the_dead_time_is_a_ga
     np.testing.assert_array_equal(found[2], np.full(40, values[0, 0]))
 
 
-def test_a_column_with_a_wrong_scale_beside_its_dead_time_has_both():
-    form, gain = (FORMS["previous"][name] for name in ("input_delay:force", "input_gain:force"))
-    about = ABOUT["previous"]
+def test_a_column_with_a_wrong_scale_beside_its_dead_time_has_both(about_of, forms_of):
+    form, gain = (forms_of["previous"][name] for name in ("input_delay:force", "input_gain:force"))
+    about = about_of["previous"]
     theta = np.concatenate([about.theta[0], [0.33], [0.1]])[None, :]
     found = about.system.chain(TABLE, (form, gain)).predict(theta, TABLE)[0]
     np.testing.assert_allclose(found, _spring_by_solve_ivp("previous", delay=0.33, gain=1.1), atol=1e-5)
 
 
-def test_the_cost_counts_the_parts_of_the_steps_that_a_late_column_divides():
-    n_calls, about = 0, ABOUT["previous"]
+def test_the_cost_counts_the_parts_of_the_steps_that_a_late_column_divides(about_of, forms_of):
+    n_calls, about = 0, about_of["previous"]
     own = about.system.simulator.law
 
     def rates(s, p, u):
@@ -219,7 +226,7 @@ def test_the_cost_counts_the_parts_of_the_steps_that_a_late_column_divides():
     system = replace(
         about.system, simulator=simulator, tally=IntegrationTally(), trajectories=TrajectoryCache(n_refused=99)
     )
-    _predicted(replace(about, system=system), FORMS["previous"]["input_delay:force"], np.array([[0.33]]))
+    _predicted(replace(about, system=system), forms_of["previous"]["input_delay:force"], np.array([[0.33]]))
     assert system.tally.n_evaluations == pytest.approx(n_calls, rel=0.25)
 
 

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 _DIAGNOSIS_OF_EQUAL_RIVALS = """
 import numpy as np
 from probewise.diagnosis import diagnose_system, repaired_of
@@ -21,6 +23,7 @@ print(repaired_of(found).to_json())
 """
 
 
+@pytest.mark.slow
 def test_the_repaired_model_is_the_same_whatever_order_python_gives_to_sets():
     """Four parameters of one sum, which may each depend on a column: rivals of equal probability, in random order."""
     one, other = (

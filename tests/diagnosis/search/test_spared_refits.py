@@ -55,13 +55,23 @@ def decaying():
     return prepare_system(simulator, RunTable({"t_min": t, "y": y}, time="t_min", run=None))
 
 
+@pytest.fixture(scope="module")
+def searched_line(prepared):
+    return searching.search(prepared)
+
+
+@pytest.fixture(scope="module")
+def searched_cup(decaying):
+    return searching.search(decaying)
+
+
 def _far_start(prepared):
     return prepared.null.starts[0] + 1.5
 
 
-def test_a_fit_that_would_stay_above_what_matters_is_given_up(decaying):
+def test_a_fit_that_would_stay_above_what_matters_is_given_up(decaying, searched_cup):
     model = Model(decaying.null, (), decaying.recording.plan)
-    law = searching.search(decaying).null.law
+    law = searched_cup.null.law
     whole = fit(model, decaying.recording, _far_start(decaying), law)
     asked = fit(model, decaying.recording, _far_start(decaying), law, hopeless_above=whole.objective - 1e6)
     assert whole.settled
@@ -70,17 +80,17 @@ def test_a_fit_that_would_stay_above_what_matters_is_given_up(decaying):
     assert np.isfinite(asked.slopes).all()
 
 
-def test_a_fit_that_may_still_come_down_is_not(decaying):
+def test_a_fit_that_may_still_come_down_is_not(decaying, searched_cup):
     model = Model(decaying.null, (), decaying.recording.plan)
-    law = searching.search(decaying).null.law
+    law = searched_cup.null.law
     whole = fit(model, decaying.recording, _far_start(decaying), law)
     same = fit(model, decaying.recording, _far_start(decaying), law, hopeless_above=whole.objective + 1.0)
     np.testing.assert_array_equal(same.z, whole.z)
 
 
-def test_only_fits_of_a_law_are_given_up(decaying, prepared):
-    for ready, spared in ((decaying, True), (prepared, False)):
-        refits = searching.search(ready).refits
+def test_only_fits_of_a_law_are_given_up(decaying, searched_cup, prepared, searched_line):
+    for ready, searched, spared in ((decaying, searched_cup, True), (prepared, searched_line, False)):
+        refits = searched.refits
         best = min(candidate.found.objective for candidate, _ in refits.known.values())
         limit = refits._hopeless_above(Model(ready.null, (), ready.recording.plan))
         assert limit == (best + 40.0 if spared else math.inf)
@@ -102,11 +112,10 @@ def test_a_start_of_its_own_in_each_run_does_not_make_every_effect_be_refitted(p
     assert max(searched.posterior.marginal_over_noise.items(), key=lambda kv: kv[1])[0] == ("sensitivity:room",)
 
 
-def test_no_formula_is_searched_for_beside_a_name_that_explains_everything(prepared, monkeypatch):
-    searched = searching.search(prepared)
+def test_no_formula_is_searched_for_beside_a_name_that_explains_everything(searched_line, monkeypatch):
     monkeypatch.setattr(weighing_formulas, "search", lambda *a, **k: pytest.fail("searched once more"))
     assert searching.search is not weighing_formulas.search
-    assert search_with_formulas(searched) is searched
+    assert search_with_formulas(searched_line) is searched_line
 
 
 def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):

@@ -33,8 +33,12 @@ def at_step(prepared, max_step):
     return replace(prepared, null=replace(prepared.null, max_step=max_step))
 
 
-def test_what_has_a_chance_is_refitted_and_is_as_probable_as_by_another_search(prepared):
-    first = search(at_step(prepared, 0.02))
+@pytest.fixture(scope="module")
+def first(prepared):
+    return search(at_step(prepared, 0.02))
+
+
+def test_what_has_a_chance_is_refitted_and_is_as_probable_as_by_another_search(prepared, first):
     stages = []
     found = searched_at_step(first, 0.01, progress=lambda stage, *numbers, **note: stages.append(stage))
     again = search(at_step(prepared, 0.01)).posterior.marginal_over_noise
@@ -57,8 +61,7 @@ def test_a_search_that_errors_of_the_integration_may_have_led_is_made_again(prep
     assert searched_at_step(first, 0.01) is None
 
 
-def test_a_null_without_a_chance_may_move_by_more(prepared, monkeypatch):
-    first = search(at_step(prepared, 0.02))
+def test_a_null_without_a_chance_may_move_by_more(first, monkeypatch):
     assert first.posterior.marginal_over_noise[()] < 1e-9
     refitted = finer_step._refitted
 

@@ -54,6 +54,7 @@ def test_the_noise_is_in_the_unit_of_the_readings(scale):
     assert np.median(found.noise_sd) / scale == pytest.approx(1e-4, rel=0.3)
 
 
+@pytest.mark.slow
 def test_the_noise_of_rounded_readings_has_the_rounding_in_it_whichever_way_they_are_fitted():
     """Sd 0.1 and rounded to whole numbers: by quadrature 0.1 and 1 / sqrt(12) add up to 0.305."""
     x = np.linspace(-10.0, 10.0, 60)

@@ -32,6 +32,7 @@ def diagnosis():
     return diagnose_system(DOME, TABLE, rng=np.random.default_rng(1))
 
 
+@pytest.mark.slow
 def test_every_probability_and_size_is_a_number(diagnosis):
     assert sum(h.probability for h in diagnosis.judged.hypotheses) == pytest.approx(1.0)
     assert diagnosis.effects
@@ -39,6 +40,7 @@ def test_every_probability_and_size_is_a_number(diagnosis):
     assert all(np.isfinite([place.start, place.end]).all() for place in diagnosis.where if place.start is not None)
 
 
+@pytest.mark.slow
 def test_a_size_is_that_of_a_refit_from_values_that_predict_something(diagnosis):
     """Not that of readings a thousand noise sds off, which stands for an impossible one."""
     assert max(effect.size_lambda for effect in diagnosis.effects) < 200

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from probewise.diagnosis import diagnose_system
 from probewise.systems import Law, Simulator
 
-TIMES = np.linspace(0.0, 16.0, 81)  # about five rows a period
+TIMES = np.linspace(0.0, 8.0, 41)  # about five rows a period
 SD = 1e-4
 
 

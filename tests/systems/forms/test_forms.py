@@ -338,6 +338,7 @@ def _names_in_units(of_law, time, column, reading):
     return {re.sub(r"-?\d[\d.e+-]*", "#", name) for name in names}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_law", [False, True])
 def test_what_may_be_missing_does_not_depend_on_the_units_of_the_columns(of_law):
     """Nanoseconds in seconds, picoamperes in amperes, and readings of a million million of their unit."""

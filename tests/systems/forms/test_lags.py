@@ -117,6 +117,7 @@ def _cups(every_min, tau_min, delay_min=0.0):
     return simulator, RunTable(columns, time="t_min", run="cup")
 
 
+@pytest.mark.slow
 def test_a_lag_and_a_delay_have_a_smooth_variant_where_rows_are_not_dense_beside_the_noise():
     sparse = prepare_system(*_cups(0.8, 0.6)).effects
     assert all(len(sparse[name].variants()) == 2 for name in ("lag", "delay"))

@@ -94,19 +94,14 @@ def test_bad_input_is_told_in_one_line_and_nothing_is_written(few, tmp_path, cap
 
 @pytest.mark.slow
 def test_an_aliased_effect_is_settled_by_the_readings_that_are_asked_for(tmp_path):
-    """And a resumed investigation ends as the one that was never cut, byte for byte."""
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    out = tmp_path / "out"
     options = ("--plan", "paper", "--truth", "backlash:0.5", "--seed", 4, "--quiet")
-    assert run("investigate", *options, "--out", whole) == 0
-    found = json.loads((whole / "diagnosis.json").read_text())
+    assert run("investigate", *options, "--out", out) == 0
+    found = json.loads((out / "diagnosis.json").read_text())
     assert found["hypotheses"][0]["effects"] == ["backlash"]
     assert found["hypotheses"][0]["probability"] > 0.95
-    assert (whole / "rounds" / "2.csv").exists()
-    assert set(read_recording(whole / "recording.csv").plan.sessions) >= {0, 1}
-    assert run("investigate", *options, "--out", cut, "--rounds", 1) == 0
-    assert run("investigate", *options, "--out", cut, "--resume") == 0
-    for name in ("diagnosis.json", "recording.csv", "sensor.json", "rounds/2.csv"):
-        assert (cut / name).read_bytes() == (whole / name).read_bytes(), name
+    assert (out / "rounds" / "2.csv").exists()
+    assert set(read_recording(out / "recording.csv").plan.sessions) >= {0, 1}
 
 
 OWN = """

@@ -106,6 +106,26 @@ def test_a_rate_under_another_name_than_its_state_is_told(capsys, tmp_path):
     assert "rates returns no 'temp_c'; allowed: a dict with a rate for each state, under its name: temp_c" in said
 
 
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ('return [-s["temp_c"]]', "rates returns a list or a tuple; allowed: a dict with a rate for each state"),
+        ('return {"temp_c": -math.sin(s["temp_c"])}', "line 13: rates raises TypeError"),
+        ('return {"temp_c": -math.sin(s["temp_c"])}', "allowed: np.sin(x) in place of math.sin(x)"),
+        ('return {"temp_c": -1.0 if s["temp_c"] > 0 else 1.0}', "allowed: np.where(condition, a, b) in place of if"),
+    ],
+)
+def test_a_law_written_for_one_number_is_told_how_arrays_are_written(capsys, tmp_path, body, said):
+    """Also where a column of the table is text, such as the names of the runs: they are not to blame."""
+    law = "import math\n" + FILE.partition("def simulate")[0]
+    law += f'states = {{"temp_c": "start_c"}}\n\ndef rates(s, p, u):\n    {body}\n'
+    table = "\n".join(
+        ",".join(["note" if k == 0 else "a", *line.split(",")])
+        for k, line in enumerate(run_table_csv(runs()).splitlines())
+    )
+    assert said in refused(capsys, tmp_path, law, table=table + "\n")
+
+
 def test_a_mistake_in_observe_is_told_of_observe(capsys, tmp_path):
     law = FILE.partition("def simulate")[0] + (
         'states = {"warm": 0.0}\ndef rates(s, p, u):\n    return {"warm": -s["warm"] / p["tau_s"]}\n'

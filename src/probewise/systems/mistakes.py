@@ -13,6 +13,11 @@ from probewise.errors import FileError
 from probewise.systems.simulator import Simulator
 
 _LONGEST = 160
+_WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
+    "output operand": "k = k * x in place of k *= x: an array changed in place keeps its shape",
+    "converted to Python scalar": "np.sin(x) in place of math.sin(x), and so on: states and columns are arrays",
+    "truth value of an array": "np.where(condition, a, b) in place of if: states and columns are arrays",
+}
 
 
 def user_function_error(
@@ -39,12 +44,12 @@ def user_function_error(
     said = said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."
     found = f"{what} raises {type(error).__name__}: {said}".rstrip(": ")
     law, outside = simulator.law, not frames or frames[-1].filename not in where
-    if law is not None and isinstance(error, KeyError) and outside and error.args and error.args[0] in law.states:
-        return FileError(
-            simulator.source or what,
-            f"rates returns no {error.args[0]!r}",
-            f"a dict with a rate for each state, under its name: {', '.join(law.states)}",
-        )
+    if law is not None and outside:
+        by_name = f"a dict with a rate for each state, under its name: {', '.join(law.states)}"
+        if isinstance(error, KeyError) and error.args and error.args[0] in law.states:
+            return FileError(simulator.source or what, f"rates returns no {error.args[0]!r}", by_name)
+        if isinstance(error, TypeError) and ("list indices" in said or "tuple indices" in said):
+            return FileError(simulator.source or what, "rates returns a list or a tuple", by_name)
     texts = [name for name, values in columns.items() if values.dtype != np.float64]
     if isinstance(error, KeyError):
         names = ", ".join(columns)
@@ -52,8 +57,8 @@ def user_function_error(
         allowed = (
             f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
         )
-    elif isinstance(error, ValueError) and "output operand" in said:
-        allowed = "k = k * x in place of k *= x: an array changed in place keeps its shape"
+    elif way_out := next((out for words, out in _WAY_OUT_BY_WORDS.items() if words in said), None):
+        allowed = way_out
     elif texts and isinstance(error, TypeError | ValueError):
         shown = ", ".join(f"{name} ({_first_non_numeric_cell(columns[name])!r})" for name in texts[:4])
         allowed = f"calculations with numeric columns; these contain text: {shown}"

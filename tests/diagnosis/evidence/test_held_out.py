@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.evidence.held_out import mean_gain_over_parts, sequential_log_densities
+from probewise.diagnosis.evidence.held_out import are_of_part_alone, mean_gain_over_parts, sequential_log_densities
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.recordings import Recording, paper_plan
@@ -76,3 +76,10 @@ def test_a_part_held_out_of_noise_with_memory_has_its_density_given_the_rest(kin
     assert found.sum() == pytest.approx(
         multivariate_normal(np.zeros(n), every).logpdf(readings) - kept.logpdf(readings[~out])
     )
+
+
+def test_a_parameter_of_one_part_stays_its_own_where_integration_leaves_rounding_in_the_others():
+    """Slopes of a run's start, without and with rounding, of a parameter of all runs, and of one that does nothing."""
+    part = np.array([True, True, False, False])
+    slopes = np.array([[3.0, 3.0, 3.0, 0.0], [2.0, 2.0, 3.0, 0.0], [0.0, 5e-10, 1e-3, 0.0], [0.0, -5e-10, 3.0, 0.0]])
+    np.testing.assert_array_equal(are_of_part_alone(slopes, part), [True, True, False, False])

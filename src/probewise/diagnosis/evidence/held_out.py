@@ -24,6 +24,7 @@ Parts = tuple[IntArray, tuple[str, ...]]
 """Part number of each usable reading, (n_usable,), and the names of the parts."""
 
 _BLOCKS = 5
+_NO_SLOPE = 1e-6  # of a parameter's slope on its own readings: so little on others is rounding of predictions
 _HARDLY_TOLD = 0.5  # variance of a coordinate given the other parts, of 1 before them
 
 
@@ -127,7 +128,7 @@ def _refit_log_densities(
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
     rest = law.take_readings(~out)
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
-    of_its_own = ~np.any(found.slopes[~out], axis=0) & np.any(found.slopes[out], axis=0)
+    of_its_own = are_of_part_alone(found.slopes, out)
     turned = np.where(of_its_own, 0.0, rest(without.slopes))
     # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the other
     # readings may bound them on one side only, as for a ceiling.
@@ -149,6 +150,15 @@ def _refit_log_densities(
         for sd, share in ((own.sd_with_rounding, 1 - law.share), (law.times * own.sd, law.share))
     )
     return np.asarray(np.logaddexp(narrow, wide) * own.kept)
+
+
+def are_of_part_alone(slopes: FloatArray, part: BoolArray) -> BoolArray:
+    """Return which parameters change only the readings of a part, (n_params,), such as where its run starts.
+
+    `slopes` are those of all readings, (n_readings, n_params), `part` is the mask of its readings.
+    """
+    here, elsewhere = (np.linalg.norm(slopes[rows], axis=0) for rows in (part, ~part))
+    return np.asarray((here > 0.0) & (elsewhere <= _NO_SLOPE * here))
 
 
 def sequential_log_densities(

@@ -37,6 +37,9 @@ ORDERS_WITHIN = 100.0
 # Nats behind the best refit of a law: a fit that stays so far behind is given up. Where an effect gains hundreds of
 # nats, others gain some of them slowly, and most steps of a search were theirs.
 HOPELESS = 40.0
+# Nats above a given null: what could be added to a candidate further above is screened by changes of its own
+# predictions. Below, those of the null are near enough, and are at hand.
+FAR_FROM_NULL = 100.0
 REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
 # Effects that pairs are screened of, the best alone. A difference of two columns may explain what neither does. Of the
 # best twelve, as before, it was found in none of 6 recordings with seven other columns; of the best sixty in all.

@@ -15,6 +15,7 @@ from probewise.diagnosis.search.constants import (
     BEAM,
     EXTENDED_WITHIN,
     FAINT,
+    FAR_FROM_NULL,
     LEADING_PLAINLY,
     MOST_OUT_OF_VOCABULARY,
     ORDERS_WITHIN,
@@ -107,18 +108,22 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
 def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
     """Screen every effect that a candidate lacks, by its templates about the null with the same number of Gaussians.
 
-    The log evidence of each resulting combination, by noise model, is stored in the state.
+    Where the candidate is far from a given null, the templates are those about the candidate: a null that slides on
+    behind an end stop says nothing of a drag before it. The log evidence of each resulting combination, by noise model,
+    is stored in the state.
 
     Returns
     -------
     `proposals` with the new ones added, the best for each combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
+    gain = parent.log_z - null.log_z
+    about = parent if state.refits.sensor is not None and gain > FAR_FROM_NULL else null
     against = state.penalty_of_extending(parent)
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)
     for noise, evidence in parent.leading_noises():
-        for name, own in state.log_bayes_factors_by_effect(parent, evidence.likeliest_law, null).items():
+        for name, own in state.log_bayes_factors_by_effect(parent, evidence.likeliest_law, about).items():
             first = name_of_first_copy(name)
             if name in parent.names or (first is not None and first not in parent.names):
                 continue

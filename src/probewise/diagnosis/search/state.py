@@ -100,19 +100,22 @@ class SearchState:
         """Return a candidate's unnormalised log posterior: its log evidence plus the log prior of its effects."""
         return candidate.log_z + self.prior.log_prior_on_mean(candidate.names)
 
-    def template_banks(self, null: WeighedFit) -> list[TemplateBank]:
-        """Return the template banks of all effects about a null: one in the vocabulary, and one out of it if any."""
-        named = [effect for name, effect in self.effects.items() if not effects_out_of_vocabulary((name,))]
-        rest = [effect for name, effect in self.effects.items() if effects_out_of_vocabulary((name,))]
-        return [self.templates.coarse_bank(null.found, effects) for effects in (named, rest) if effects]
+    def template_banks(self, about: WeighedFit) -> list[TemplateBank]:
+        """Return the template banks of what a candidate lacks, about it: in the vocabulary, and out of it if any."""
+        lacking = {name: effect for name, effect in self.effects.items() if name not in about.names}
+        named = [effect for name, effect in lacking.items() if not effects_out_of_vocabulary((name,))]
+        rest = [effect for name, effect in lacking.items() if effects_out_of_vocabulary((name,))]
+        return [self.templates.coarse_bank(about.found, effects) for effects in (named, rest) if effects]
 
-    def log_bayes_factors_by_effect(self, about: WeighedFit, law: NoiseLaw, null: WeighedFit) -> dict[str, FloatArray]:
+    def log_bayes_factors_by_effect(
+        self, parent: WeighedFit, law: NoiseLaw, about: WeighedFit
+    ) -> dict[str, FloatArray]:
         """Return, by effect, the log Bayes factors of adding its templates to a candidate, (n_templates,) each.
 
-        The templates are those about `null`.
+        The templates are those about `about`: the candidate, or its null.
         """
         of_banks = [
-            self.refits.log_bayes_factors_by_label(about.found, law, bank) for bank in self.template_banks(null)
+            self.refits.log_bayes_factors_by_label(parent.found, law, bank) for bank in self.template_banks(about)
         ]
         return {name: own for scores in of_banks for name, own in scores.items()}
 

@@ -163,6 +163,20 @@ def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():
     assert 3 not in prepared.usable_rows
 
 
+def test_a_law_says_how_much_of_a_run_a_gap_in_an_input_costs(tmp_path, capsys):
+    """Also at the prompt: the verdict is of far fewer readings than the table has."""
+    law = FILE.partition("def simulate")[0] + (
+        'states = {"temp_c": "start_c"}\n\ndef rates(s, p, u):\n'
+        '    return {"temp_c": (p["gain"] * u["power_w"] + u["room_c"] - s["temp_c"]) / p["tau_s"]}\n'
+    )
+    (tmp_path / "heater.py").write_text(law)
+    (tmp_path / "data.csv").write_text(cell(8, "room_c", ""))
+    words = (str(tmp_path / "data.csv"), "--simulator", str(tmp_path / "heater.py"), "--out", str(tmp_path / "out"))
+    assert main(["fit", *words]) == 0
+    said = "note: 5 readings left out: a column that the law reads is missing in row 8, and a law ends at the first gap"
+    assert said in capsys.readouterr().out
+
+
 def test_an_extra_effect_has_the_priors_of_a_file_and_a_finite_null():
     from probewise.errors import ParameterError
     from probewise.priors import Uniform

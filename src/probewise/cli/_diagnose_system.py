@@ -52,7 +52,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
     ) as stage:
         write_results(diagnosis, drawn, stage)
         stage.write("report.html", page)
-    for note in (*notes, *notes_on_calls(diagnosis), *stage.notes_on_renamed_inputs):
+    for note in (*diagnosis.recording.notes, *notes_on_calls(diagnosis), *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         stage.write("samples.csv", samples_csv(fitted.fitted))
         stage.write_figures(drawn)
         stage.write("report.html", report.page_html(fitted, drawn, seed=arguments.seed))
-    for note in (*notes, *stage.notes_on_renamed_inputs):
+    for note in (*fitted.recording.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

@@ -175,6 +175,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     inputs = {name: values for name, values in table.covariates.items() if name not in no_inputs}
     for values in inputs.values():
         missing |= ~np.isfinite(values)
+    gaps = np.flatnonzero(missing) + 2  # line 1 of a file is its header
     if system.simulator.law is not None:  # what is missing once is missing to the end of its run
         for rows in table.rows_by_scan():
             missing[rows] = np.maximum.accumulate(missing[rows])
@@ -185,6 +186,12 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
         raise ParameterError(what, where, allowed)
     note = f"{int(lost.sum())} readings left out: a column that the simulator reads is missing there"
+    if system.simulator.law is not None:
+        more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
+        note = (
+            f"{int(lost.sum())} readings left out: a column that the law reads is missing in row {gaps[0]}{more}, "
+            "and a law ends at the first gap of its run; fill the gaps in to use them"
+        )
     filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
     return replace(
         recording,

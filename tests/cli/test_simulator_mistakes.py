@@ -22,6 +22,11 @@ def refused(capsys, tmp_path, file, *arguments, table=None, more=()):
     return captured.err
 
 
+def law_whose_rates(do):
+    """A file like the heater's, of a law with one state, temp_c, and a last line of its rates."""
+    return f'{FILE.partition("def simulate")[0]}states = {{"temp_c": "start_c"}}\n\ndef rates(s, p, u):\n    {do}\n'
+
+
 FILES = {
     "a column that the table lacks": (
         ('data["power_w"]', 'data["power"]'), "line 10: simulate raises KeyError: 'power'; allowed: columns run, t_s,",
@@ -90,19 +95,13 @@ def test_a_state_that_starts_at_no_number_is_refused_by_name(capsys, tmp_path, s
 
 
 def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path):
-    law = FILE.partition("def simulate")[0] + (
-        'states = {"temp_c": "start_c"}\n\ndef rates(s, p, u):\n    return {"temp_c": p["gain"] * s["heat"]}\n'
-    )
-    said = refused(capsys, tmp_path, law)
+    said = refused(capsys, tmp_path, law_whose_rates('return {"temp_c": p["gain"] * s["heat"]}'))
     assert "heater.py, line 12: rates raises KeyError: 'heat'" in said
     assert "states temp_c" in said
 
 
 def test_a_rate_under_another_name_than_its_state_is_told(capsys, tmp_path):
-    law = FILE.partition("def simulate")[0] + (
-        'states = {"temp_c": "start_c"}\n\ndef rates(s, p, u):\n    return {"temp": -s["temp_c"]}\n'
-    )
-    said = refused(capsys, tmp_path, law)
+    said = refused(capsys, tmp_path, law_whose_rates('return {"temp": -s["temp_c"]}'))
     assert "rates returns no 'temp_c'; allowed: a dict with a rate for each state, under its name: temp_c" in said
 
 
@@ -117,13 +116,11 @@ def test_a_rate_under_another_name_than_its_state_is_told(capsys, tmp_path):
 )
 def test_a_law_written_for_one_number_is_told_how_arrays_are_written(capsys, tmp_path, body, said):
     """Also where a column of the table is text, such as the names of the runs: they are not to blame."""
-    law = "import math\n" + FILE.partition("def simulate")[0]
-    law += f'states = {{"temp_c": "start_c"}}\n\ndef rates(s, p, u):\n    {body}\n'
     table = "\n".join(
         ",".join(["note" if k == 0 else "a", *line.split(",")])
         for k, line in enumerate(run_table_csv(runs()).splitlines())
     )
-    assert said in refused(capsys, tmp_path, law, table=table + "\n")
+    assert said in refused(capsys, tmp_path, "import math\n" + law_whose_rates(body), table=table + "\n")
 
 
 def test_a_mistake_in_observe_is_told_of_observe(capsys, tmp_path):
@@ -165,10 +162,7 @@ def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():
 
 def test_a_law_says_how_much_of_a_run_a_gap_in_an_input_costs(tmp_path, capsys):
     """Also at the prompt: the verdict is of far fewer readings than the table has."""
-    law = FILE.partition("def simulate")[0] + (
-        'states = {"temp_c": "start_c"}\n\ndef rates(s, p, u):\n'
-        '    return {"temp_c": (p["gain"] * u["power_w"] + u["room_c"] - s["temp_c"]) / p["tau_s"]}\n'
-    )
+    law = law_whose_rates('return {"temp_c": (p["gain"] * u["power_w"] + u["room_c"] - s["temp_c"]) / p["tau_s"]}')
     (tmp_path / "heater.py").write_text(law)
     (tmp_path / "data.csv").write_text(cell(8, "room_c", ""))
     words = (str(tmp_path / "data.csv"), "--simulator", str(tmp_path / "heater.py"), "--out", str(tmp_path / "out"))

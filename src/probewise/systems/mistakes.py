@@ -50,6 +50,8 @@ def user_function_error(
             return FileError(simulator.source or what, f"rates returns no {error.args[0]!r}", by_name)
         if isinstance(error, TypeError) and ("list indices" in said or "tuple indices" in said):
             return FileError(simulator.source or what, "rates returns a list or a tuple", by_name)
+    is_of_values = isinstance(error, TypeError | ValueError)
+    way_out = next((out for words, out in _WAY_OUT_BY_WORDS.items() if words in said), "")
     texts = [name for name, values in columns.items() if values.dtype != np.float64]
     if isinstance(error, KeyError):
         names = ", ".join(columns)
@@ -57,9 +59,9 @@ def user_function_error(
         allowed = (
             f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
         )
-    elif way_out := next((out for words, out in _WAY_OUT_BY_WORDS.items() if words in said), None):
+    elif is_of_values and way_out:
         allowed = way_out
-    elif texts and isinstance(error, TypeError | ValueError):
+    elif is_of_values and texts:
         shown = ", ".join(f"{name} ({_first_non_numeric_cell(columns[name])!r})" for name in texts[:4])
         allowed = f"calculations with numeric columns; these contain text: {shown}"
     else:

@@ -61,7 +61,7 @@ def select_forward(state: SearchState, *, depth: int) -> None:
             parent = state.candidates[proposal.parent.n_gaussians, ()] if proposal.parent is null else proposal.parent
             found = state.refit_with_effect(parent, proposal.added)
             refitted.append(found)
-            if size == 1 and found is not None and state.refits.sensor is not None:
+            if size == 1 and found is not None and state.null_is_given:
                 state.refit_subset_from(found, proposal.added)
         if size == 2:
             refitted += _refit_leading_pairs(state)
@@ -117,8 +117,7 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     `proposals` with the new ones added, the best for each combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
-    gain = parent.log_z - null.log_z
-    about = parent if state.refits.sensor is not None and gain > FAR_FROM_NULL else null
+    about = parent if state.null_is_given and parent.log_z > null.log_z + FAR_FROM_NULL else null
     against = state.penalty_of_extending(parent)
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)

@@ -172,7 +172,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
         if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
             return
         part = state.largest_refitted_part(names)
-        if state.refits.sensor is not None and part.names and part not in screened:
+        if state.null_is_given and part.names and part not in screened:
             screened.add(part)
             proposals_for(state, part, {})
             continue

@@ -88,6 +88,11 @@ class SearchState:
         return max(self.nulls, key=lambda c: c.log_z)
 
     @property
+    def null_is_given(self) -> bool:
+        """Whether the null is a given one, whose fits are comparable, and not one of several forms of the SSF."""
+        return self.refits.sensor is not None
+
+    @property
     def refitted_combinations(self) -> set[Names]:
         """The combinations that were refitted, with any number of Gaussians."""
         return {names for _, names in self.candidates}

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
 from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
@@ -175,7 +175,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     inputs = {name: values for name, values in table.covariates.items() if name not in no_inputs}
     for values in inputs.values():
         missing |= ~np.isfinite(values)
-    gaps = np.flatnonzero(missing) + 2  # line 1 of a file is its header
+    gaps = np.flatnonzero(missing)
     if system.simulator.law is not None:  # what is missing once is missing to the end of its run
         for rows in table.rows_by_scan():
             missing[rows] = np.maximum.accumulate(missing[rows])
@@ -185,19 +185,23 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + 2}"
         allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
         raise ParameterError(what, where, allowed)
-    note = f"{int(lost.sum())} readings left out: a column that the simulator reads is missing there"
-    if system.simulator.law is not None:
-        more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
-        note = (
-            f"{int(lost.sum())} readings left out: a column that the law reads is missing in row {gaps[0]}{more}, "
-            "and a law ends at the first gap of its run; fill the gaps in to use them"
-        )
     filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
     return replace(
         recording,
         plan=cast(Plan, filled),
         readings=np.where(lost, np.nan, recording.readings),
-        notes=(*recording.notes, note) if lost.any() else recording.notes,
+        notes=(*recording.notes, _note_on_gaps(system, int(lost.sum()), gaps)) if lost.any() else recording.notes,
+    )
+
+
+def _note_on_gaps(system: System, n_lost: int, gaps: IntArray) -> str:
+    """Say that readings are left out, since cells are missing in the rows `gaps`, counted from 0."""
+    if system.simulator.law is None:
+        return f"{n_lost} readings left out: a column that the simulator reads is missing there"
+    more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
+    return (
+        f"{n_lost} readings left out: a column that the law reads is missing in row {gaps[0] + 2}{more}, "
+        "and a law ends at the first gap of its run; fill the gaps in to use them"
     )
 
 

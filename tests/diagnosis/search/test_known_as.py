@@ -59,3 +59,17 @@ def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formula
     evidences = Evidences({(0, tuple(sorted(each.names))): each for each in (alone, more, best, *others)})
     assert evidences.best_formula_beside(alone, ("outliers",)) is best
     assert evidences.best_formula_beside(others[2], ("outliers",)) is None
+
+
+@pytest.mark.parametrize(
+    ("named", "stays"),
+    [(16.0, True), (14.0, False)],
+    ids=["over half of all that is explained", "less than half"],
+)
+def test_a_name_stays_if_it_explains_more_than_all_that_has_no_name(named, stays):
+    """A gradient of 14 nats, a reflection that adds 10 and an unknown effect that adds 6: 14 of 30 have a name."""
+    white: tuple[str, ...] = ()
+    of_names = {(): 0.0, ("albedo_gradient",): named, ("albedo_gradient", "reflection"): 24.0}
+    fits = {(2, names): SimpleNamespace(evidence={white: SimpleNamespace(log_z=z)}) for names, z in of_names.items()}
+    evidences = Evidences(fits, unknown={(2, ("albedo_gradient", "reflection"), white): 30.0})
+    assert evidences.named_outweigh_unknown(2, ("albedo_gradient", "reflection"), white) is stays

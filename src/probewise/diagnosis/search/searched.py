@@ -58,14 +58,16 @@ class Evidences:
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
 
     def named_outweigh_unknown(self, order: int, names: Names, noise: Names) -> bool:
-        """Return whether named effects gain more evidence over the null than an unknown effect adds to theirs.
+        """Return whether named effects gain more evidence over the null than all that is added to them.
 
-        The comparison is at one SSF order, under one noise model.
+        Added is an unknown effect, and what the names hold out of vocabulary; without a name in vocabulary, the unknown
+        effect alone. The comparison is at one SSF order, under one noise model.
         """
-        if not names or (order, ()) not in self.fits:
+        named = tuple(name for name in names if not is_out_of_vocabulary(name)) or names
+        if not names or not {(order, ()), (order, named)} <= self.fits.keys():
             return False
-        named = self.fits[order, names].evidence[noise].log_z
-        return named - self.fits[order, ()].evidence[noise].log_z > self.unknown[order, names, noise] - named
+        gained = self.fits[order, named].evidence[noise].log_z - self.fits[order, ()].evidence[noise].log_z
+        return gained > self.unknown[order, names, noise] - self.fits[order, named].evidence[noise].log_z
 
     def reported_shares(self, mean: Names) -> dict[Names, float]:
         """Return by which names a combination is reported, with shares of its probability that sum to one.

@@ -228,3 +228,40 @@ def test_what_a_function_changes_in_place_is_its_own(simulate, options):
             own.chain(table, ()).predict(theta, table), plain.chain(table, ()).predict(theta, table), rtol=1e-9
         )
     np.testing.assert_array_equal(theta, before)
+
+
+@pytest.mark.parametrize("run", [None, "cup"], ids=["no run is named", "the function knows the runs"])
+def test_a_loop_over_the_rows_does_not_run_on_into_the_next_recording_where_no_run_is_named(run):
+    """Two cups of coffee in two tables: each is as hot as the first one was when its own recording begins."""
+
+    def cooling(p, data):
+        out, temperature = [], p["start_c"]
+        for k in range(len(data["t_min"])):
+            if k and run is not None and data["cup"][k] != data["cup"][k - 1]:
+                temperature = p["start_c"]
+            out.append(temperature)
+            temperature -= 0.1 * (temperature - 20)
+        return np.array(out)
+
+    minutes = np.arange(5.0)
+    both = RunTable(
+        {"t_min": np.tile(minutes, 2), "cup": np.repeat(["first", "second"], 5), "temp_c": np.zeros(10)},
+        time="t_min",
+        run="cup",
+    )
+    simulator = Simulator("temp_c", "degC", {"start_c": Uniform(80, 95)}, simulate=cooling, time="t_min", run=run)
+    system = System.of(simulator, both)
+    theta = np.array([[85.0], [90.0]])
+    expected = 20 + (theta - 20) * 0.9 ** np.tile(minutes, 2)
+    np.testing.assert_allclose(system.chain(both, ()).predict(theta, both), expected)
+
+
+@pytest.mark.parametrize("vectorized", [False, True])
+def test_a_function_that_draws_random_numbers_is_refused(vectorized):
+    rng = np.random.default_rng(5)
+
+    def noisy(p, data):
+        return p["a"] * data["x"] + p["b"] + rng.normal(0, 0.1, len(data["x"]))
+
+    with pytest.raises(ParameterError, match=r"simulate.*called once more.*no random numbers"):
+        _system(noisy, vectorized=vectorized)

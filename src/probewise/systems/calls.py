@@ -88,7 +88,7 @@ class Caller:
         Raises
         ------
         ParameterError
-            If no reading is finite.
+            If no reading is finite, or another call with the same parameters returns other readings.
         ShapeError
             If it does not return one number per row.
         Exception
@@ -97,12 +97,10 @@ class Caller:
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         if broadcasts:
             together = cls(simulate, broadcasts=True, name=name)
-            if not np.isfinite(_readings_or_nan(together, samples, columns)).any():
-                raise ParameterError(name, "NaN at every place of the prior that was tried", "finite readings")
+            _require_finite_and_repeatable(together, _readings_or_nan(together, samples, columns), samples, columns)
             return together
         alone = one(samples, columns, strict=True)
-        if not np.isfinite(alone).any():
-            raise ParameterError(name, "NaN at every place of the prior that was tried", "finite readings")
+        _require_finite_and_repeatable(one, alone, samples, columns)
         together = cls(simulate, broadcasts=True, name=name)
         try:
             if _nearly_equal(together(samples, columns, strict=True), alone):
@@ -300,6 +298,24 @@ def _readings_or_nan(
         if not np.isfinite(readings).any():
             raise
         return readings
+
+
+def _require_finite_and_repeatable(
+    caller: Caller, readings: FloatArray, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
+) -> None:
+    """Raise ParameterError unless readings hold a finite number, and another call with its sample returns the same."""
+    sound = np.isfinite(readings).any(axis=1)
+    if not sound.any():
+        raise ParameterError(caller.name, "NaN at every place of the prior that was tried", "finite readings")
+    at = int(np.argmax(sound))
+    own = {name: values[[min(at, len(values) - 1)]] for name, values in samples.items()}
+    again = Caller(caller.simulate, caller.broadcasts, caller.by_row, name=caller.name)
+    if not _nearly_equal(again(own, columns, strict=True), readings[[at]]):
+        raise ParameterError(
+            caller.name,
+            "other readings when it is called once more with the same parameters",
+            "the same each time: no random numbers, which the noise of FILE.py stands for, and nothing kept in between",
+        )
 
 
 def _parameters_accepted_by_row(

@@ -94,6 +94,8 @@ class System:
         bare = cls(simulator, table.scan_names)
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])
+            if simulator.run is None:  # it is called for one recording after the other
+                table = table.take(table.rows_by_scan()[0])
             columns = columns_without_reading(simulator, table)
             try:
                 caller = Caller.from_trial_calls(
@@ -283,11 +285,31 @@ class SystemChain:
         columns = self._apply_stage(Stage.INPUT, columns, theta, plan)
         parameters = self._apply_stage(Stage.PARAMETER, system.parameters(theta, plan), theta, plan)
         if system.caller is not None:
-            readings = system.caller(parameters, columns)
+            readings = self._call_for_each_recording(system.caller, parameters, columns, plan)
         else:
             of_rates = self._columns_of_rates(columns, theta, plan)
             readings = self._integrated_readings(parameters, columns, of_rates, theta, plan)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
+
+    def _call_for_each_recording(
+        self, caller: Caller, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], plan: RunTable
+    ) -> FloatArray:
+        """Call `simulate` with the whole table, or with one recording after the other where it knows no runs.
+
+        A user who names no run writes `simulate` for one recording: a loop over its rows would run on into the next.
+        """
+        if self.system.simulator.run is not None or len(plan.scan_names) == 1:
+            return caller(parameters, columns)
+        runs = plan.rows_by_scan()
+
+        def values_in_rows(values: Mapping[str, NDArray[Any]], rows: IntArray) -> dict[str, NDArray[Any]]:
+            return {name: v[..., rows] if np.shape(v)[-1] == len(plan) else v for name, v in values.items()}
+
+        each = [caller(values_in_rows(parameters, rows), values_in_rows(columns, rows)) for rows in runs]
+        out = np.empty((len(each[0]), len(plan)))
+        for rows, readings in zip(runs, each, strict=True):
+            out[:, rows] = readings
+        return out
 
     def _integrated_readings(
         self,

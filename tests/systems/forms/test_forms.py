@@ -422,7 +422,8 @@ def test_a_loop_that_holds_its_input_is_told_from_a_formula_of_the_row():
             out[k] = stays * out[k - 1] + (1 - stays) * u["drive"][k - 1]
         return out
 
-    loop = _about(Simulator("y", "V", {"tau_s": (0.5, 2.0)}, simulate=simulate, time="t_s", noise=Noise(sd=SD)))
+    noise = Noise(sd=SD)
+    loop = _about(Simulator("y", "V", {"tau_s": (0.5, 2.0)}, simulate=simulate, time="t_s", run=TABLE.run, noise=noise))
     assert loop.is_held_between_rows("drive")
     assert not loop.is_held_between_rows("room_c")
     assert not ABOUT.is_held_between_rows("drive")

@@ -19,6 +19,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.system.finer_step import finer_step_for_repair, searched_at_step
 from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
+from probewise.diagnosis.system.prior_conflict import notes_on_prior_conflict
 from probewise.diagnosis.thinning import MOST_READINGS, positions_in_stretches
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
@@ -135,6 +136,8 @@ def prepare_system(
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
+    conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
+    recording = replace(recording, notes=(*recording.notes, *conflicts))
     apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop)
     sorting = sorting_column(apparatus.about)
     if sorting is not None:
@@ -244,7 +247,11 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         out.append(f"simulate raised an error for {caller.n_failed:,} parameter vectors, which count as impossible")
     if caller.interpolated:
         names = ", ".join(sorted(caller.interpolated))
-        out.append(f"simulate takes no array of {names}: readings are interpolated between fixed values")
+        out.append(
+            f"simulate takes no array of {names}: readings are interpolated between fixed values, each as if the "
+            "parameter had always been as it is in its row; where earlier rows act on later ones let simulate take "
+            "arrays, or write a law"
+        )
     return tuple(out)
 
 

@@ -1,0 +1,42 @@
+"""Parameters whose prior the readings contradict: its end is in the way, or its mean is far off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.special import ndtr
+
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.priors import LogUniform, Normal, Uniform
+from probewise.systems import System
+
+_FAR = 4.0  # sds: of 30,000 recordings whose truth is at the end of a prior, one is as far beyond it
+
+
+def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterator[str]:
+    """Yield a note on each parameter of a fitted system, without effects, whose prior the readings contradict.
+
+    What the readings say of a parameter without its own prior is a step of its standard-normal coordinate z from the
+    fit, and the sd of that, both in linear approximation. A bounded prior is linear in its probability: in steps of z
+    its end is as far away as the probability beyond z is large, over the density at z.
+    """
+    slopes = law(found.slopes[:, : system.n_params]) / found.sd
+    z, curvature = found.z[: system.n_params], slopes.T @ slopes + np.eye(system.n_params)
+    downhill = slopes.T @ law(found.residuals[:, None])[:, 0] / found.sd - z
+    for k, (name, prior) in enumerate(system.marginals.items()):
+        own = np.zeros(len(z))
+        own[k] = 1.0
+        without = np.linalg.pinv(curvature - np.outer(own, own), hermitian=True)
+        step, sd = float(without[k] @ (downhill + z[k] * own)), float(np.sqrt(without[k, k]))
+        if isinstance(prior, Uniform | LogUniform):
+            end = float(ndtr(-abs(z[k])) / (np.exp(-0.5 * z[k] ** 2) / np.sqrt(2 * np.pi)))
+            if np.sign(z[k]) * step - end > _FAR * sd:
+                where, more = ("upper", "more") if z[k] > 0 else ("lower", "less")
+                yield f"{name} is at the {where} end of its prior, {prior}, but the readings ask for {more}; widen it"
+        elif isinstance(prior, Normal):
+            away = z[k] + step
+            if abs(away) > _FAR * np.hypot(1, sd):
+                way = "above" if away > 0 else "below"
+                yield f"the readings ask for {name} {abs(away):.1f} sds {way} the mean of its prior, {prior}"

@@ -17,6 +17,7 @@ from probewise.diagnosis import (
     audit_plan_of_diagnosis,
     diagnose,
 )
+from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
@@ -293,6 +294,27 @@ def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():
     said = page._next_readings_in_words(found)
     assert said.startswith("Nothing that is worth the time: the best plan of up to")
     assert "factor of 0.0 nats. It is in next_plan.csv: scan again (8 readings, about 1 minute)." in said
+
+
+def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
+    effects = (("lag",), ("delay",), ("settling",))
+    plan = NextMeasurement(
+        range(8), "scan again", 1.2, 12.3, ("lag", "delay", "settling"), effects, np.full(3, 1 / 3),
+        np.array([[0.0, 0.1, 20.0], [0.1, 0.0, 20.0], [20.0, 20.0, 0.0]]),
+    )  # fmt: skip
+    found = SimpleNamespace(
+        next_measurement=plan,
+        apparatus=SimpleNamespace(words=SimpleNamespace(next_plan="next_plan.csv")),
+        hypotheses=(),
+        judged=SimpleNamespace(unknown_shares={}),
+        repaired=SimpleNamespace(effects=()),
+    )
+    said = page._next_readings_in_words(found)
+    rest = said.partition("Expected to separate ")[2]
+    one, other = rest.split(" from ")
+    assert " or " in one
+    assert " or " not in other
+    assert other.endswith("by 12 nats.")
 
 
 def test_rivals_are_told_in_words_and_a_formula_keeps_its_blanks():

@@ -18,7 +18,7 @@ from probewise.diagnosis.advice.rivals import choose_next_measurement
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
-from probewise.diagnosis.judgement.judged import Judged, judge
+from probewise.diagnosis.judgement.judged import Hypothesis, Judged, judge
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.prepared import Prepared, prepare
@@ -28,7 +28,6 @@ from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples, draw
 from probewise.diagnosis.repair.places import locate_effects_and_residuals
 from probewise.diagnosis.repair.repair import repair_of
 from probewise.diagnosis.residuals.locate import Place
-from probewise.diagnosis.scheduling import WORTHWHILE_NATS
 from probewise.diagnosis.search.formulas import search_with_formulas
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
@@ -37,7 +36,7 @@ from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agr
 from probewise.diagnosis.verdict_report.beyond import formula_of, remainder_of
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
-from probewise.diagnosis.verdict_report.reason import Grounds, combinations_in_reason, reason_of
+from probewise.diagnosis.verdict_report.reason import ALL, NOTHING_MORE, Grounds, combinations_in_reason, reason_of
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.effects.vocabulary import require_effect_classes, sentence_from_samples
 from probewise.progress import Progress, silent
@@ -183,6 +182,7 @@ def _facts_for_reason(
     beside = searched.likeliest_fit_beside_unknown(test.noise)
     formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
     columns = [drawn.best.effect_samples(effect.name) for effect in formulas]
+    settles, apart = _separating_readings_in_words(searched, judged, asked)
     return Grounds(
         words=prepared.apparatus.words,
         n_readings=len(prepared.usable_rows),
@@ -194,27 +194,33 @@ def _facts_for_reason(
         beside=beside.names if beside else (),
         shows_in=tuple(place.covariate for place in where),
         p_value_after=best.improvement.p_value_after,
-        settles=_separating_readings_in_words(searched, judged, asked),
+        settles=settles,
+        apart=apart,
     )
 
 
-def _separating_readings_in_words(searched: Searched, judged: Judged, asked: NextMeasurement | None) -> str | None:
-    """Return the next readings in words if they separate the hypotheses that the reason names; "" if none do.
+def _separating_readings_in_words(
+    searched: Searched, judged: Judged, asked: NextMeasurement | None
+) -> tuple[str | None, str]:
+    """Return `settles` and `apart` of `Grounds`: the next readings, and which hypotheses of the reason they separate.
 
-    None if that is not known: these hypotheses differ in their noise alone, or are not among those compared.
+    Nothing is known of hypotheses that differ in their noise alone, or that are not among those compared.
     """
     formulas = {names for names in asked.effects if effects_out_of_vocabulary(names)} if asked else set()
-    named = set[Names]()
+    named: dict[Names, str] = {}
     for names in combinations_in_reason(judged):
         if names == ("unknown",):  # without a formula it predicts what the null does
-            named |= formulas or {()}
+            named |= dict.fromkeys(formulas or {()}, "unknown")
         else:
-            named.add(tuple(sorted({*names} - searched.prepared.noise_effect_names)))
+            beside = tuple(sorted({*names} - {*judged.shared}))
+            label = Hypothesis(beside, 0.0).label if beside or not judged.shared else NOTHING_MORE
+            named.setdefault(tuple(sorted({*names} - searched.prepared.noise_effect_names)), label)
     if len(named) < 2:
-        return None
-    if asked is None:
-        return ""
-    nats = asked.nats_among(named)
-    if nats is None:
-        return None
-    return asked.description if nats >= WORTHWHILE_NATS else ""
+        return None, ""
+    classes = asked.classes_among(named) if asked is not None else []
+    if asked is None or len(classes) == 1 < len(classes[0]):
+        return "", ""
+    if sum(map(len, classes)) < 2:
+        return None, ""
+    labels = [" or ".join(dict.fromkeys(named[asked.effects[k]] for k in own)) for own in classes]
+    return asked.description, ALL if max(map(len, classes)) == 1 else " from ".join(dict.fromkeys(labels))

@@ -285,7 +285,8 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
         )
     said = f"{description}: {asked}, {file}."
     rivals = [_hypothesis_label_in_words(label, _names_by_spoken_name(diagnosis)) for label in plan.between]
-    separated = " from ".join(rivals) if len(rivals) == 2 else join_lists(rivals)
+    classes = [join_lists([rivals[k] for k in own], "or") for own in plan.classes_among(plan.effects)]
+    separated = " from ".join(classes) if len(classes) == 2 else join_lists(classes)
     nats = number_text(told, 0 if told >= 10 else 1)
     return f"{said[:1].upper()}{said[1:]} Expected to separate {separated} by {nats} nats."
 

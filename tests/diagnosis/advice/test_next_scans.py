@@ -103,18 +103,23 @@ def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
     np.testing.assert_allclose(read.x_mm, asked.plan.x_mm, atol=1e-9)
 
 
-def test_readings_are_said_to_separate_some_hypotheses_by_what_they_tell_of_those():
-    """Of three, two predict the same: these are not separated, and each of them is from the third."""
+def test_readings_separate_hypotheses_into_classes():
+    """Of three, two predict the same: these are in one class, and what is promised is to tell it from the third."""
     plan = paper_plan()
     lag, play = rival("lag", 0.4, [0.5], plan), rival("backlash", 0.2, [0.84], plan)
     same = replace(play, model=replace(play.model, effects=(replace(play.model.effects[0]),)))
     object.__setattr__(same.model.effects[0], "name", "twin")
     asked = measurement_separating_rivals([lag, play, same], 0.4, plan, LightSensorApparatus())
     assert asked is not None
-    assert asked.nats_among([("backlash",), ("twin",)]) == pytest.approx(0.0, abs=1e-6)
-    assert asked.nats_among([("lag",), ("twin",)]) > 3
-    assert asked.nats_among([("lag",), ("glint",)]) is None
-    assert asked.expected_log_bayes_factor == pytest.approx(asked.nats_among(asked.effects))
+    assert asked.classes_among(asked.effects) == [[0], [1, 2]]
+    assert asked.classes_among([("backlash",), ("twin",)]) == [[1, 2]]
+    assert asked.classes_among([("lag",), ("twin",)]) == [[0], [2]]
+    assert asked.classes_among([("lag",), ("glint",)]) == [[0]]
+    apart = np.array([asked.nats[0, 1:].min(), asked.nats[1, 0], asked.nats[2, 0]])
+    assert asked.expected_log_bayes_factor == pytest.approx(asked.probabilities @ apart)
+    assert apart.min() > 3
+    both = measurement_separating_rivals([play, same], 0.4, plan, LightSensorApparatus())
+    assert both is None or both.expected_log_bayes_factor == pytest.approx(0.0, abs=1e-6)
 
 
 def test_lag_against_backlash_wants_the_other_way():

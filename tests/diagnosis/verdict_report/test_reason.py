@@ -74,6 +74,12 @@ SAID = [
     ),
     (
         judged("cannot_tell"),
+        {"settles": "repeat run 2", "apart": "lag or clean from unknown"},
+        "These 100 readings cannot tell apart lag (0.70), clean (0.20) and unknown (0.10); to tell lag or clean from "
+        "unknown: repeat run 2.",
+    ),
+    (
+        judged("cannot_tell"),
         {"settles": ""},
         "These 100 readings cannot tell apart lag (0.70), clean (0.20) and unknown (0.10); no reading tells them "
         "apart.",

@@ -8,9 +8,9 @@ added greedily by information per minute, as long as there is information to gai
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, permutations
 
 import numpy as np
 from scipy.special import logsumexp
@@ -20,7 +20,7 @@ from probewise.diagnosis.advice.new_runs import slopes_split_by_run
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.scheduling import MOST_READINGS, Command, rows_by_command
+from probewise.diagnosis.scheduling import MOST_READINGS, WORTHWHILE_NATS, Command, rows_by_command
 from probewise.recordings.plan import Plan
 
 _STRIDES = (2, 4)
@@ -38,9 +38,9 @@ class NextMeasurement:
     """Scans to take next, as one plan, with the information that they are expected to give.
 
     `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
-    true. `between`: each of the hypotheses, in words; `effects`: the effects of each; `probabilities`: of each, as used
-    here, (n_rivals,); `nats` (n_rivals, n_rivals): expected log Bayes factor of each, if true, over each other.
-    `minutes`: duration with breaks.
+    true; rivals that the readings cannot tell apart count as one. `between`: each of the hypotheses, in words;
+    `effects`: the effects of each; `probabilities`: of each, as used here, (n_rivals,); `nats` (n_rivals, n_rivals):
+    expected log Bayes factor of each, if true, over each other. `minutes`: duration with breaks.
     """
 
     plan: Plan
@@ -52,13 +52,13 @@ class NextMeasurement:
     probabilities: FloatArray
     nats: FloatArray
 
-    def nats_among(self, hypotheses: Collection[Names]) -> float | None:
-        """Return the expected log Bayes factor of the true one of some of the hypotheses over its closest rival there.
+    def classes_among(self, hypotheses: Collection[Names]) -> list[list[int]]:
+        """Return the classes into which the readings separate some of the hypotheses, by their indices in `effects`.
 
-        None if fewer than two of them were compared.
+        Two are in one class if the expected log Bayes factor of either over the other is not worth the readings, or if
+        each is so alike to a third. Hypotheses that were not compared are in none.
         """
-        at = [k for k, names in enumerate(self.effects) if names in hypotheses]
-        return None if len(at) < 2 else _mean_over_closest(self.nats[np.ix_(at, at)], self.probabilities[at])
+        return _classes_told_apart(self.nats, [k for k, names in enumerate(self.effects) if names in hypotheses])
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +183,7 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
     covariances = [predictive.covariance for predictive in predictives]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
     distances = np.zeros((len(predictives), len(predictives)))
-    for a, b in combinations(range(len(predictives)), 2):
+    for a, b in itertools.combinations(range(len(predictives)), 2):
         middle, apart = (covariances[a] + covariances[b]) / 2, predictives[a].mean - predictives[b].mean
         log_det = np.linalg.slogdet(middle)[1] - (log_dets[a] + log_dets[b]) / 2
         distances[a, b] = distances[b, a] = apart @ np.linalg.solve(middle, apart) / 8 + log_det / 2
@@ -203,7 +203,7 @@ def _shortlisted_command_indices(
     model = replace(leader.model, plan=everywhere)
     of_run = model.predict_and_differentiate(leader.z, by=leader.of_run)[1] / sd if leader.of_run.size else None
     kept: dict[int, None] = {}
-    for a, b in combinations(range(len(rivals)), 2):
+    for a, b in itertools.combinations(range(len(rivals)), 2):
         apart = means[a] - means[b]
         squares = [_squared_distance(apart[own], None if of_run is None else of_run[own]) for own in rows]
         # Separation beyond this adds nothing.
@@ -230,14 +230,29 @@ def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> Floa
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
     out = np.zeros((len(predictives), len(predictives)))
-    for a, b in permutations(range(len(predictives)), 2):
+    for a, b in itertools.permutations(range(len(predictives)), 2):
         apart = predictives[a].mean - predictives[b].mean
         trace = float(np.sum(inverse[b] * covariances[a])) - len(apart)
         out[a, b] = 0.5 * (trace + log_dets[b] - log_dets[a] + apart @ inverse[b] @ apart)
     return out
 
 
+def _classes_told_apart(nats: FloatArray, members: Sequence[int]) -> list[list[int]]:
+    """Return classes of members whose expected log Bayes factors, `nats` (n, n), are not worth further readings."""
+    classes: list[list[int]] = []
+    for k in members:
+        alike = [own for own in classes if any(min(nats[k, j], nats[j, k]) < WORTHWHILE_NATS for j in own)]
+        classes = [own for own in classes if own not in alike] + [sorted([k, *itertools.chain(*alike)])]
+    return sorted(classes)
+
+
 def _mean_over_closest(nats: FloatArray, weights: FloatArray) -> float:
-    """Return the log Bayes factor of the truth over its closest rival, averaged by weights (n,); `nats` (n, n)."""
+    """Return the log Bayes factor of the truth over its closest rival, averaged by weights (n,); `nats` (n, n).
+
+    Rivals in one class count as one, unless all are.
+    """
+    classes = _classes_told_apart(nats, range(len(nats)))
     others = np.where(np.eye(len(nats), dtype=np.bool_), np.inf, nats)
+    for own in classes if len(classes) > 1 else []:
+        others[np.ix_(own, own)] = np.inf
     return max(float(weights @ others.min(axis=1) / weights.sum()), 0.0)

@@ -13,8 +13,12 @@ from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import spoken_name
 
-TO_SEPARATE = "; to tell them apart: "
+TO_SEPARATE = "; to tell "
 """Introduces the next readings in the reason of `cannot_tell`."""
+ALL = "them apart"
+"""What they tell if they separate all hypotheses that the reason names."""
+NOTHING_MORE = "nothing more"
+"""The hypothesis of no effect beside those that are certain."""
 
 _WORTH_NAMING = 0.01  # least probability of a third rival
 
@@ -46,6 +50,8 @@ class Grounds:
     settles
         The readings that would separate the hypotheses that the sentence names, in words; "" if no such readings do,
         None if that is not known.
+    apart
+        Which of these hypotheses they separate, in words.
     nuisances
         Sentences on the noise that was found beside what has a name in the vocabulary.
     """
@@ -61,6 +67,7 @@ class Grounds:
     shows_in: tuple[str, ...] = ()
     p_value_after: float = 1.0
     settles: str | None = None
+    apart: str = ALL
     nuisances: tuple[str, ...] = ()
 
 
@@ -128,7 +135,7 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
 def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
     cure = "" if grounds.settles is None else f"; {grounds.words.settles_nothing}"
     if grounds.settles:
-        cure = f"{TO_SEPARATE}{grounds.settles}"
+        cure = f"{TO_SEPARATE}{grounds.apart}: {grounds.settles}"
     said = _joined_effect_sentences(judged.shared, grounds)
     if said:
         return f"{said}. {_open_beside_shared(judged, grounds)}{cure}."
@@ -137,7 +144,7 @@ def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
 
 def _open_beside_shared(judged: Judged, grounds: Grounds) -> str:
     """Say what these readings cannot tell beside the effects that nearly all hypotheses share, without a full stop."""
-    beside = _rivals_in_words(judged.beside_shared, nothing="nothing more")
+    beside = _rivals_in_words(judged.beside_shared, nothing=NOTHING_MORE)
     return f"Beside that, these {grounds.n_readings} readings cannot tell apart {beside}"
 
 

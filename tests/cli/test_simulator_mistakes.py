@@ -41,7 +41,9 @@ FILES = {
     "an error at every place": (
         ("return p", "raise ValueError('too hot')\n    return p"), "line 10: simulate raises ValueError: too hot",
     ),
-    "a control that the table lacks": (('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'"),
+    "a control that the table lacks": (
+        ('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'; allowed: a column that can be set: power_w",
+    ),
     "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
     "a zero that is no number": (('"sd": 0.05', '"zero": "0.5"'), "noise[\"zero\"] is '0.5'; allowed: a finite number"),
     "a zero that is NaN": (('"sd": 0.05', '"zero": float("nan")'), 'noise["zero"] is nan; allowed: a finite number'),
@@ -197,3 +199,10 @@ def test_a_reading_that_is_not_available_is_left_out(tmp_path):
     file.write_text(FILE)
     table.write_text(cell(5, "temp_c", "n/a"))
     assert main(["diagnose", str(table), "--simulator", str(file), "--out", str(out), "--quiet"]) == 0
+
+
+def test_a_second_table_whose_reading_is_misspelt_is_refused(capsys, tmp_path):
+    more = tmp_path / "more.csv"
+    more.write_text(run_table_csv(runs()).replace("temp_c", "temp"))
+    said = refused(capsys, tmp_path, FILE, more=[str(more)])
+    assert "more.csv: no column 'temp_c'; allowed: the reading, as in data.csv; has 'run', 't_s'" in said

@@ -85,9 +85,10 @@ class System:
             raise ParameterError(
                 'noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}"
             )
+        settable = [name for name in table.columns if name not in (simulator.reading, simulator.time, simulator.run)]
         for name in simulator.controls:
             if name not in table.columns:
-                raise ParameterError("controls", name, f"a column of the table: {', '.join(table.columns)}")
+                raise ParameterError("controls", name, f"a column that can be set: {', '.join(settable)}")
         if not columns_without_reading(simulator, table):
             allowed = "a column besides the reading, such as the time or the number of each row"
             raise ParameterError("columns", list(table.columns), allowed)

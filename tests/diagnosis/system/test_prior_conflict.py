@@ -40,3 +40,19 @@ def test_a_prior_that_excludes_what_the_readings_say_is_told(prior, words):
 def test_a_wide_prior_and_one_that_ends_at_the_truth_are_not(prior, slope, seed):
     """By chance a best value is four sds beyond an end at the truth in 3e-5 of recordings, by far the most of these."""
     assert not _notes(prior, slope=slope, seed=seed)
+
+
+@pytest.mark.parametrize(("declared", "told"), [(0.5, True), (2.0, True), (SD, False), (None, False)])
+def test_a_noise_that_is_not_as_it_was_declared_is_told(declared, told):
+    """Of 400 readings the sd is known to a thirtieth."""
+    rng, x = np.random.default_rng(8), np.linspace(1, 20, 400)
+    simulator = Simulator(
+        "strain_ue",
+        "ue",
+        {"per_n": (0, 5)},
+        simulate=lambda p, data: p["per_n"] * data["pull_n"],
+        noise={"sd": declared},
+    )
+    table = {"pull_n": x, "strain_ue": SLOPE * x + rng.normal(0, SD, len(x))}
+    notes = fit_simulator(simulator, table, rng=rng).recording.notes
+    assert sum("the noise sd of a reading is " in note and "was declared" in note for note in notes) == told

@@ -19,7 +19,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.system.finer_step import finer_step_for_repair, searched_at_step
 from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
-from probewise.diagnosis.system.prior_conflict import notes_on_prior_conflict
+from probewise.diagnosis.system.prior_conflict import notes_on_declared_noise, notes_on_prior_conflict
 from probewise.diagnosis.thinning import MOST_READINGS, positions_in_stretches
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
@@ -228,16 +228,17 @@ def without_readings_at_stop(
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return notes on a simulator's calls: search cut short, failed calls, parameters not taken as arrays; else ()."""
+    """Return notes on a simulator's calls (cut short, failed, by fixed values) and its declared noise; else ()."""
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
+    white = diagnosis.report.noise.model == "white"
+    out = [*notes_on_declared_noise(apparatus.system.simulator, diagnosis.repaired.noise_sd)] if white else []
     caller, tally = apparatus.system.caller, apparatus.system.tally
     if caller is None:
         law = apparatus.system.simulator.law
         sets_step = law is not None and law.max_step_s is not None
-        return tuple(_notes_on_integration(tally, apparatus.evaluations_of_a_search, sets_step=sets_step))
-    out = []
+        return (*out, *_notes_on_integration(tally, apparatus.evaluations_of_a_search, sets_step=sets_step))
     if caller.cut_short:
         out.append(
             f"simulate takes one sample at a time: in {CALLS_OF_A_SEARCH:,} calls not every combination of effects "

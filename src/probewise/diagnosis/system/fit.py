@@ -29,6 +29,7 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.diagnosis.system.fitted import fitted_system_from_samples, recorded_table_if_needed
+from probewise.diagnosis.system.prior_conflict import notes_on_declared_noise
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
@@ -152,6 +153,9 @@ def fit_simulator(
             prepared, null, noise, samples, evidence, rng=rng, progress=progress
         )
     recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
+    recording = replace(
+        recording, notes=(*recording.notes, *notes_on_declared_noise(simulator, np.asarray(samples.noise_sd)))
+    )
     predicted = samples.chain.predict(samples.theta, recording.plan)
     sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2) * recording.relative_sd**2)
     known = recorded_table_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)

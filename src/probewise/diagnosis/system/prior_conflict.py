@@ -1,4 +1,4 @@
-"""Parameters whose prior the readings contradict: its end is in the way, or its mean is far off."""
+"""What the readings contradict of what is known before: the end or mean of a parameter's prior, a declared noise sd."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import ndtr
 
+from probewise._arrays import FloatArray
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.priors import LogUniform, Normal, Uniform
-from probewise.systems import System
+from probewise.systems import Simulator, System
 
 _FAR = 4.0  # sds: of 30,000 recordings whose truth is at the end of a prior, one is as far beyond it
+_MUCH = 1.1  # factor by which the noise differs from what was declared
 
 
 def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterator[str]:
@@ -40,3 +42,14 @@ def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterat
             if abs(away) > _FAR * np.hypot(1, sd):
                 way = "above" if away > 0 else "below"
                 yield f"the readings ask for {name} {abs(away):.1f} sds {way} the mean of its prior, {prior}"
+
+
+def notes_on_declared_noise(simulator: Simulator, noise_sd: FloatArray) -> Iterator[str]:
+    """Yield a note if samples of the noise sd, (n_samples,), contradict the number that was declared."""
+    declared = simulator.noise.sd
+    if declared is None or isinstance(declared, str):
+        return
+    mean, sd = float(np.mean(noise_sd)), float(np.std(noise_sd))
+    if abs(mean - declared) > max(_FAR * sd, (_MUCH - 1) * declared):
+        unit = f" {simulator.unit}" if simulator.unit else ""
+        yield f"the noise sd of a reading is {mean:.3g} ± {sd:.1g}{unit}, though {declared:g} was declared"

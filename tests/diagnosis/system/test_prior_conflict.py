@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import fit_simulator
-from probewise.systems import Noise, Simulator
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.systems import Noise, Simulator, table_for
 
 X = np.linspace(1, 20, 40)
 SLOPE, SD = 1.8, 1.0
@@ -16,7 +17,8 @@ def _notes(prior, *, slope=SLOPE, seed=3):
         "strain_ue", "ue", {"per_n": prior}, simulate=lambda p, data: p["per_n"] * data["pull_n"], noise=Noise(sd=SD)
     )
     table = {"pull_n": X, "strain_ue": slope * X + rng.normal(0, SD, len(X))}
-    return [note for note in fit_simulator(simulator, table, rng=rng).recording.notes if "prior" in note]
+    prepared = prepare_system(simulator, table_for(simulator, table), with_effects=False)
+    return [note for note in prepared.recording.notes if "prior" in note]
 
 
 @pytest.mark.parametrize(

@@ -106,6 +106,19 @@ def test_a_product_of_columns_alone_is_unknown_with_its_formula():
     assert low < 0.001 < high
 
 
+@pytest.mark.slow
+def test_a_product_beside_both_of_its_columns_is_what_remains():
+    """Without a mean taken off, most of a product is an influence of each column, and these have names."""
+    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * temp * damp)
+    found = diagnose_prepared(prepared, rng=np.random.default_rng(1))
+    assert {name.rpartition(":")[2] for name in found.combination} == {"temp", "damp"}
+    remainder = found.report.remainder
+    assert remainder is not None
+    assert remainder.formula is not None
+    low, high = remainder.formula.parameters[0].interval95
+    assert low < 0.001 < high
+
+
 def test_products_are_of_time_and_the_columns_that_vary_most():
     """A column of few values gives way; the reading, the run and what is predicted are no columns of a product."""
     rng = np.random.default_rng(2)

@@ -106,6 +106,10 @@ class Apparatus(Protocol):
         """
         ...
 
+    def multiplied_covariates(self, covariates: Sequence[Covariate]) -> Sequence[Covariate]:
+        """Choose, from the covariates of the readings, those of which a product of two may be an unknown effect."""
+        ...
+
     def covariate_of_effect(
         self,
         effect: NamedEffect[Any],

@@ -11,7 +11,12 @@ from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.light_sensor.covariates import varying_covariates
 from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named
+from probewise.diagnosis.residuals.bases import (
+    PRODUCTS,
+    bank_of_unknown_effects,
+    bases_unlike_named,
+    without_products_like,
+)
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.recordings import two_way_plan
 
@@ -88,3 +93,41 @@ def test_what_a_name_describes_is_no_unknown():
     assert [bool(np.any(left[k])) for k in of_runs] == [False] + [True] * (len(of_runs) - 1)
     factors = left.log_bayes_factors(problem)[:, 0]
     assert factors[of_runs[0]] < -40
+
+
+def _three_columns_and_bases():
+    """Return three columns, (3, 200), of 190, 200 and 200 rows, and the bases with and without their products."""
+    rng = np.random.default_rng(8)
+    columns = rng.normal([[20.0], [45.0], [1e-9]], [[3.0], [9.0], [1e-10]], (3, 200))
+    rows = [np.arange(10, 200), np.arange(200), np.arange(200)]
+    covariates = [Covariate(name, c[at], at) for name, c, at in zip("abc", columns, rows, strict=True)]
+    level = rng.random(200)
+    apart = bank_of_unknown_effects(covariates, level, np.gradient(level), None)
+    return columns, bank_of_unknown_effects(covariates, level, np.gradient(level), None, multiplied=covariates), apart
+
+
+def test_products_of_two_columns_are_one_family_that_no_function_of_one_imitates():
+    columns, bases, apart = _three_columns_and_bases()
+    assert PRODUCTS not in apart.labels
+    products = [bases[int(k)][:, 0] for k in bases.indices_by_label[PRODUCTS]]
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    centred[0] = np.where(np.arange(200) < 10, 0.0, columns[0] - columns[0, 10:].mean())
+    for product, (first, second) in zip(products, [(0, 1), (0, 2), (1, 2)], strict=True):
+        wanted = centred[first] * centred[second]
+        assert np.corrcoef(product, wanted)[0, 1] == pytest.approx(1.0)
+        assert np.all(product[:10] == 0) == (first == 0)
+        every = [apart[k] for k in range(len(apart.widths))]
+        left = [np.sum((wanted - t @ np.linalg.lstsq(t, wanted)[0]) ** 2) / np.sum(wanted**2) for t in every]
+        assert min(left) > 0.7
+
+
+def test_a_product_that_is_a_formula_is_no_basis():
+    """The other bases stay, whatever the formula: they are no formulas."""
+    columns, bases, apart = _three_columns_and_bases()
+    a, b, _ = columns - columns.mean(axis=1, keepdims=True)
+    problem = Linearised(np.ones((200, 1)) / np.sqrt(200), np.zeros(200), white_noise(200), 1.0, 200)
+    formulas = [(a * b)[:, None], apart[0]]
+    left = without_products_like(bases, TemplateBank.of(formulas, ["formula", "other"], 200), problem)
+    assert left.labels.count(PRODUCTS) == bases.labels.count(PRODUCTS) - 1
+    assert len(left.labels) == len(bases.labels) - 1
+    assert without_products_like(apart, TemplateBank.of(formulas, ["formula", "other"], 200), problem) is apart

@@ -1,12 +1,16 @@
 """Formulas for what has no name: proposed where two names would stand in for one."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from probewise.diagnosis.engine import diagnose_prepared
 from probewise.diagnosis.judgement.global_test import run_global_test
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.search.formulas import needs_more_than_memoryless_noise
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Posterior
@@ -67,6 +71,68 @@ def test_a_product_of_columns_is_no_pair_of_names():
     (product,) = [e for e in found.repaired.chain.effects if e.name.startswith("formula:")]
     assert "damp" in product.expression
     assert "room" in product.expression
+
+
+def _prepared_with_climate(change, *, seed=5, **more):
+    """Prepare a line in x, read in a room whose temperature and humidity change it as the simulator does not say."""
+    rng = np.random.default_rng(seed)
+    temp, damp, x = 20 + 4 * rng.normal(size=150), 40 + 12 * rng.normal(size=150), rng.uniform(0, 1, 150)
+    y = 1.0 + 2.0 * x + change(temp, damp) + SD * rng.normal(size=150)
+    columns = {"lot": np.repeat([1.0, 2.0, 3.0], 50), "x": x, "temp": temp, "damp": damp, **more, "y": y}
+    simulator = Simulator(
+        "y", "V", {"a": (-5, 5), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], run="lot"
+    )
+    return prepare_system(simulator, table_for(simulator, columns))
+
+
+def test_a_product_of_columns_alone_is_no_noise():
+    """Neither column drives the simulator, and neither acts alone: no function of one of them shows the product."""
+    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * (temp - 20) * (damp - 40))
+    searched = search(prepared, depth=0)
+    assert run_global_test(searched, rng=np.random.default_rng(1)).p_value < 0.001
+    assert searched.posterior.marginal_over_noise["unknown",] > 0.9
+
+
+@pytest.mark.slow
+def test_a_product_of_columns_alone_is_unknown_with_its_formula():
+    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * (temp - 20) * (damp - 40))
+    found = diagnose_prepared(prepared, rng=np.random.default_rng(1))
+    assert found.verdict == "unknown"
+    formula = found.report.formula
+    assert formula is not None
+    assert formula.side == "reading"
+    assert re.fullmatch(r"a \(temp - [\d.]+\) \(damp - [\d.]+\)", formula.expression)
+    low, high = formula.parameters[0].interval95
+    assert low < 0.001 < high
+
+
+@pytest.mark.slow
+def test_a_product_beside_both_of_its_columns_is_what_remains():
+    """Without a mean taken off, most of a product is an influence of each column, and these have names."""
+    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * temp * damp)
+    found = diagnose_prepared(prepared, rng=np.random.default_rng(1))
+    assert {name.rpartition(":")[2] for name in found.combination} == {"temp", "damp"}
+    remainder = found.report.remainder
+    assert remainder is not None
+    assert remainder.formula is not None
+    low, high = remainder.formula.parameters[0].interval95
+    assert low < 0.001 < high
+
+
+def test_products_are_of_time_and_the_columns_that_vary_most():
+    """A column of few values gives way; the reading, the run and what is predicted are no columns of a product."""
+    rng = np.random.default_rng(2)
+    more = {f"c{k}": rng.random(150) for k in range(8)} | {"bench": rng.integers(1, 4, 150).astype(float)}
+    prepared = _prepared_with_climate(lambda temp, damp: 0.0, **more)
+    found = search(prepared, depth=0).misfit_templates.covariates
+    assert {"level", "row", "run", "bench"} <= {c.name for c in found}
+    chosen = [c.name for c in prepared.apparatus.multiplied_covariates(found)]
+    assert chosen == ["x", "temp", "damp", *(f"c{k}" for k in range(7))]
+
+
+def test_a_light_sensor_multiplies_no_columns():
+    columns = [Covariate(name, np.arange(5.0), np.arange(5)) for name in ("battery_mv", "room_c")]
+    assert LightSensorApparatus().multiplied_covariates(columns) == ()
 
 
 @pytest.mark.parametrize(

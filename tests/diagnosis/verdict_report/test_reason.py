@@ -102,6 +102,11 @@ SAID = [
     ),
     (
         judged("unknown", ("unknown",)),
+        {"family": "products of two columns", "shows_in": ("time",)},
+        "Something is missing (p = 0.0001) that no named effect explains; it varies as a product of two columns.",
+    ),
+    (
+        judged("unknown", ("unknown",)),
         {"family": "edge_distance, far out"},
         "Outlying readings cluster in edge distance: something is missing there (a test of the mean alone, which takes "
         "them for heavy-tailed noise, gives p = 0.0001).",

@@ -86,6 +86,10 @@ class LightSensorApparatus:
         slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
+    def multiplied_covariates(self, covariates: Sequence[Covariate]) -> tuple[Covariate, ...]:
+        """Return no covariates: what an arm logs beside the readings is not known to act by products."""
+        return ()
+
     takes_one_measurement_at_a_time = False  # a plan names its scans
     prior_odds = staticmethod(PriorOdds.for_effects)
     covariate_of_effect = staticmethod(covariate_of_effect)

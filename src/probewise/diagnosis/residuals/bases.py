@@ -4,13 +4,15 @@ A mismatch that depends smoothly on a covariate adds to the readings, multiplies
 there are smooth functions of covariates: alone, times the signal, and times the slope of the readings along the
 motion; over time and place all three, over another covariate those that make sense. Other bases are steps (change
 points) over time and place, windows, one value per scan or angle, memories of earlier readings, and transients at the
-ends of scans.
+ends of scans. Where columns are logged beside the readings, products of two are bases too: a function of one column
+cannot imitate a product of two that vary independently.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -18,6 +20,9 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.residuals.covariate import Covariate
+
+PRODUCTS = "products of two columns"
+"""The family of products of covariates."""
 
 _LIKE = 0.9  # cosine from which a basis duplicates a named effect
 _MOST_GROUPS = 24
@@ -42,7 +47,12 @@ class _BasisMultipliers:
 
 
 def bank_of_unknown_effects(
-    covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, scan: IntArray | None
+    covariates: Sequence[Covariate],
+    signal: FloatArray,
+    slope: FloatArray,
+    scan: IntArray | None,
+    *,
+    multiplied: Sequence[Covariate] = (),
 ) -> TemplateBank:
     """Build the template bank of unknown effects: basis functions over every covariate.
 
@@ -55,6 +65,8 @@ def bank_of_unknown_effects(
     scan
         Number of each usable row's scan, (n_usable,); rows of scans may be mixed. None: rows are in no order, and
         nothing depends on the rows before.
+    multiplied
+        Covariates of which the product of every two is a basis; all products are one family.
 
     Returns
     -------
@@ -74,6 +86,7 @@ def bank_of_unknown_effects(
         for covariate in covariates
         for template in _bases_of_covariate(covariate, ways)
     ]
+    found += [(PRODUCTS, template) for template in _product_bases(multiplied, len(signal))]
     if scan is not None:
         found += [("what was seen before", template[back]) for template in _memory_bases(signal[order], starts)]
         found += [("ends of scans", template[back]) for template in _scan_end_bases(len(signal), starts)]
@@ -91,13 +104,32 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
     """
     if bases.widths.size == 0 or named.widths.size == 0:
         return bases
-    blocks = OrthonormalBlocks.of(problem, [named[k] for k in range(len(named.widths))])
-    own = OrthonormalBlocks.of(problem, [bases[k] for k in range(len(bases.widths))])
+    blocks, own = _orthonormal_blocks(named, problem), _orthonormal_blocks(bases, problem)
     single = np.flatnonzero(bases.widths == 1)
-    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own.u[:, own.starts[single]]) ** 2, blocks.starts, axis=0))
-    kept = np.setdiff1d(np.arange(len(bases.widths)), single[cosines.max(axis=0) >= _LIKE])
+    kept = np.setdiff1d(np.arange(len(bases.widths)), single[_are_held(own.u[:, own.starts[single]], blocks)])
     twins = np.repeat(_have_span_of_some(own, blocks), bases.widths)
     return replace(bases, columns=np.where(twins, 0.0, bases.columns)).take_templates(kept)
+
+
+def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: Linearised) -> TemplateBank:
+    """Return the bases without the products that a template of a formula holds, the fit's parameters projected out."""
+    products = bases.indices_by_label.get(PRODUCTS, np.zeros(0, dtype=np.int64))
+    if products.size == 0 or formulas.widths.size == 0:
+        return bases
+    held = _are_held(
+        _orthonormal_blocks(bases.take_templates(products), problem).u, _orthonormal_blocks(formulas, problem)
+    )
+    return bases.take_templates(np.setdiff1d(np.arange(len(bases.widths)), products[held]))
+
+
+def _orthonormal_blocks(bank: TemplateBank, problem: Linearised) -> OrthonormalBlocks:
+    return OrthonormalBlocks.of(problem, [bank[k] for k in range(len(bank.widths))])
+
+
+def _are_held(columns: FloatArray, blocks: OrthonormalBlocks) -> BoolArray:
+    """Return which orthonormal columns, (n_rows, n_columns), have a cosine of 0.9 or more with the span of a block."""
+    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ columns) ** 2, blocks.starts, axis=0))
+    return np.asarray(cosines.max(axis=0) >= _LIKE)
 
 
 def _have_span_of_some(blocks: OrthonormalBlocks, others: OrthonormalBlocks) -> BoolArray:
@@ -181,6 +213,14 @@ def _group_bases(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[Floa
         yield member * way[:, None]
     for way in (ways.adds, ways.shift):
         yield from (column[:, None] * way[:, None] for column in member.T)
+
+
+def _product_bases(covariates: Sequence[Covariate], n_points: int) -> Iterator[FloatArray]:
+    """Yield the product of each two covariates, both centred and scaled: 0 where either is missing."""
+    scaled = [
+        _on_all_rows(((c.values - c.values.mean()) / (c.values.std() or 1.0))[:, None], c, n_points) for c in covariates
+    ]
+    yield from (first * second for first, second in combinations(scaled, 2))
 
 
 def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:

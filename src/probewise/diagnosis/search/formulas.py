@@ -22,7 +22,7 @@ from probewise.progress import Progress, silent
 _LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
 _MOST = 8  # formulas that are refitted
 # Nats behind the best of what was refitted, within which screening must see a formula: alone, where an effect of
-# hundreds of nats is seen wrongly by a dozen, and beside the best single effect, whose fit is near.
+# hundreds of nats is seen wrongly by a dozen, and beside the best single effect or the leader, whose fits are near.
 _WITHIN_ALONE = 12.0
 _WITHIN_BESIDE = 3.0
 
@@ -65,14 +65,18 @@ def needs_more_than_memoryless_noise(searched: Searched) -> bool:
 
 
 def _promise_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
-    """Return, by formula, its log evidence by screening, added to the null or to the best single effect, if larger.
+    """Return, by formula, its largest log evidence by screening, added to the null, the best single effect, the leader.
 
-    The log prior of that null or effect is included, that of the formula is not; with it come the nats by which it may
-    be behind.
+    The leader is the most probable combination. The log prior of what the formula is added to is included, that of the
+    formula is not; with it come the nats by which it may be behind.
     """
     usable, null = searched.prepared.usable_rows, searched.null
     singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]
-    parents = [(null, _WITHIN_ALONE), *((fit, _WITHIN_BESIDE) for fit in sorted(singles, key=lambda f: -f.log_z)[:1])]
+    fits = sorted(singles, key=lambda f: -f.log_z)[:1]
+    leader = max(searched.evidences.fits.values(), key=lambda f: f.log_z + searched.prior.log_prior_on_mean(f.names))
+    if len(leader.names) > 1:
+        fits.append(leader)
+    parents = [(null, _WITHIN_ALONE), *((fit, _WITHIN_BESIDE) for fit in fits)]
     memory, out = TemplateCache(usable), dict[str, float]()
     bank: TemplateBank = memory.coarse_bank(null.found, list(proposals.values()))
     for parent, within in parents:

@@ -7,16 +7,15 @@ unknown effect. Templates screen them; a beam of the best is refitted jointly an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
-from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named
-from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
 from probewise.diagnosis.search.backward_elimination import eliminate_backward
 from probewise.diagnosis.search.constants import (
     EXTENDED_WITHIN,
@@ -38,7 +37,7 @@ from probewise.diagnosis.search.searched import Evidences, MisfitTemplates, Post
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.unknown import UnknownEffects
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
-from probewise.effects import NamedEffect, NoiseEffect
+from probewise.effects import PROPOSAL, NamedEffect, NoiseEffect
 from probewise.progress import Progress, silent
 
 
@@ -112,8 +111,12 @@ def search(
     else:
         state.sensors |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
-    unknown = _build_unknown_effects(state, prepared, after)
-    misfit_templates = MisfitTemplates(templates, state.null.found, unknown.bases, unknown.covariates)
+    misfit_templates = (
+        _build_misfit_templates(state, prepared)
+        if after is None
+        else replace(after.misfit_templates, about=state.null.found)
+    )
+    unknown = _build_unknown_effects(state, misfit_templates)
 
     def evidences() -> Evidences:
         return Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
@@ -196,31 +199,42 @@ def _refit_null_from_effects(state: SearchState) -> None:
             state.store_candidate(again)
 
 
-def _build_unknown_effects(state: SearchState, prepared: Prepared, after: Searched | None) -> UnknownEffects:
-    """Build the evidence of unknown effects, with bases about the best null, or those of the search `after`."""
-    named = [effect for name, effect in state.effects.items() if not effects_out_of_vocabulary((name,))]
-    if after is None:
-        bases, covariates = _unknown_bases_and_covariates(state, prepared, named)
-    else:
-        bases, covariates = after.misfit_templates.unknown_bases, after.misfit_templates.covariates
+def _build_unknown_effects(state: SearchState, misfit_templates: MisfitTemplates) -> UnknownEffects:
+    """Build the evidence of unknown effects, without the products of columns that are among the state's formulas.
+
+    As a formula and as a basis a product would be the same hypothesis twice, and the one that says less might lead. The
+    test of the residuals keeps all bases, since the formulas were chosen by these readings.
+    """
+    null, bases = state.null, misfit_templates.unknown_bases
+    formulas = [effect for name, effect in state.effects.items() if name.startswith(PROPOSAL)]
+    if formulas:
+        problem = Linearised.of(null.found, state.refits.likeliest_law(null))
+        bases = without_products_like(bases, state.templates.coarse_bank(null.found, formulas), problem)
+    n_named = len(_effects_in_vocabulary(state))
     each = state.prior.unknown_complexity_penalty
     return UnknownEffects(
         state.refits.log_bayes_factors_by_label,
         bases,
-        covariates,
+        misfit_templates.covariates,
         state.noises,
         lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
-        log_n_choices=lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
+        log_n_choices=lambda names: math.log(math.comb(n_named, len(names)) / n_named) if len(names) > 1 else 0.0,
     )
 
 
-def _unknown_bases_and_covariates(
-    state: SearchState, prepared: Prepared, named: Sequence[NamedEffect[Any]]
-) -> tuple[TemplateBank, tuple[Covariate, ...]]:
-    null, recording = state.null, prepared.recording
-    covariates, slope = prepared.apparatus.covariates_and_predicted_slope(null.found, recording)
+def _effects_in_vocabulary(state: SearchState) -> list[NamedEffect[Any]]:
+    return [effect for name, effect in state.effects.items() if not effects_out_of_vocabulary((name,))]
+
+
+def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTemplates:
+    """Build the templates about the best null, with bases of the covariates of the readings."""
+    null, recording, apparatus = state.null, prepared.recording, prepared.apparatus
+    covariates, slope = apparatus.covariates_and_predicted_slope(null.found, recording)
     level = null.found.predicted
-    scan = recording.plan.scan[recording.usable] if prepared.apparatus.rows_are_in_order else None
-    bases = bank_of_unknown_effects(covariates, level - level.min(), slope, scan)
+    scan = recording.plan.scan[recording.usable] if apparatus.rows_are_in_order else None
+    multiplied = apparatus.multiplied_covariates(covariates)
+    bases = bank_of_unknown_effects(covariates, level - level.min(), slope, scan, multiplied=multiplied)
     problem = Linearised.of(null.found, state.refits.likeliest_law(null))
-    return bases_unlike_named(bases, state.templates.coarse_bank(null.found, named), problem), tuple(covariates)
+    named = state.templates.coarse_bank(null.found, _effects_in_vocabulary(state))
+    unlike = bases_unlike_named(bases, named, problem)
+    return MisfitTemplates(state.templates, null.found, unlike, tuple(covariates))

@@ -61,6 +61,7 @@ CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some
 _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
 _N_BLOCKS = 5
+_MOST_MULTIPLIED = 10  # columns with time, 45 products of two: with each more all others are less likely
 
 # Prior odds of one, two, three effects on the mean, and of white noise beside them. A second effect is as likely as a
 # fault of the noise, of which a walk takes up much of what a second effect does. Both are so rare that one effect holds
@@ -209,6 +210,16 @@ class SimulatorApparatus:
         if len(table.scan_names) > 1:
             out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))
         return out, pooled["previous"]
+
+    def multiplied_covariates(self, covariates: Sequence[Covariate]) -> list[Covariate]:
+        """Return time and the table's columns: of more than ten, those with the most distinct values.
+
+        Columns with few values are settings or numbers of groups, whose product with another is the rarer mistake.
+        """
+        columns = {covariate_of_column(name) for name in self.about.table.covariates}
+        varied = [c for c in covariates if c.name == "time" or c.name in columns]
+        chosen = sorted(varied, key=lambda c: -len(np.unique(c.values)))[:_MOST_MULTIPLIED]
+        return [c for c in varied if c in chosen]
 
     def covariate_values_by_name(self, predicted: FloatArray) -> dict[str, FloatArray]:
         """Return every covariate by name at each row, (n_points,), for predictions (n_points,); the run is last."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged
 from probewise.diagnosis.names import Names
+from probewise.diagnosis.residuals.bases import PRODUCTS
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.verdict_report.words import p_in_words
@@ -127,6 +128,8 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
     likeliest = grounds.family.partition(",")[0].removesuffix(" within scans")
     most = likeliest if likeliest in grounds.shows_in else next(iter(grounds.shows_in), "")
     place = f"; it shows most in {grounds.words.covariate_in_words(most)}" if most else ""
+    if grounds.family == PRODUCTS:
+        place = "; it varies as a product of two columns"
     known = " and ".join(spoken_name(name) for name in grounds.beside)
     what = f"Beside {known}, something" if known else "Something"
     return f"{what} is missing ({p}) that no named effect explains{place}."

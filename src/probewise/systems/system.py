@@ -25,7 +25,7 @@ from probewise.systems.motion import LawWithEffects, integrate_readings, reading
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Simulator
 from probewise.systems.steps import Steps, steps_for_table
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, masks_of_readings_at_ends
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
@@ -53,6 +53,8 @@ class System:
         Counts of a law's evaluations, and of samples at which it raises an error.
     trajectories
         Cache of trajectories of the law, from which nearby ones are solved.
+    limited
+        Whether predictions are limited to the declared range of the instrument (`limited_to_range`).
     """
 
     simulator: Simulator
@@ -63,6 +65,7 @@ class System:
     first: FloatArray | None = None
     tally: IntegrationTally = field(default_factory=IntegrationTally)
     trajectories: TrajectoryCache = field(default_factory=TrajectoryCache, repr=False)
+    limited: bool = True
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable, *, stiff: bool = False) -> System:
@@ -260,6 +263,25 @@ def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, 
     return {name: values for name, values in table.columns.items() if name != simulator.reading}
 
 
+def limited_to_range(predicted: FloatArray, simulator: Simulator, table: RunTable) -> FloatArray:
+    """Limit predictions, (n_samples, n_points), to the declared range, as the instrument does.
+
+    Where a reading at an end was recorded, the limit is that reading, which may be rounded. There is none where one
+    within the range was recorded: it tells how far off a prediction beyond the range is.
+    """
+    low, high = simulator.noise.ends
+    if np.isinf(low) and np.isinf(high):
+        return predicted
+    recorded = table.columns.get(simulator.reading)
+    if recorded is not None and recorded.dtype == np.float64:
+        at_low, at_high = masks_of_readings_at_ends(recorded, low, high, simulator.noise.step)
+        within = (low < recorded) & (recorded < high) & ~(at_low | at_high)
+        low = np.where(within, -np.inf, np.where(at_low, recorded, low))
+        high = np.where(within, np.inf, np.where(at_high, recorded, high))
+    # A prediction that ran away stays as it is: not finite.
+    return np.where(np.isfinite(predicted), np.clip(predicted, low, high), predicted)
+
+
 @dataclass(frozen=True, eq=False)
 class SystemChain:
     """A system with effects, applied in this order: input and clock, parameters, law, reading."""
@@ -356,7 +378,7 @@ class SystemChain:
             for effect, columns in self._effects_with_theta_columns:
                 if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                     view = effect.apply(view, theta[:, columns], plan)
-        return view
+        return limited_to_range(view, self.system.simulator, plan) if self.system.limited else view
 
     look, read = simulated_view, readings_from_simulated_view  # their earlier names
 

@@ -200,6 +200,34 @@ class RunRecording(Recording):
         table = cast(RunTable, self.plan)
         return relative_sds_of_column(table, self.sd_column)
 
+    @cached_property
+    def usable(self) -> BoolArray:
+        """Rows whose reading is present and within the declared range or at its ends, rounded, (n_points,)."""
+        return super().usable | self.censored
+
+    @cached_property
+    def censored(self) -> BoolArray:
+        """Mask of the readings at an end of the declared range: the signal with its noise is at it or beyond."""
+        own = self.plan.instrumentation
+        at_low, at_high = masks_of_readings_at_ends(self.readings, own.min, own.max, own.step)
+        return at_low | at_high
+
+
+def masks_of_readings_at_ends(
+    readings: FloatArray, low: float | None, high: float | None, step: float | None
+) -> tuple[BoolArray, BoolArray]:
+    """Return which readings, of any shape, are at the low and at the high end of a range, within half a rounding step.
+
+    An end may be None or infinite: open.
+    """
+
+    def are_at(end: float | None) -> BoolArray:
+        if end is None or not np.isfinite(end):
+            return np.zeros(np.shape(readings), dtype=np.bool_)
+        return np.asarray(np.abs(readings - end) <= 0.5 * (1 + 1e-9) * (step or 0.0) + 1e-12 * abs(end))
+
+    return are_at(low), are_at(high)
+
 
 def covariate_of_column(name: str) -> str:
     """Return the covariate's name for a column: as it is, or "column:NAME" if reserved ("time", "level", ...)."""

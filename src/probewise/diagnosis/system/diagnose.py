@@ -347,7 +347,7 @@ def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatA
     for share in _BEGINNINGS:
         begun = since <= share * since.max()
         part = recording.with_readings(np.where(begun, recording.readings, np.nan))
-        if part.usable.sum() < system.least_readings:
+        if (part.usable & ~part.censored).sum() < system.least_readings:
             return []
         found = sorted(
             fit_each_start(model, part, starts, white_noise_of_recording(part), max_steps=_STEPS_TRIED),

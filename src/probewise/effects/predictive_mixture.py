@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._renamed import renamed_arguments
+from probewise.effects.limited_range import limited_mean_and_variance, log_probability_at_end
 from probewise.effects.noise_distribution import log_density, reading_variance
+from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.sensor.stages import NoiseParameters
 
 
@@ -25,11 +27,15 @@ class PredictiveMixture:
         Mask of the readings that get a log density, (n_points,).
     step
         The declared rounding step, if any.
+    ends
+        Smallest and largest reading of the instrument; infinite for an open end. At an end the "density" is a
+        probability: that the noise reaches the end.
     """
 
     readings: FloatArray
     scored: BoolArray
     step: float | None = None
+    ends: tuple[float, float] = (-math.inf, math.inf)
     n_samples: int = field(default=0, init=False)
     _center: FloatArray | None = field(default=None, init=False)
 
@@ -45,19 +51,40 @@ class PredictiveMixture:
         `between` (n_points,) is an additional smoothing sd of the density, for samples whose predictions lie farther
         apart than the noise; mean and sd are unaffected.
         """
+        read, variance = mean, reading_variance(noise)
+        if self._is_limited:
+            read, variance = limited_mean_and_variance(noise, mean, *self.ends)
         if self._center is None:
-            self._center = mean.mean(axis=0)  # sums about a nearby value keep their precision
+            self._center = read.mean(axis=0)  # sums about a nearby value keep their precision
         self.n_samples += len(mean)
-        self._total += (mean - self._center).sum(axis=0)
-        self._squares += ((mean - self._center) ** 2).sum(axis=0)
-        self._of_noise += np.broadcast_to(reading_variance(noise), mean.shape).sum(axis=0)
+        self._total += (read - self._center).sum(axis=0)
+        self._squares += ((read - self._center) ** 2).sum(axis=0)
+        self._of_noise += np.broadcast_to(variance, mean.shape).sum(axis=0)
         if self.step is not None:  # `reading_variance` above leaves it out: the pooled sd includes a declared rounding
             noise = replace(noise, step=np.full((1, 1), self.step))
         if between is not None:
             noise = replace(noise, sd=np.hypot(np.broadcast_to(noise.sd, mean.shape), between))
         if self._log_sum.size:
-            log_p = log_density(_noise_of_rows(noise, self.scored), self.readings[self.scored], mean[:, self.scored])
+            log_p = self._log_density_of_scored(noise, mean)
             self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
+
+    @property
+    def _is_limited(self) -> bool:
+        return bool(np.isfinite(self.ends).any())
+
+    def _log_density_of_scored(self, noise: NoiseParameters, mean: FloatArray) -> FloatArray:
+        """Return the log density of each scored reading, or log probability at an end, (n_samples, n_scored)."""
+        readings = self.readings[self.scored]
+        out = log_density(_noise_of_rows(noise, self.scored), readings, mean[:, self.scored])
+        if not self._is_limited:
+            return out
+        for at_end, is_high in zip(
+            masks_of_readings_at_ends(readings, *self.ends, self.step), (False, True), strict=True
+        ):
+            rows = np.flatnonzero(self.scored)[at_end]
+            own = _noise_of_rows(noise, rows)
+            out[:, at_end] = log_probability_at_end(own, self.readings[rows], mean[:, rows], is_high=is_high)
+        return out
 
     def mean_sd_and_log_density(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return mean and sd of a new reading at each row, and log density of the measured one: (n_points,) each.
@@ -73,6 +100,6 @@ class PredictiveMixture:
         return base + shift, np.sqrt(spread + self._of_noise / n), scores
 
 
-def _noise_of_rows(noise: NoiseParameters, rows: BoolArray) -> NoiseParameters:
+def _noise_of_rows(noise: NoiseParameters, rows: BoolArray | IntArray) -> NoiseParameters:
     sd = noise.sd if noise.sd.shape[-1] == 1 else noise.sd[:, rows]
     return replace(noise, sd=sd, walked=noise.walked if len(noise.walked) == 1 else noise.walked[rows])

@@ -15,6 +15,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
+from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
@@ -25,7 +26,7 @@ from probewise.systems.motion import LawWithEffects, integrate_readings, reading
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Simulator
 from probewise.systems.steps import Steps, steps_for_table
-from probewise.systems.table import RunTable, masks_of_readings_at_ends
+from probewise.systems.table import RunTable
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
@@ -269,12 +270,13 @@ def limited_to_range(predicted: FloatArray, simulator: Simulator, table: RunTabl
     Where a reading at an end was recorded, the limit is that reading, which may be rounded. There is none where one
     within the range was recorded: it tells how far off a prediction beyond the range is.
     """
-    low, high = simulator.noise.ends
-    if np.isinf(low) and np.isinf(high):
+    ends = simulator.noise.ends
+    if np.isinf(ends).all():
         return predicted
+    low, high = np.array(ends[0]), np.array(ends[1])
     recorded = table.columns.get(simulator.reading)
     if recorded is not None and recorded.dtype == np.float64:
-        at_low, at_high = masks_of_readings_at_ends(recorded, low, high, simulator.noise.step)
+        at_low, at_high = masks_of_readings_at_ends(recorded, *ends, simulator.noise.step)
         within = (low < recorded) & (recorded < high) & ~(at_low | at_high)
         low = np.where(within, -np.inf, np.where(at_low, recorded, low))
         high = np.where(within, np.inf, np.where(at_high, recorded, high))

@@ -17,6 +17,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
+from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.recordings.table import LARGEST, csv_text, number_text, read_table
 
 _ONE_RUN = "all"
@@ -211,22 +212,6 @@ class RunRecording(Recording):
         own = self.plan.instrumentation
         at_low, at_high = masks_of_readings_at_ends(self.readings, own.min, own.max, own.step)
         return at_low | at_high
-
-
-def masks_of_readings_at_ends(
-    readings: FloatArray, low: float | None, high: float | None, step: float | None
-) -> tuple[BoolArray, BoolArray]:
-    """Return which readings, of any shape, are at the low and at the high end of a range, within half a rounding step.
-
-    An end may be None or infinite: open.
-    """
-
-    def are_at(end: float | None) -> BoolArray:
-        if end is None or not np.isfinite(end):
-            return np.zeros(np.shape(readings), dtype=np.bool_)
-        return np.asarray(np.abs(readings - end) <= 0.5 * (1 + 1e-9) * (step or 0.0) + 1e-12 * abs(end))
-
-    return are_at(low), are_at(high)
 
 
 def covariate_of_column(name: str) -> str:

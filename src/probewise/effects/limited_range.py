@@ -42,31 +42,24 @@ def log_probability_at_end(
     return np.asarray(out)
 
 
-def limited_mean_and_variance(
-    noise: NoiseParameters, predicted: FloatArray, low: float, high: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of a reading that is not lost, limited to a range, (n_samples, n_points) each.
+def limited_mean(noise: NoiseParameters, predicted: FloatArray, low: float, high: float) -> FloatArray:
+    """Return the mean of a reading that is not lost, limited to a range, (n_samples, n_points).
 
     `predicted` are noise-free readings of an unlimited instrument, of that shape.
     """
     noise = noise_with_walk_variance(noise)
-    parts = [
-        (share, *_moments_of_limited_normal(predicted, np.hypot(sd, noise.step / np.sqrt(12)), low, high))
-        for share, sd in ((1 - noise.wide_share, noise.sd), (noise.wide_share, noise.sd * noise.wide_times))
-    ]
-    mean = np.asarray(sum(share * own for share, own, _ in parts))
-    return mean, np.asarray(sum(share * (variance + (own - mean) ** 2) for share, own, variance in parts))
+    own, wide = (
+        _mean_of_limited_normal(predicted, np.hypot(sd, noise.step / np.sqrt(12)), low, high)
+        for sd in (noise.sd, noise.sd * noise.wide_times)
+    )
+    return np.asarray((1 - noise.wide_share) * own + noise.wide_share * wide)
 
 
-def _moments_of_limited_normal(
-    mean: FloatArray, sd: FloatArray, low: float, high: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance of a normal variable that is limited to a range; arrays broadcast."""
+def _mean_of_limited_normal(mean: FloatArray, sd: FloatArray, low: float, high: float) -> FloatArray:
+    """Return the mean of a normal variable that is limited to a range; arrays broadcast."""
     a, b = (np.clip((end - mean) / sd, -_FARTHEST, _FARTHEST) for end in (low, high))
-    below, above, at_a, at_b = ndtr(a), ndtr(-b), _density(a), _density(b)
-    first = a * below + b * above + at_a - at_b
-    second = a**2 * below + b**2 * above + (1 - below - above) + a * at_a - b * at_b
-    return np.clip(mean + sd * first, low, high), np.asarray(sd**2 * np.maximum(second - first**2, 0.0))
+    z = a * ndtr(a) + b * ndtr(-b) + _density(a) - _density(b)
+    return np.asarray(np.clip(mean + sd * z, low, high))
 
 
 def _density(z: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._renamed import renamed_arguments
-from probewise.effects.limited_range import limited_mean_and_variance, log_probability_at_end
+from probewise.effects.limited_range import limited_mean, log_probability_at_end
 from probewise.effects.noise_distribution import log_density, reading_variance
 from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.sensor.stages import NoiseParameters
@@ -42,6 +42,7 @@ class PredictiveMixture:
     def __post_init__(self) -> None:
         n_points = len(self.readings)
         self._total, self._squares, self._of_noise = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
+        self._limited_total = np.zeros(n_points)
         self._log_sum = np.full(int(self.scored.sum()), -np.inf)
 
     @renamed_arguments(level="noise")
@@ -51,15 +52,14 @@ class PredictiveMixture:
         `between` (n_points,) is an additional smoothing sd of the density, for samples whose predictions lie farther
         apart than the noise; mean and sd are unaffected.
         """
-        read, variance = mean, reading_variance(noise)
-        if self._is_limited:
-            read, variance = limited_mean_and_variance(noise, mean, *self.ends)
         if self._center is None:
-            self._center = read.mean(axis=0)  # sums about a nearby value keep their precision
+            self._center = mean.mean(axis=0)  # sums about a nearby value keep their precision
         self.n_samples += len(mean)
-        self._total += (read - self._center).sum(axis=0)
-        self._squares += ((read - self._center) ** 2).sum(axis=0)
-        self._of_noise += np.broadcast_to(variance, mean.shape).sum(axis=0)
+        self._total += (mean - self._center).sum(axis=0)
+        self._squares += ((mean - self._center) ** 2).sum(axis=0)
+        self._of_noise += np.broadcast_to(reading_variance(noise), mean.shape).sum(axis=0)
+        if self._is_limited:
+            self._limited_total += limited_mean(noise, mean, *self.ends).sum(axis=0)
         if self.step is not None:  # `reading_variance` above leaves it out: the pooled sd includes a declared rounding
             noise = replace(noise, step=np.full((1, 1), self.step))
         if between is not None:
@@ -71,6 +71,11 @@ class PredictiveMixture:
     @property
     def _is_limited(self) -> bool:
         return bool(np.isfinite(self.ends).any())
+
+    @property
+    def _are_at_end(self) -> BoolArray:
+        at_low, at_high = masks_of_readings_at_ends(self.readings, *self.ends, self.step)
+        return at_low | at_high
 
     def _log_density_of_scored(self, noise: NoiseParameters, mean: FloatArray) -> FloatArray:
         """Return the log density of each scored reading, or log probability at an end, (n_samples, n_scored)."""
@@ -89,7 +94,8 @@ class PredictiveMixture:
     def mean_sd_and_log_density(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return mean and sd of a new reading at each row, and log density of the measured one: (n_points,) each.
 
-        The density is NaN where a reading is not scored.
+        The density is NaN where a reading is not scored. The mean is within the range of the instrument; the sd is
+        that of a reading which no end limits.
         """
         n = self.n_samples
         shift = self._total / n
@@ -97,7 +103,11 @@ class PredictiveMixture:
         scores = np.full(len(self.readings), np.nan)
         scores[self.scored] = self._log_sum - math.log(n)
         base = np.zeros(len(self.readings)) if self._center is None else self._center
-        return base + shift, np.sqrt(spread + self._of_noise / n), scores
+        mean = base + shift
+        if self._is_limited:
+            mean = np.clip(self._limited_total / n, *self.ends)
+            scores = np.where(self._are_at_end, np.minimum(scores, 0.0), scores)
+        return mean, np.sqrt(spread + self._of_noise / n), scores
 
 
 def _noise_of_rows(noise: NoiseParameters, rows: BoolArray | IntArray) -> NoiseParameters:

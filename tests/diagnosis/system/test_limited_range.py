@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
+from probewise.diagnosis.evidence.held_out import held_out_gain
 from probewise.diagnosis.evidence.laplace import Linearised, laplace_evidence
 from probewise.diagnosis.fitting.fit import Model, fit
 from probewise.diagnosis.noise.law import white_noise_of_recording
@@ -166,3 +167,14 @@ def test_the_noise_of_a_reading_at_an_end_is_correlated_with_none():
     assert not law.carry[at_end].any()
     assert not law.carry[at_end[at_end < len(law.carry) - 1] + 1].any()
     assert (law.carry == 0.5).any()
+
+
+@pytest.mark.parametrize("carry", [0.0, 0.5], ids=["white", "correlated"])
+def test_a_held_out_reading_at_an_end_gains_nothing_by_another_noise(carry):
+    """Beyond the end the probability to read it is 1 whatever the noise."""
+    prepared, found, law = _fitted(LAMP, _lamp())
+    law = replace(law, carry=np.where(law.censored | np.append(True, law.censored[:-1]), 0.0, carry))
+    with_tail = replace(law, share=0.2, times=5.0)
+    parts = (found.residuals == 0).astype(np.int64), ("others", "at the end")
+    gain = held_out_gain(found, found, prepared.recording, with_tail, parts, law_of_null=law)
+    assert abs(dict(gain.by_scan)["at the end"]) < 1e-12

@@ -13,6 +13,7 @@ from probewise.diagnosis.noise.law import white_noise_of_recording
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.system.diagnose import prepare_system, readings_near_ends, recording_from_table
 from probewise.effects import CorrelatedNoise, Dropouts, Extent
+from probewise.errors import ParameterError
 from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system
 
 FULL, BACK, EXPONENT, SD, HIGH = 1250.0, 12.0, 2.0, 6.0, 1000.0
@@ -178,3 +179,9 @@ def test_a_held_out_reading_at_an_end_gains_nothing_by_another_noise(carry):
     parts = (found.residuals == 0).astype(np.int64), ("others", "at the end")
     gain = held_out_gain(found, found, prepared.recording, with_tail, parts, law_of_null=law)
     assert abs(dict(gain.by_scan)["at the end"]) < 1e-12
+
+
+def test_readings_that_are_all_at_the_ends_are_refused():
+    table = _lamp().with_columns({"lux": np.where(np.arange(150) % 2, HIGH, 0.0)})
+    with pytest.raises(ParameterError, match="all at an end of the declared range"):
+        prepare_system(LAMP, table)

@@ -133,6 +133,9 @@ def prepare_system(
         raise ParameterError(
             "usable readings", 0, f"{system.least_readings} or more; column {simulator.reading} has none"
         )
+    if not (recording.usable & ~recording.censored).any():
+        allowed = f"{system.least_readings} or more within the range"
+        raise ParameterError("usable readings", "all at an end of the declared range", allowed)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)

@@ -88,8 +88,9 @@ class Prepared:
 
     @property
     def has_too_little_data(self) -> bool:
-        """Whether the readings are too few for a verdict, or all equal."""
-        return len(self.usable_rows) < self.least_readings or self.has_only_equal_readings
+        """Whether the readings are too few for a verdict, or all equal; those at an end of the range do not count."""
+        n_informative = len(self.usable_rows) - int(self.recording.censored[self.usable_rows].sum())
+        return n_informative < self.least_readings or self.has_only_equal_readings
 
     def expand_usable_to_all_rows(self, values: FloatArray) -> FloatArray:
         """Expand values of usable readings to all rows, NaN elsewhere: (n_usable,) -> (n_points,)."""

@@ -37,7 +37,7 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
     predicted
         Noise-free readings, (n_samples, n_points).
     """
-    noise = _noise_with_walk_variance(noise)
+    noise = noise_with_walk_variance(noise)
     of_kept = _log_density_rounded(readings, predicted, noise.sd, noise.step)
     with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
         if np.any(noise.wide_share):
@@ -52,12 +52,12 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
 @renamed_arguments(level="noise")
 def reading_variance(noise: NoiseParameters) -> FloatArray:
     """Return the variance of a reading that is not lost, with outliers, random walk and rounding; arrays broadcast."""
-    noise = _noise_with_walk_variance(noise)
+    noise = noise_with_walk_variance(noise)
     wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
     return np.asarray(noise.sd**2 * wide + noise.step**2 / 12)
 
 
-def _noise_with_walk_variance(noise: NoiseParameters) -> NoiseParameters:
+def noise_with_walk_variance(noise: NoiseParameters) -> NoiseParameters:
     """Return the noise with the random walk's marginal variance at each row included in its sd."""
     if not np.any(noise.walk):
         return noise

@@ -329,6 +329,11 @@ class Recording(ShowsItself):
         """Declared noise sd of each reading relative to the median, (n_points,): here 1; a subclass may differ."""
         return np.ones(len(self.plan))
 
+    @cached_property
+    def censored(self) -> BoolArray:
+        """Mask of the readings that only say that the signal is at or beyond an end, (n_points,): here none."""
+        return np.zeros(len(self.plan), dtype=np.bool_)
+
     @classmethod
     def from_arrays(
         cls,

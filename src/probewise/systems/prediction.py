@@ -48,9 +48,11 @@ _SOME = 200  # samples used to estimate the scatter of predictions in each row
 class SystemPrediction(ShowsItself):
     """Predictive distribution of each row's reading, all arrays (n_points,).
 
-    `sd` is that of one new reading, noise and parameters together; `log_density` is the natural logarithm of the
-    predictive density of that row's reading alone, per unit of the reading, NaN without a reading. `n_failed` of
-    `n_samples` samples were left out because the simulator gives no finite readings for them.
+    `mean` is within the declared range of the instrument. `sd` is that of one new reading which no end of the range
+    limits, noise and parameters together; `log_density` is the natural logarithm of the
+    predictive density of that row's reading alone, per unit of the reading, NaN without a reading; of a reading at an
+    end of the declared range, it is the log probability of that end, whatever the unit. `n_failed` of `n_samples`
+    samples were left out because the simulator gives no finite readings for them.
     """
 
     table: RunTable
@@ -158,13 +160,16 @@ def predict_system(
         System.of(fitted.simulator, _table_with_interpolated_inputs(fitted.simulator, own)),
         max_step=fitted.max_step,
         stiff=fitted.stiff,
+        limited=False,  # noise decides which readings are at an end of the range
     )
     chain = system.chain(own, bind_effects(fitted, own))
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
     given, lost = _filled_table_and_unpredictable_mask(chain, theta, own)
     chain = _chain_with_converged_step(chain, theta, given, float(np.median(fitted.noise_sd)))
-    mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
+    mixture = PredictiveMixture(
+        recording.readings, recording.usable & ~lost, own.instrumentation.step, fitted.simulator.noise.ends
+    )
     n_failed, never = 0, np.ones(len(own), dtype=np.bool_)
     between = _smoothing_width_by_row(chain, theta, given) if is_drawn else None
     for first in range(0, n_samples, per_block):

@@ -89,7 +89,8 @@ class Noise:
     step
         Rounding step of the readings; None if not declared.
     range
-        Smallest and largest reading of the instrument; None for an open end.
+        Smallest and largest reading of the instrument, which reads an end where the signal and its noise are beyond
+        it; None for an open end.
     zero
         Reading at zero signal, about which a gain acts.
     """
@@ -128,6 +129,12 @@ class Noise:
         low, high = (bound if end is None else end for end, bound in zip(self.range, (-np.inf, np.inf), strict=True))
         if not (_is_number(low) and _is_number(high) and low < high):
             raise ParameterError('noise["range"]', self.range, "(low, high), low < high")
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Smallest and largest reading of the instrument, infinite for an open end."""
+        low, high = self.range
+        return -np.inf if low is None else low, np.inf if high is None else high
 
 
 @dataclass(frozen=True)

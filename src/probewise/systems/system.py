@@ -15,6 +15,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
+from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
@@ -25,7 +26,7 @@ from probewise.systems.motion import LawWithEffects, integrate_readings, reading
 from probewise.systems.rows_in_runs import RowsInRuns
 from probewise.systems.simulator import Simulator
 from probewise.systems.steps import Steps, steps_for_table
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, relative_sds_of_column
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
@@ -53,6 +54,11 @@ class System:
         Counts of a law's evaluations, and of samples at which it raises an error.
     trajectories
         Cache of trajectories of the law, from which nearby ones are solved.
+    limited
+        Whether predictions are limited to the declared range of the instrument (`limited_to_range`).
+    slack
+        How far within the range, in the unit of the readings, noise may carry a reading to its end. A prediction so
+        near to the end is as good as one beyond it where the reading is at the end.
     """
 
     simulator: Simulator
@@ -63,6 +69,8 @@ class System:
     first: FloatArray | None = None
     tally: IntegrationTally = field(default_factory=IntegrationTally)
     trajectories: TrajectoryCache = field(default_factory=TrajectoryCache, repr=False)
+    limited: bool = True
+    slack: float = 0.0
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable, *, stiff: bool = False) -> System:
@@ -263,6 +271,29 @@ def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, 
     return {name: values for name, values in table.columns.items() if name != simulator.reading}
 
 
+def limited_to_range(predicted: FloatArray, system: System, table: RunTable) -> FloatArray:
+    """Limit predictions, (n_samples, n_points), to the declared range, as the instrument does.
+
+    Where a reading at an end was recorded, the limit is that reading, which may be rounded, and the prediction is moved
+    towards it by `system.slack`. There is no limit where a reading within the range was recorded: it tells how far off
+    a prediction beyond the range is.
+    """
+    noise = system.simulator.noise
+    if np.isinf(noise.ends).all():
+        return predicted
+    low, high = np.array(noise.ends[0]), np.array(noise.ends[1])
+    recorded = table.columns.get(system.simulator.reading)
+    if recorded is not None and recorded.dtype == np.float64:
+        at_low, at_high = masks_of_readings_at_ends(recorded, *noise.ends, noise.step)
+        slack = system.slack * (relative_sds_of_column(table, noise.sd) if isinstance(noise.sd, str) else 1.0)
+        predicted = predicted + slack * (1.0 * at_high - 1.0 * at_low)
+        within = (low < recorded) & (recorded < high) & ~(at_low | at_high)
+        low = np.where(within, -np.inf, np.where(at_low, recorded, low))
+        high = np.where(within, np.inf, np.where(at_high, recorded, high))
+    # A prediction that ran away stays as it is: not finite.
+    return np.where(np.isfinite(predicted), np.clip(predicted, low, high), predicted)
+
+
 @dataclass(frozen=True, eq=False)
 class SystemChain:
     """A system with effects, applied in this order: input and clock, parameters, law, reading."""
@@ -379,7 +410,7 @@ class SystemChain:
             for effect, columns in self._effects_with_theta_columns:
                 if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                     view = effect.apply(view, theta[:, columns], plan)
-        return view
+        return limited_to_range(view, self.system, plan) if self.system.limited else view
 
     look, read = simulated_view, readings_from_simulated_view  # their earlier names
 

@@ -17,6 +17,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
+from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.recordings.table import LARGEST, csv_text, number_text, read_table
 
 _ONE_RUN = "all"
@@ -199,6 +200,18 @@ class RunRecording(Recording):
             return np.ones(len(self.plan))
         table = cast(RunTable, self.plan)
         return relative_sds_of_column(table, self.sd_column)
+
+    @cached_property
+    def usable(self) -> BoolArray:
+        """Rows whose reading is present and within the declared range or at its ends, rounded, (n_points,)."""
+        return super().usable | self.censored
+
+    @cached_property
+    def censored(self) -> BoolArray:
+        """Mask of the readings at an end of the declared range: the signal with its noise is at it or beyond."""
+        own = self.plan.instrumentation
+        at_low, at_high = masks_of_readings_at_ends(self.readings, own.min, own.max, own.step)
+        return at_low | at_high
 
 
 def covariate_of_column(name: str) -> str:

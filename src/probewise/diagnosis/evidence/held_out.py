@@ -122,11 +122,14 @@ def _refit_log_densities(
 ) -> FloatArray:
     """Return the log predictive density of each held-out reading, from a refit to the others; 0 for lost readings.
 
+    Of a reading at an end of the range it is the log probability: that of a signal beyond the end is 1.
     `rows` (n_points,) and `out` (n_usable,) are masks of the held-out readings. Lost readings (dropouts at one value)
     add the same to every model of the mean.
     """
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
     rest = law.take_readings(~out)
+    if not rest.n_kept:  # they tell no noise sd, and so no density
+        return np.zeros(int(out.sum()))
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     of_its_own = are_of_part_alone(found.slopes, out)
     turned = np.where(of_its_own, 0.0, rest(without.slopes))
@@ -145,11 +148,18 @@ def _refit_log_densities(
         return sequential_log_densities(law, out, miss, slopes, without.z - about, covariance, sigma_2)
     miss, slopes, own = miss[out], slopes[out], law.take_readings(out)
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
-    narrow, wide = (
-        _log_normal_density(miss, sigma_2 * sd**2 + spread) + math.log(max(share, 1e-300))
-        for sd, share in ((own.sd_with_rounding, 1 - law.share), (law.times * own.sd, law.share))
-    )
-    return np.asarray(np.logaddexp(narrow, wide) * own.kept)
+
+    def log_density(miss: FloatArray) -> FloatArray:
+        narrow, wide = (
+            _log_normal_density(miss, sigma_2 * sd**2 + spread) + math.log(max(share, 1e-300))
+            for sd, share in ((own.sd_with_rounding, 1 - law.share), (law.times * own.sd, law.share))
+        )
+        return np.asarray(np.logaddexp(narrow, wide))
+
+    density = log_density(miss)
+    if own.censored.any():
+        density -= np.where(own.censored, log_density(np.zeros(len(miss))), 0.0)
+    return np.asarray(density * own.kept)
 
 
 def are_of_part_alone(slopes: FloatArray, part: BoolArray) -> BoolArray:
@@ -187,8 +197,9 @@ def sequential_log_densities(
 
     Returns
     -------
-    Log densities, (n_out,), whose sum is the log of the joint density.
+    Log densities, (n_out,), whose sum is the log of the joint density; of censored readings, relative to the peak.
     """
+    censored = law.censored[out] if law.censored.size else np.zeros(int(out.sum()), dtype=np.bool_)
     whitened, sd = innovations_given_rest(law, np.concatenate([slopes, miss[:, None]], axis=1), out)
     turned, innovations, kept = whitened[:, :-1], whitened[:, -1], law.kept[out]
     mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
@@ -202,9 +213,13 @@ def sequential_log_densities(
         density = _log_normal_density(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
         densities[k] = np.logaddexp(*density)
         variance = float(np.exp(density - densities[k]) @ parts)  # the most probable noise variance of this reading
+        if censored[k]:
+            densities[k] -= np.logaddexp(
+                *(_log_normal_density(np.zeros(2), parts) + np.log(np.maximum(shares, 1e-300)))
+            )
         mean += gain * left / variance
         covariance -= np.outer(gain, gain) / variance
-    return np.asarray((densities - np.log(sd)) * kept)
+    return np.asarray((densities - np.where(censored, 0.0, np.log(sd))) * kept)
 
 
 def _variances_of_narrow_and_wide(law: NoiseLaw, out: BoolArray, sd: FloatArray) -> FloatArray:

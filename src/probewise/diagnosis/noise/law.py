@@ -84,6 +84,9 @@ class NoiseLaw:
         Empty: the reading above, as always unless the rows of scans are interleaved.
     wide
         Probability of each reading to be wide, (n_points,), where `sd` includes it; empty without or if unknown.
+    censored
+        Mask of the readings at an end of the instrument's range, (n_points,); empty without one. The prediction there
+        is limited to the end, so that the likelihood is 1 where the signal is beyond it. They do not count in the sd.
     """
 
     sd: FloatArray
@@ -98,6 +101,7 @@ class NoiseLaw:
     walk: FloatArray = field(default_factory=lambda: np.zeros(0))
     before: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     wide: FloatArray = field(default_factory=lambda: np.zeros(0))
+    censored: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
 
     def __post_init__(self) -> None:
@@ -105,8 +109,21 @@ class NoiseLaw:
 
     @property
     def n_kept(self) -> int:
-        """Number of readings that are not lost."""
-        return len(self.sd) - int(self.lost.sum())
+        """Number of readings that are neither lost nor censored."""
+        return int(self._counted.sum())
+
+    @property
+    def _counted(self) -> BoolArray:
+        """Mask of the readings that are neither lost nor censored, (n_points,)."""
+        return ~(self.lost | self.censored) if self.censored.size else ~self.lost
+
+    def without_readings_beyond_end(self, residuals: FloatArray) -> NoiseLaw:
+        """Return the distribution without the censored readings that a fit with these residuals predicts beyond.
+
+        Such a reading tells nothing, whatever small change is added to the prediction.
+        """
+        beyond = self.censored & (residuals == 0) if self.censored.size else self.censored
+        return replace(self, lost=self.lost | beyond) if beyond.any() else self
 
     @property
     def whitening_key(self) -> tuple[bytes, ...]:
@@ -145,7 +162,17 @@ class NoiseLaw:
         above, carry = self._nearest_taken_before(rows)
         before = np.maximum(above, 0) if self.before.size else self.before
         wide = self.wide[rows] if self.wide.size else self.wide
-        return replace(self, sd=self.sd[rows], carry=carry, lost=self.lost[rows], walk=walk, before=before, wide=wide)
+        censored = self.censored[rows] if self.censored.size else self.censored
+        return replace(
+            self,
+            sd=self.sd[rows],
+            carry=carry,
+            lost=self.lost[rows],
+            walk=walk,
+            before=before,
+            wide=wide,
+            censored=censored,
+        )
 
     def _nearest_taken_before(self, rows: BoolArray) -> tuple[IntArray, FloatArray]:
         """Return for each reading taken the nearest taken before it, and its correlation with that: (n_taken,) both.
@@ -205,10 +232,10 @@ class NoiseLaw:
 
     def half_log_det(self) -> float:
         """Return half the log determinant of the relative covariance."""
-        kept = ~self.lost
         if self.walk.size:
             return float(np.log(self._difference_covariance_root[0]).sum())
-        return float(np.log(self.sd[kept]).sum() + 0.5 * np.log1p(-(self.carry[kept] ** 2)).sum())
+        counted = self._counted
+        return float(np.log(self.sd[counted]).sum() + 0.5 * np.log1p(-(self.carry[counted] ** 2)).sum())
 
     @cached_property
     def whitened_density(self) -> Tail | RoundedNormal:
@@ -297,7 +324,7 @@ class NoiseLaw:
             if isinstance(self.whitened_density, RoundedNormal):
                 eps = self.whitened_density.add_rounding(eps, rng=rng)
             eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.fisher_information)
-        return eps * self.kept[:, None]
+        return eps * self._counted[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,7 +447,12 @@ def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:
 
 def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
     """Return independent noise of a recording's usable readings, with its declared relative sds."""
-    return replace(white_noise(int(recording.usable.sum()), least=least), sd=recording.relative_sd[recording.usable])
+    usable, censored = recording.usable, recording.censored
+    return replace(
+        white_noise(int(usable.sum()), least=least),
+        sd=recording.relative_sd[usable],
+        censored=censored[usable] if censored.any() else np.zeros(0, dtype=np.bool_),
+    )
 
 
 def noise_statistics(

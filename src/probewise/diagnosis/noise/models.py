@@ -121,7 +121,8 @@ class NoiseModel:
         """Return the residuals over their declared relative sds, (n_usable,), and a robust estimate of their sd."""
         residuals = (self._usable_readings - predicted) / self._relative_sd
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
-        sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12))
+        free = residuals[~self._censored] if self._censored.any() else residuals
+        sd = max(float(np.median(np.abs(free))) / 0.6745, self._rounding_step / math.sqrt(12))
         return residuals, sd or 1.0
 
     def _weighted_nodes(
@@ -161,9 +162,11 @@ class NoiseModel:
             value_at_node(noise.rho) ** np.maximum(self._n_rows_since_previous_in_scan, 1),
             0.0,
         )
-        carry[lost] = 0.0
+        # The noise of a censored reading is not known: none is correlated with it.
+        unknown = lost | self._censored
+        carry[unknown] = 0.0
         above = self._previous_in_scan
-        carry[(above >= 0) & lost[above]] = 0.0
+        carry[(above >= 0) & unknown[above]] = 0.0
         walk = (
             value_at_node(noise.walk) ** 2 * self._n_rows_since_previous_in_table if np.any(noise.walk) else np.zeros(0)
         )
@@ -173,14 +176,15 @@ class NoiseModel:
                 int(lost.sum()),
                 max(self._span / self._lost_value_resolution, 1.0),
             )
-            # Each lost reading has that value to within a cell.
+            # Each lost reading has that value to within a cell; a censored one, by probability and not by density.
             log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
+            log_extra += int((lost & self._censored).sum()) * math.log(self._lost_value_resolution)
             log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
         return NoiseLaw(
             sd,
             carry,
-            lost,
+            unknown if walk.size else lost,
             value_at_node(noise.wide_share),
             value_at_node(noise.wide_times),
             log_extra,
@@ -189,7 +193,13 @@ class NoiseModel:
             before=np.maximum(above, 0)
             if self._has_interleaved_scans and np.any(carry)
             else np.zeros(0, dtype=np.int64),
+            censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),
         )
+
+    @cached_property
+    def _censored(self) -> BoolArray:
+        """Mask of the usable readings at an end of the instrument's range, (n_usable,)."""
+        return self.recording.censored[self.recording.usable]
 
     @cached_property
     def _previous_in_scan(self) -> IntArray:
@@ -293,7 +303,8 @@ def rough_sd(recording: Recording) -> float:
     """
     order = order_by_scan(recording)
     readings, steps = recording.readings[recording.usable][order], n_rows_since_previous_usable(recording)[order]
-    inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1
+    free = ~recording.censored[recording.usable][order]  # a meter that stands at its end does not scatter
+    inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1) & free[:-2] & free[1:-1] & free[2:]) + 1
     bends = np.sort(readings[inner - 1] - 2 * readings[inner] + readings[inner + 1])
     step = lattice_step(readings)
     if step:

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
 from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
@@ -38,6 +38,8 @@ from probewise.systems.table import median_sd_of_column
 _STEPS_TRIED = 8  # of the fit of the simulator, from each start
 _BEST_STARTS = 3  # of which it goes on
 _BEGINNINGS = 0.25, 0.5  # shares of the longest run that are fitted before all of it
+_NEAR_END = 2.0  # noise sds from an end of the declared range to a prediction whose noise the end may cut off
+_EXPLAINED = 3.0  # noise sds from the prediction, limited to the range, to a reading that it explains
 
 
 def diagnose_system(
@@ -132,9 +134,16 @@ def prepare_system(
         raise ParameterError(
             "usable readings", 0, f"{system.least_readings} or more; column {simulator.reading} has none"
         )
+    if not (recording.usable & ~recording.censored).any():
+        allowed = f"{system.least_readings} or more within the range"
+        raise ParameterError("usable readings", "all at an end of the declared range", allowed)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
+    near_ends = readings_near_ends(system, found, sd, recording)
+    if near_ends.any():
+        recording = without_readings_near_ends(system, recording, near_ends)
+        system, found, sd = fit_system(replace(system, first=found.z, slack=_NEAR_END * sd), recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
     recording = replace(recording, notes=(*recording.notes, *conflicts))
@@ -225,6 +234,39 @@ def without_readings_at_stop(
     note = f"{int(rows.sum())} readings left out: they stand at {level}, where the meter stops"
     recording = replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, note))
     return recording, stop
+
+
+def readings_near_ends(system: System, found: Fit, sd: float, recording: RunRecording) -> BoolArray:
+    """Return the mask of the readings at an end of the declared range, and of those whose noise an end cuts off.
+
+    Of the latter, the fit predicts the signal near an end or beyond, and explains the reading; (n_points,) in all.
+    """
+    table, own_sd = cast(RunTable, recording.plan), sd * recording.relative_sd
+    low, high = system.simulator.noise.ends
+    predicted = replace(system, limited=False).chain(table, ()).predict(system.theta(found.z[None, :]), table)[0]
+    is_near = (predicted - low < _NEAR_END * own_sd) | (high - predicted < _NEAR_END * own_sd)
+    is_explained = np.abs(recording.readings - np.clip(predicted, low, high)) < _EXPLAINED * own_sd
+    return np.asarray(recording.usable & (recording.censored | is_near & is_explained))
+
+
+def without_readings_near_ends(system: System, recording: RunRecording, near_ends: BoolArray) -> RunRecording:
+    """Leave out, with a note, those of the readings `near_ends` that are not at an end.
+
+    Of a signal near an end only the noise away from the end is seen: its mean would be wrong. Where too few readings
+    would be left for a fit, all stay.
+    """
+    at_end = near_ends & recording.censored
+    cut = near_ends & ~at_end
+    if (recording.usable & ~near_ends).sum() < system.least_readings:
+        cut = np.zeros_like(cut)
+    said = []
+    if at_end.any():
+        said.append(
+            f"{int(at_end.sum())} readings at an end of the declared range say that the signal is there or beyond"
+        )
+    if cut.any():
+        said.append(f"{int(cut.sum())} readings near an end of the declared range left out: it cuts off their noise")
+    return replace(recording, readings=np.where(cut, np.nan, recording.readings), notes=(*recording.notes, *said))
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -355,7 +397,7 @@ def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatA
     for share in _BEGINNINGS:
         begun = since <= share * since.max()
         part = recording.with_readings(np.where(begun, recording.readings, np.nan))
-        if part.usable.sum() < system.least_readings:
+        if (part.usable & ~part.censored).sum() < system.least_readings:
             return []
         found = sorted(
             fit_each_start(model, part, starts, white_noise_of_recording(part), max_steps=_STEPS_TRIED),

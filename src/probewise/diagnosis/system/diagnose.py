@@ -31,7 +31,12 @@ from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.sorted_rows import sorting_column
-from probewise.systems.forms.stop import MeterStop, find_meter_stop_and_mask
+from probewise.systems.forms.stop import (
+    MeterStop,
+    find_meter_stop_and_mask,
+    is_signal_beyond,
+    possible_meter_stops_and_masks,
+)
 from probewise.systems.row_order import note_on_row_order, rows_are_in_order
 from probewise.systems.table import median_sd_of_column
 
@@ -139,6 +144,8 @@ def prepare_system(
         raise ParameterError("usable readings", "all at an end of the declared range", allowed)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
+    if stop is None:
+        recording, stop = without_readings_at_scattered_stop(system, recording)
     system, found, sd = fit_system(system, recording)
     near_ends = readings_near_ends(system, found, sd, recording)
     if near_ends.any():
@@ -230,10 +237,31 @@ def without_readings_at_stop(
     if found is None:
         return recording, None
     stop, rows = found
-    level = f"{stop.level:.6g} {simulator.unit}".rstrip()
+    return _without_rows_at_stop(recording, stop, rows), stop
+
+
+def without_readings_at_scattered_stop(
+    system: System, recording: RunRecording
+) -> tuple[RunRecording, MeterStop | None]:
+    """Leave out, with a note, readings at a stop of the meter that they do not show by standing there in succession.
+
+    A fit to the others must predict them beyond the stop. Returns as `without_readings_at_stop`.
+    """
+    for stop, rows in possible_meter_stops_and_masks(recording, system.simulator.reading):
+        without = _without_rows_at_stop(recording, stop, rows)
+        if without.usable.sum() < system.least_readings:
+            continue
+        fitted, found, sd = fit_system(system, without)
+        predicted = fitted.chain(recording.plan, ()).predict(fitted.theta(found.z[None, :]), recording.plan)[0]
+        if is_signal_beyond(stop, predicted[rows], sd):
+            return without, stop
+    return recording, None
+
+
+def _without_rows_at_stop(recording: RunRecording, stop: MeterStop, rows: BoolArray) -> RunRecording:
+    level = f"{stop.level:.6g} {stop.unit}".rstrip()
     note = f"{int(rows.sum())} readings left out: they stand at {level}, where the meter stops"
-    recording = replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, note))
-    return recording, stop
+    return replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, note))
 
 
 def readings_near_ends(system: System, found: Fit, sd: float, recording: RunRecording) -> BoolArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
@@ -22,6 +23,7 @@ _FINE = 0.1
 # Share of the other readings that equal the one before. Eight equal readings in turn, or five and three, are then by
 # chance in one of 1e5 places, and at the end of the range in fewer.
 _OFTEN = 0.1
+_NEARLY_ALL = 0.9  # of the readings at a stop must have a signal near it or beyond
 
 
 @dataclass(frozen=True)
@@ -83,25 +85,70 @@ def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading")
     unless the meter saturates after the noise. None also if rounding is too coarse to tell, or if that end was
     declared.
     """
-    usable = np.flatnonzero(recording.usable)
-    readings, scan = recording.readings[usable], recording.plan.scan[usable]
-    if len(readings) <= _LEAST_IN_ALL:
-        return None
-    in_turn = (np.diff(usable) == 1) & (np.diff(scan) == 0)
-    steps = np.abs(np.diff(readings))[in_turn]
-    typical = float(np.median(steps)) if steps.size else 0.0
-    if not typical or lattice_step(readings) > _FINE * typical:
-        return None
-    for is_ceiling in (True, False):
-        level = float(readings.max() if is_ceiling else readings.min())
-        stands = readings == level
-        elsewhere = steps[~stands[1:][in_turn]]
+    rows = _RowsInTurn.of(recording)
+    for is_ceiling in (True, False) if rows.are_fine else ():
+        level, stands = rows.extreme_and_mask(is_ceiling)
+        elsewhere = rows.steps[~stands[1:][rows.in_turn]]
         if level in recording.plan.instrumentation.declared_ends or np.mean(elsewhere == 0) > _OFTEN:
             continue
-        if stands.sum() >= _LEAST_IN_ALL and _longest_streak(stands, in_turn) >= _LEAST_IN_TURN:
+        if stands.sum() >= _LEAST_IN_ALL and _longest_streak(stands, rows.in_turn) >= _LEAST_IN_TURN:
             unit = recording.plan.instrumentation.unit
             return MeterStop(level, is_ceiling, reading, unit), recording.readings == level
     return None
+
+
+def possible_meter_stops_and_masks(
+    recording: Recording, reading: str = "the reading"
+) -> Iterator[tuple[MeterStop, BoolArray]]:
+    """Yield stops at the largest and smallest reading that eight rows have exactly, wherever they are in the table.
+
+    Few other readings may have an exact equal. Lost readings look alike: only a fit tells whether the signal is beyond
+    (`is_signal_beyond`). A declared end is no stop.
+    """
+    rows = _RowsInTurn.of(recording)
+    for is_ceiling in (True, False) if rows.are_fine else ():
+        level, stands = rows.extreme_and_mask(is_ceiling)
+        n_each = np.unique(rows.readings[~stands], return_counts=True)[1]
+        alike = n_each[n_each > 1].sum() / max(n_each.sum(), 1)
+        if level in recording.plan.instrumentation.declared_ends or alike > _OFTEN or stands.sum() < _LEAST_IN_ALL:
+            continue
+        yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), recording.readings == level
+
+
+def is_signal_beyond(stop: MeterStop, predicted: FloatArray, sd: float) -> bool:
+    """Return whether a fit to the other readings predicts those at a stop, (n_rows,), beyond it but for the noise.
+
+    Noise of the sd carries some there from two sds within; most of them must be beyond.
+    """
+    beyond = (predicted - stop.level) * (1.0 if stop.is_ceiling else -1.0)
+    return bool(np.mean(beyond > -2 * sd) >= _NEARLY_ALL and np.median(beyond) > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class _RowsInTurn:
+    """Usable readings, and the steps, (n_steps,), between those in successive rows of a run, marked by `in_turn`."""
+
+    readings: FloatArray
+    in_turn: BoolArray
+    steps: FloatArray
+
+    @classmethod
+    def of(cls, recording: Recording) -> Self:
+        usable = np.flatnonzero(recording.usable)
+        readings, scan = recording.readings[usable], recording.plan.scan[usable]
+        in_turn = (np.diff(usable) == 1) & (np.diff(scan) == 0)
+        return cls(readings, in_turn, np.abs(np.diff(readings))[in_turn])
+
+    @property
+    def are_fine(self) -> bool:
+        """Whether readings are so many and so fine that equal ones tell of a stop."""
+        typical = float(np.median(self.steps)) if self.steps.size else 0.0
+        return len(self.readings) > _LEAST_IN_ALL and typical > 0 and lattice_step(self.readings) <= _FINE * typical
+
+    def extreme_and_mask(self, is_ceiling: bool) -> tuple[float, BoolArray]:
+        """Return the largest or smallest reading, and the mask of those that equal it, (n_readings,)."""
+        level = float(self.readings.max() if is_ceiling else self.readings.min())
+        return level, self.readings == level
 
 
 def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:

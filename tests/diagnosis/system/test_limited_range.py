@@ -11,7 +11,8 @@ from probewise.diagnosis.evidence.laplace import Linearised, laplace_evidence
 from probewise.diagnosis.fitting.fit import Model, fit
 from probewise.diagnosis.noise.law import white_noise_of_recording
 from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.system.diagnose import prepare_system, readings_near_ends, recording_from_table
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.system.left_out import readings_near_ends, recording_from_table
 from probewise.effects import CorrelatedNoise, Dropouts, Extent
 from probewise.errors import ParameterError
 from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system

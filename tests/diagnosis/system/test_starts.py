@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.system.diagnose import fit_system, recording_from_table
+from probewise.diagnosis.system.first_fit import fit_system
+from probewise.diagnosis.system.left_out import recording_from_table
 from probewise.systems import Law, RunTable, Simulator, System
 
 

@@ -205,4 +205,4 @@ def test_a_second_table_whose_reading_is_misspelt_is_refused(capsys, tmp_path):
     more = tmp_path / "more.csv"
     more.write_text(run_table_csv(runs()).replace("temp_c", "temp"))
     said = refused(capsys, tmp_path, FILE, more=[str(more)])
-    assert "more.csv: no column 'temp_c'; allowed: the reading, as in data.csv; has 'run', 't_s'" in said
+    assert "more.csv: no column 'temp_c'; allowed: the reading, as in data.csv; the header has 'run', 't_s'" in said

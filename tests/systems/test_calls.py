@@ -263,5 +263,21 @@ def test_a_function_that_draws_random_numbers_is_refused(vectorized):
     def noisy(p, data):
         return p["a"] * data["x"] + p["b"] + rng.normal(0, 0.1, len(data["x"]))
 
-    with pytest.raises(ParameterError, match=r"simulate.*called once more.*no random numbers"):
+    with pytest.raises(ParameterError, match=r"simulate.*called again.*no random numbers"):
         _system(noisy, vectorized=vectorized)
+
+
+def test_the_recording_that_is_tried_is_the_one_with_the_most_values():
+    """A column may be empty in the first of two tables."""
+    both = RunTable(
+        {
+            "file": np.repeat(["one", "two"], 5),
+            "x": np.arange(10.0),
+            "u": np.repeat([np.nan, 1.0], 5),
+            "y": np.zeros(10),
+        },
+        run="file",
+    )
+    simulator = Simulator("y", "V", {"a": Uniform(0, 1)}, simulate=lambda p, data: p["a"] * data["u"])
+    system = System.of(simulator, both)
+    np.testing.assert_allclose(system.chain(both, ()).predict(np.array([[0.5]]), both)[0, 5:], 0.5)

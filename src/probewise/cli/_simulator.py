@@ -46,9 +46,10 @@ def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunT
         if path.suffix == ".jsonl":
             raise FileError(path, "a journal", "a CSV table; the journal of an explore run goes with --sensor")
         tables.append(read_run_table(path, time=simulator.time, run=simulator.run))
-        if simulator.reading in tables[0].columns and simulator.reading not in tables[-1].columns:
-            header = ", ".join(repr(name) for name in tables[-1].columns)
-            raise FileError(
-                path, f"no column {simulator.reading!r}", f"the reading, as in {paths[0].name}; has {header}"
-            )
+    with_reading = [path for path, table in zip(paths, tables, strict=True) if simulator.reading in table.columns]
+    for path, table in zip(paths, tables, strict=True):
+        if with_reading and path not in with_reading:
+            header = ", ".join(repr(name) for name in table.columns)
+            allowed = f"the reading, as in {with_reading[0].name}; the header has {header}"
+            raise FileError(path, f"no column {simulator.reading!r}", allowed)
     return concatenate_tables(tables, [path.name for path in paths])

@@ -222,5 +222,7 @@ def _separating_readings_in_words(
         return "", ""
     if sum(map(len, classes)) < 2:
         return None, ""
-    labels = [" or ".join(dict.fromkeys(named[asked.effects[k]] for k in own)) for own in classes]
-    return asked.description, ALL if max(map(len, classes)) == 1 else " from ".join(dict.fromkeys(labels))
+    labels = list(dict.fromkeys(" or ".join(dict.fromkeys(named[asked.effects[k]] for k in own)) for own in classes))
+    if len(labels) < 2:  # formulas for one unknown effect
+        return None, ""
+    return asked.description, ALL if set(labels) == set(named.values()) else " from ".join(labels)

@@ -313,8 +313,8 @@ def _require_finite_and_repeatable(
     if not _nearly_equal(again(own, columns, strict=True), readings[[at]]):
         raise ParameterError(
             caller.name,
-            "other readings when it is called once more with the same parameters",
-            "the same each time: no random numbers, which the noise of FILE.py stands for, and nothing kept in between",
+            "different when it is called again with the same parameters",
+            "the same readings each time: no random numbers (declare the noise instead), no state kept between calls",
         )
 
 

@@ -48,11 +48,11 @@ _SOME = 200  # samples used to estimate the scatter of predictions in each row
 class SystemPrediction(ShowsItself):
     """Predictive distribution of each row's reading, all arrays (n_points,).
 
-    `mean` is within the declared range of the instrument. `sd` is that of one new reading which no end of the range
-    limits, noise and parameters together; `log_density` is the natural logarithm of the
-    predictive density of that row's reading alone, per unit of the reading, NaN without a reading; of a reading at an
-    end of the declared range, it is the log probability of that end, whatever the unit. `n_failed` of `n_samples`
-    samples were left out because the simulator gives no finite readings for them.
+    `mean` is within the declared range of the instrument. `sd` is that of one new reading, noise and parameters
+    together; it ignores the range. `log_density` is the natural logarithm of the predictive density of that row's
+    reading alone, per unit of the reading, NaN without a reading; for a reading at an end of the declared range, it is
+    the log probability of reading that end. `n_failed` of `n_samples` samples were left out because the simulator gives
+    no finite readings for them.
     """
 
     table: RunTable

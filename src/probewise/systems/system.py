@@ -57,8 +57,8 @@ class System:
     limited
         Whether predictions are limited to the declared range of the instrument (`limited_to_range`).
     slack
-        How far within the range, in the unit of the readings, noise may carry a reading to its end. A prediction so
-        near to the end is as good as one beyond it where the reading is at the end.
+        Distance within the range, in the unit of the readings, from which noise may carry a reading to an end. For a
+        reading at an end, a prediction within this distance counts as beyond the end.
     """
 
     simulator: Simulator
@@ -104,7 +104,7 @@ class System:
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])
             if simulator.run is None:  # it is called for one recording after the other
-                table = table.take(table.rows_by_scan()[0])
+                table = table.take(max(table.rows_by_scan(), key=lambda rows: _n_filled_cells(table, rows)))
             columns = columns_without_reading(simulator, table)
             try:
                 caller = Caller.from_trial_calls(
@@ -266,6 +266,10 @@ class System:
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
 
+def _n_filled_cells(table: RunTable, rows: IntArray) -> int:
+    return sum(int(np.isfinite(values[rows]).sum()) for values in table.covariates.values())
+
+
 def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
     """Return the columns passed to `simulate` and `rates`: all except the reading, which they predict."""
     return {name: values for name, values in table.columns.items() if name != simulator.reading}
@@ -275,8 +279,8 @@ def limited_to_range(predicted: FloatArray, system: System, table: RunTable) -> 
     """Limit predictions, (n_samples, n_points), to the declared range, as the instrument does.
 
     Where a reading at an end was recorded, the limit is that reading, which may be rounded, and the prediction is moved
-    towards it by `system.slack`. There is no limit where a reading within the range was recorded: it tells how far off
-    a prediction beyond the range is.
+    towards it by `system.slack`. Where the recorded reading is within the range, the prediction is not limited, so that
+    one beyond the range counts as a misfit.
     """
     noise = system.simulator.noise
     if np.isinf(noise.ends).all():
@@ -326,7 +330,7 @@ class SystemChain:
     def _call_for_each_recording(
         self, caller: Caller, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], plan: RunTable
     ) -> FloatArray:
-        """Call `simulate` with the whole table, or with one recording after the other where it knows no runs.
+        """Call `simulate` with the whole table, or with one recording after the other if the simulator names no run.
 
         A user who names no run writes `simulate` for one recording: a loop over its rows would run on into the next.
         """

@@ -15,7 +15,7 @@ from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.diagnosis.system.left_out import readings_near_ends, recording_from_table
 from probewise.effects import CorrelatedNoise, Dropouts, Extent
 from probewise.errors import ParameterError
-from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system
+from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system, table_for
 
 FULL, BACK, EXPONENT, SD, HIGH = 1250.0, 12.0, 2.0, 6.0, 1000.0
 TRUE = np.array([FULL, BACK, EXPONENT])
@@ -102,7 +102,7 @@ def test_a_signal_that_rests_at_an_end_has_no_offset():
     covariance = np.linalg.inv(found.slopes.T @ found.slopes / found.sd**2 + np.eye(2))
     assert abs(offset) < 4 * 10 * np.sqrt(covariance[1, 1])
     assert abs(found.sd / 3.0 - 1) < 4 / np.sqrt(2 * 150)
-    assert any("left out: it cuts off their noise" in note for note in prepared.recording.notes)
+    assert any("left out: the end cuts off their noise" in note for note in prepared.recording.notes)
 
 
 def test_readings_that_stand_below_the_declared_end_stay():
@@ -185,5 +185,54 @@ def test_a_held_out_reading_at_an_end_gains_nothing_by_another_noise(carry):
 
 def test_readings_that_are_all_at_the_ends_are_refused():
     table = _lamp().with_columns({"lux": np.where(np.arange(150) % 2, HIGH, 0.0)})
-    with pytest.raises(ParameterError, match="all at an end of the declared range"):
+    with pytest.raises(ParameterError, match="readings within the declared range is 0; allowed: 12 or more"):
         prepare_system(LAMP, table)
+
+
+def test_an_end_that_no_reading_reaches_leaves_nothing_out_however_wrong_the_simulator_is():
+    rng = np.random.default_rng(2)
+    x, w = rng.uniform(0, 10, 300), rng.uniform(0, 6, 300)
+    line = {"y": 10 + 4 * x + 28 * np.sin(w) + rng.normal(0, 0.2, 300), "x": x}
+    simulator = Simulator(
+        "y", "V", {"a": (-50, 50), "b": (0, 10)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"range": (-30, 90)},
+    )  # fmt: skip
+    assert prepare_system(simulator, table_for(simulator, line), with_effects=False).recording.usable.all()
+
+
+def test_a_walk_is_no_explanation_of_readings_at_an_end_that_the_simulator_does_not_predict_there():
+    rng = np.random.default_rng(0)
+    x, w = np.tile(np.linspace(0, 10, 60), 2), np.repeat([0.0, 1.0], 60)
+    y = np.minimum(2 + x + 6 * w * (x > 6) + rng.normal(0, 0.3, 120), 12.5)
+    simulator = Simulator(
+        "y", "V", {"a": (-10, 10), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"sd": 0.3, "range": (0, 12.5)},
+    )  # fmt: skip
+    prepared = prepare_system(simulator, table_for(simulator, {"x": x, "w": w, "y": y}))
+    assert prepared.recording.censored.sum() > 10
+    assert "random_walk" not in prepared.effects
+
+
+def test_too_few_readings_within_the_range_are_refused_in_one_line():
+    rng = np.random.default_rng(4)
+    x = np.linspace(0, 10, 60)
+    y = np.where(np.arange(60) < 5, 1 + rng.random(60), 0.0)
+    simulator = Simulator(
+        "y", "V", {"a": (-10, 10), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"range": (0, None)},
+    )  # fmt: skip
+    with pytest.raises(ParameterError, match="readings within the declared range is 5; allowed: 12 or more"):
+        prepare_system(simulator, table_for(simulator, {"x": x, "y": y}))
+
+
+def test_a_rounded_reading_at_a_declared_end_is_no_stop():
+    rng = np.random.default_rng(5)
+    x = np.linspace(0, 10, 300)
+    y = np.round(np.minimum(1 + 0.5 * x + rng.normal(0, 0.05, 300), 4.0951), 2)
+    simulator = Simulator(
+        "y", "V", {"a": (-10, 10), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"range": (0, 4.0951), "step": 0.01},
+    )  # fmt: skip
+    prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": y}), with_effects=False)
+    assert prepared.apparatus.stop is None
+    assert prepared.recording.censored.sum() > 50

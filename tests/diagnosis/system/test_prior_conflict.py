@@ -24,8 +24,8 @@ def _notes(prior, *, slope=SLOPE, seed=3):
 @pytest.mark.parametrize(
     ("prior", "words"),
     [
-        ((0, 1), "per_n is at the upper end of its prior, uniform 0 to 1, but the readings ask for more"),
-        ((3, 9), "per_n is at the lower end of its prior, uniform 3 to 9, but the readings ask for less"),
+        ((0, 1), "per_n is at the upper end of its prior, uniform 0 to 1, but the readings ask for a larger value"),
+        ((3, 9), "per_n is at the lower end of its prior, uniform 3 to 9, but the readings ask for a smaller value"),
         (("log", 0.1, 1), "upper end"),
         (("normal", 1.0, 0.1), "sds above the mean of its prior, normal 1 ± 0.1"),
     ],

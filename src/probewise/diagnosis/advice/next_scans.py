@@ -55,8 +55,8 @@ class NextMeasurement:
     def classes_among(self, hypotheses: Collection[Names]) -> list[list[int]]:
         """Return the classes into which the readings separate some of the hypotheses, by their indices in `effects`.
 
-        Two are in one class if the expected log Bayes factor of either over the other is not worth the readings, or if
-        each is so alike to a third. Hypotheses that were not compared are in none.
+        Two hypotheses share a class if the expected log Bayes factor of one over the other is below `WORTHWHILE_NATS`,
+        directly or through a chain of others. Hypotheses that were not compared are in no class.
         """
         return _classes_told_apart(self.nats, [k for k, names in enumerate(self.effects) if names in hypotheses])
 
@@ -238,7 +238,7 @@ def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> Floa
 
 
 def _classes_told_apart(nats: FloatArray, members: Sequence[int]) -> list[list[int]]:
-    """Return classes of members whose expected log Bayes factors, `nats` (n, n), are not worth further readings."""
+    """Group members that the readings cannot tell apart, by their expected log Bayes factors, `nats` (n, n)."""
     classes: list[list[int]] = []
     for k in members:
         alike = [own for own in classes if any(min(nats[k, j], nats[j, k]) < WORTHWHILE_NATS for j in own)]
@@ -249,7 +249,7 @@ def _classes_told_apart(nats: FloatArray, members: Sequence[int]) -> list[list[i
 def _mean_over_closest(nats: FloatArray, weights: FloatArray) -> float:
     """Return the log Bayes factor of the truth over its closest rival, averaged by weights (n,); `nats` (n, n).
 
-    Rivals in one class count as one, unless all are.
+    Rivals in one class count as one, unless all rivals are in one class.
     """
     classes = _classes_told_apart(nats, range(len(nats)))
     others = np.where(np.eye(len(nats), dtype=np.bool_), np.inf, nats)

@@ -122,13 +122,13 @@ def _refit_log_densities(
 ) -> FloatArray:
     """Return the log predictive density of each held-out reading, from a refit to the others; 0 for lost readings.
 
-    Of a reading at an end of the range it is the log probability: that of a signal beyond the end is 1.
+    At an end of the range it is a log likelihood relative to its peak: 0 where the prediction is beyond the end.
     `rows` (n_points,) and `out` (n_usable,) are masks of the held-out readings. Lost readings (dropouts at one value)
     add the same to every model of the mean.
     """
     kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
     rest = law.take_readings(~out)
-    if not rest.n_kept:  # they tell no noise sd, and so no density
+    if not rest.n_kept:  # without them the noise sd, and so the density, is unknown
         return np.zeros(int(out.sum()))
     without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
     of_its_own = are_of_part_alone(found.slopes, out)

@@ -244,8 +244,8 @@ class NoiseLaw:
 
     @cached_property
     def sd_beside_rounding(self) -> float | FloatArray:
-        """Relative sds as `RoundedNormal` takes them: (n_points, 1), 1 for lost readings; 1.0 if all are equal."""
-        return np.where(self.lost, 1.0, self.sd)[:, None] if np.any(self.sd != 1) else 1.0
+        """Relative sds as `RoundedNormal` takes them: (n_points, 1), 1 where none counts; 1.0 if all are equal."""
+        return np.where(self._counted, self.sd, 1.0)[:, None] if np.any(self.sd != 1) else 1.0
 
     @cached_property
     def _whitening_sd(self) -> FloatArray:

@@ -176,7 +176,7 @@ class NoiseModel:
                 int(lost.sum()),
                 max(self._span / self._lost_value_resolution, 1.0),
             )
-            # Each lost reading has that value to within a cell; a censored one, by probability and not by density.
+            # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
             log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
             log_extra += int((lost & self._censored).sum()) * math.log(self._lost_value_resolution)
             log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
@@ -184,7 +184,7 @@ class NoiseModel:
         return NoiseLaw(
             sd,
             carry,
-            unknown if walk.size else lost,
+            lost,
             value_at_node(noise.wide_share),
             value_at_node(noise.wide_times),
             log_extra,

@@ -61,7 +61,7 @@ def improvement_of(
         Random generator, for the null distribution of the test of the repaired model.
     """
     null = test.null
-    law = after.law
+    law = best.evidence[noise].likeliest_law
     rms = [float(np.sqrt(np.mean(residuals_beside_walk(found.residuals, law) ** 2))) for found in shown]
     log_evidence = best.evidence[noise].log_z - null.evidence[searched.certain].log_z
     if best is null:

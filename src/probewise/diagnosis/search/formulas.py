@@ -65,10 +65,10 @@ def needs_more_than_memoryless_noise(searched: Searched) -> bool:
 
 
 def _promise_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
-    """Return, by formula, its largest log evidence by screening, added to the null, the best single effect, the leader.
+    """Return for each formula its largest screened log evidence beside the null, the best single effect or the leader.
 
-    The leader is the most probable combination. The log prior of what the formula is added to is included, that of the
-    formula is not; with it come the nats by which it may be behind.
+    The leader is the most probable combination. The log prior of what the formula stands beside is included, that of
+    the formula is not. The nats by which a formula may trail there are added.
     """
     usable, null = searched.prepared.usable_rows, searched.null
     singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]

@@ -202,8 +202,8 @@ def _refit_null_from_effects(state: SearchState) -> None:
 def _build_unknown_effects(state: SearchState, misfit_templates: MisfitTemplates) -> UnknownEffects:
     """Build the evidence of unknown effects, without the products of columns that are among the state's formulas.
 
-    As a formula and as a basis a product would be the same hypothesis twice, and the one that says less might lead. The
-    test of the residuals keeps all bases, since the formulas were chosen by these readings.
+    As a formula and as a basis a product would be the same hypothesis twice, and the less specific one, the basis,
+    might lead. The test of the residuals keeps all bases, since the formulas were chosen by these readings.
     """
     null, bases = state.null, misfit_templates.unknown_bases
     formulas = [effect for name, effect in state.effects.items() if name.startswith(PROPOSAL)]

@@ -58,10 +58,10 @@ class Evidences:
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
 
     def named_outweigh_unknown(self, order: int, names: Names, noise: Names) -> bool:
-        """Return whether named effects gain more evidence over the null than all that is added to them.
+        """Return whether the named effects gain more evidence over the null than everything without a name over them.
 
-        Added is an unknown effect, and what the names hold out of vocabulary; without a name in vocabulary, the unknown
-        effect alone. The comparison is at one SSF order, under one noise model.
+        Without a name are the unknown effect, and the effects of `names` that are out of vocabulary; if all of `names`
+        are, only the unknown effect counts. The comparison is at one SSF order, under one noise model.
         """
         named = tuple(name for name in names if not is_out_of_vocabulary(name)) or names
         if not names or not {(order, ()), (order, named)} <= self.fits.keys():

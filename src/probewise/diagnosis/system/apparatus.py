@@ -61,7 +61,7 @@ CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some
 _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
 _N_BLOCKS = 5
-_MOST_MULTIPLIED = 10  # columns with time, 45 products of two: with each more all others are less likely
+_MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
 # Prior odds of one, two, three effects on the mean, and of white noise beside them. A second effect is as likely as a
 # fault of the noise, of which a walk takes up much of what a second effect does. Both are so rare that one effect holds
@@ -137,6 +137,8 @@ class SimulatorApparatus:
         """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""
         extent = Extent.of(recording)
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
+        if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
+            kinds.remove(RandomWalk)
         on_noise = [effect for kind in kinds if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
         stops = {} if self.stop is None else {self.stop.name: self.stop}
@@ -160,7 +162,9 @@ class SimulatorApparatus:
         caller = self.system.caller
         if caller is None:
             return self.system.tally.n_evaluations / self.evaluations_of_a_search
-        return 0.0 if caller.broadcasts else caller.n_calls / CALLS_OF_A_SEARCH
+        # A simulate that knows no runs is called for one recording after the other.
+        n_each = len(self.system.runs) if self.system.simulator.run is None else 1
+        return 0.0 if caller.broadcasts else caller.n_calls / (n_each * CALLS_OF_A_SEARCH)
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:
         """Return whether at least this share of the budget is spent; if so, record that the search was cut short."""

@@ -15,7 +15,7 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.system.finer_step import finer_step_for_repair, searched_at_step
-from probewise.diagnosis.system.first_fit import fit_system
+from probewise.diagnosis.system.first_fit import fit_system, is_noise_sd_known_beside_misfit
 from probewise.diagnosis.system.left_out import (
     NEAR_END,
     readings_near_ends,
@@ -128,9 +128,10 @@ def prepare_system(
         raise ParameterError(
             "usable readings", 0, f"{system.least_readings} or more; column {simulator.reading} has none"
         )
-    if not (recording.usable & ~recording.censored).any():
-        allowed = f"{system.least_readings} or more within the range"
-        raise ParameterError("usable readings", "all at an end of the declared range", allowed)
+    n_within = int((recording.usable & ~recording.censored).sum())
+    if recording.censored.any() and n_within < system.least_readings:
+        allowed = f"{system.least_readings} or more: those at its ends tell no noise"
+        raise ParameterError("readings within the declared range", n_within, allowed)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
     if stop is None:
@@ -139,7 +140,9 @@ def prepare_system(
     near_ends = readings_near_ends(system, found, sd, recording)
     if near_ends.any():
         recording = without_readings_near_ends(system, recording, near_ends)
-        system, found, sd = fit_system(replace(system, first=found.z, slack=NEAR_END * sd), recording)
+        known = is_noise_sd_known_beside_misfit(simulator, table)
+        system = replace(system, first=found.z, slack=NEAR_END * sd if known else 0.0)
+        system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
     recording = replace(recording, notes=(*recording.notes, *conflicts))
@@ -160,7 +163,7 @@ def _progress_with_call_count(progress: Progress, system: System) -> Progress:
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return notes on a simulator's calls (cut short, failed, by fixed values) and its declared noise; else ()."""
+    """Return notes on a simulator's calls (cut short, failed, interpolated) and its declared noise; else ()."""
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
@@ -181,8 +184,8 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     if caller.interpolated:
         names = ", ".join(sorted(caller.interpolated))
         out.append(
-            f"simulate takes no array of {names}: readings are interpolated between fixed values, each as if the "
-            "parameter had always been as it is in its row; where earlier rows act on later ones let simulate take "
+            f"simulate takes no array of {names}: each reading is interpolated between fixed values, as if the "
+            "parameter had had that row's value from the start; if earlier rows affect later ones, let simulate take "
             "arrays, or write a law"
         )
     return tuple(out)

@@ -92,6 +92,11 @@ def _objective_or_infinity(found: Fit) -> float:
     return found.objective if np.isfinite(found.objective) else np.inf
 
 
+def is_noise_sd_known_beside_misfit(simulator: Simulator, table: RunTable) -> bool:
+    """Return whether the noise sd is declared, or successive readings tell it: not from residuals alone."""
+    return simulator.noise.sd is not None or rows_are_in_order(simulator, table)
+
+
 def _noise_sd_of(simulator: Simulator, table: RunTable, recording: Recording, found: Fit) -> float:
     declared = simulator.noise.sd
     known = median_sd_of_column(table, declared) if isinstance(declared, str) else declared

@@ -9,9 +9,10 @@ import numpy as np
 
 from probewise._arrays import BoolArray, IntArray
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.system.first_fit import fit_system
+from probewise.diagnosis.system.first_fit import fit_system, is_noise_sd_known_beside_misfit
 from probewise.diagnosis.thinning import MOST_READINGS, positions_in_stretches
 from probewise.errors import ParameterError
+from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.recordings.plan import Plan
 from probewise.systems import RunRecording, RunTable, Simulator, System, as_recording
 from probewise.systems.forms.stop import (
@@ -124,9 +125,9 @@ def without_readings_at_stop(
 def without_readings_at_scattered_stop(
     system: System, recording: RunRecording
 ) -> tuple[RunRecording, MeterStop | None]:
-    """Leave out, with a note, readings at a stop of the meter that they do not show by standing there in succession.
+    """Leave out, with a note, readings at an undeclared stop of the meter that are scattered over the table.
 
-    A fit to the others must predict them beyond the stop. Returns as `without_readings_at_stop`.
+    The stop counts only if a fit to the other readings predicts these beyond it. Returns as `without_readings_at_stop`.
     """
     for stop, rows in possible_meter_stops_and_masks(recording, system.simulator.reading):
         without = _without_rows_at_stop(recording, stop, rows)
@@ -149,11 +150,16 @@ def readings_near_ends(system: System, found: Fit, sd: float, recording: RunReco
     """Return the mask of the readings at an end of the declared range, and of those whose noise an end cuts off.
 
     Of the latter, the fit predicts the signal near an end or beyond, and explains the reading; (n_points,) in all.
+    There are none at an end that no reading reaches, nor where only the misfit of the simulator tells the noise sd.
     """
     table, own_sd = cast(RunTable, recording.plan), sd * recording.relative_sd
     low, high = system.simulator.noise.ends
+    if not is_noise_sd_known_beside_misfit(system.simulator, table):
+        return recording.usable & recording.censored
+    at_low, at_high = masks_of_readings_at_ends(recording.readings, low, high, system.simulator.noise.step)
     predicted = replace(system, limited=False).chain(table, ()).predict(system.theta(found.z[None, :]), table)[0]
-    is_near = (predicted - low < NEAR_END * own_sd) | (high - predicted < NEAR_END * own_sd)
+    is_near = at_low.any() & (predicted - low < NEAR_END * own_sd)
+    is_near |= at_high.any() & (high - predicted < NEAR_END * own_sd)
     is_explained = np.abs(recording.readings - np.clip(predicted, low, high)) < _EXPLAINED * own_sd
     return np.asarray(recording.usable & (recording.censored | is_near & is_explained))
 
@@ -161,7 +167,7 @@ def readings_near_ends(system: System, found: Fit, sd: float, recording: RunReco
 def without_readings_near_ends(system: System, recording: RunRecording, near_ends: BoolArray) -> RunRecording:
     """Leave out, with a note, those of the readings `near_ends` that are not at an end.
 
-    Of a signal near an end only the noise away from the end is seen: its mean would be wrong. Where too few readings
+    Near an end only noise away from the end is seen, so the mean of these readings is biased. Where too few readings
     would be left for a fit, all stay.
     """
     at_end = near_ends & recording.censored
@@ -174,5 +180,7 @@ def without_readings_near_ends(system: System, recording: RunRecording, near_end
             f"{int(at_end.sum())} readings at an end of the declared range say that the signal is there or beyond"
         )
     if cut.any():
-        said.append(f"{int(cut.sum())} readings near an end of the declared range left out: it cuts off their noise")
+        said.append(
+            f"{int(cut.sum())} readings near an end of the declared range are left out: the end cuts off their noise"
+        )
     return replace(recording, readings=np.where(cut, np.nan, recording.readings), notes=(*recording.notes, *said))

@@ -1,4 +1,4 @@
-"""What the readings contradict of what is known before: the end or mean of a parameter's prior, a declared noise sd."""
+"""Notes on priors and declared noise sds that the readings contradict."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.systems import Simulator, System
 
-_FAR = 4.0  # sds: of 30,000 recordings whose truth is at the end of a prior, one is as far beyond it
+_FAR = 4.0  # sds; if the truth is at the end of its prior, one recording in 30,000 is this far beyond it
 _MUCH = 1.1  # factor by which the noise differs from what was declared
 
 
 def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterator[str]:
     """Yield a note on each parameter of a fitted system, without effects, whose prior the readings contradict.
 
-    What the readings say of a parameter without its own prior is a step of its standard-normal coordinate z from the
-    fit, and the sd of that, both in linear approximation. A bounded prior is linear in its probability: in steps of z
-    its end is as far away as the probability beyond z is large, over the density at z.
+    With the prior of one parameter removed, the readings alone move its standard-normal coordinate z by a step, known
+    to within an sd; both are linear approximations. A bounded prior is uniform in the probability Phi(z), so its end is
+    Phi(-|z|) / phi(z) away, measured in z.
     """
     slopes = law(found.slopes[:, : system.n_params]) / found.sd
     z, curvature = found.z[: system.n_params], slopes.T @ slopes + np.eye(system.n_params)
@@ -35,8 +35,8 @@ def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterat
         if isinstance(prior, Uniform | LogUniform):
             end = float(ndtr(-abs(z[k])) / (np.exp(-0.5 * z[k] ** 2) / np.sqrt(2 * np.pi)))
             if np.sign(z[k]) * step - end > _FAR * sd:
-                where, more = ("upper", "more") if z[k] > 0 else ("lower", "less")
-                yield f"{name} is at the {where} end of its prior, {prior}, but the readings ask for {more}; widen it"
+                where, more = ("upper", "larger") if z[k] > 0 else ("lower", "smaller")
+                yield f"{name} is at the {where} end of its prior, {prior}, but the readings ask for a {more} value"
         elif isinstance(prior, Normal):
             away = z[k] + step
             if abs(away) > _FAR * np.hypot(1, sd):

@@ -89,7 +89,7 @@ def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading")
     for is_ceiling in (True, False) if rows.are_fine else ():
         level, stands = rows.extreme_and_mask(is_ceiling)
         elsewhere = rows.steps[~stands[1:][rows.in_turn]]
-        if level in recording.plan.instrumentation.declared_ends or np.mean(elsewhere == 0) > _OFTEN:
+        if _is_declared_end(level, recording) or np.mean(elsewhere == 0) > _OFTEN:
             continue
         if stands.sum() >= _LEAST_IN_ALL and _longest_streak(stands, rows.in_turn) >= _LEAST_IN_TURN:
             unit = recording.plan.instrumentation.unit
@@ -110,15 +110,15 @@ def possible_meter_stops_and_masks(
         level, stands = rows.extreme_and_mask(is_ceiling)
         n_each = np.unique(rows.readings[~stands], return_counts=True)[1]
         alike = n_each[n_each > 1].sum() / max(n_each.sum(), 1)
-        if level in recording.plan.instrumentation.declared_ends or alike > _OFTEN or stands.sum() < _LEAST_IN_ALL:
+        if _is_declared_end(level, recording) or alike > _OFTEN or stands.sum() < _LEAST_IN_ALL:
             continue
         yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), recording.readings == level
 
 
 def is_signal_beyond(stop: MeterStop, predicted: FloatArray, sd: float) -> bool:
-    """Return whether a fit to the other readings predicts those at a stop, (n_rows,), beyond it but for the noise.
+    """Return whether a fit to the other readings explains those at a stop, which it predicts as `predicted`, (n_rows,).
 
-    Noise of the sd carries some there from two sds within; most of them must be beyond.
+    More than half of them must be predicted beyond the stop, and nine in ten at most two noise sds within it.
     """
     beyond = (predicted - stop.level) * (1.0 if stop.is_ceiling else -1.0)
     return bool(np.mean(beyond > -2 * sd) >= _NEARLY_ALL and np.median(beyond) > 0)
@@ -149,6 +149,12 @@ class _RowsInTurn:
         """Return the largest or smallest reading, and the mask of those that equal it, (n_readings,)."""
         level = float(self.readings.max() if is_ceiling else self.readings.min())
         return level, self.readings == level
+
+
+def _is_declared_end(level: float, recording: Recording) -> bool:
+    """Return whether a reading is at a declared end, to within rounding."""
+    at_level = recording.readings == level
+    return level in recording.plan.instrumentation.declared_ends or bool(recording.censored[at_level].any())
 
 
 def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:

@@ -308,9 +308,9 @@ def _require_finite_and_repeatable(
     if not sound.any():
         raise ParameterError(caller.name, "NaN at every place of the prior that was tried", "finite readings")
     at = int(np.argmax(sound))
-    own = {name: values[[min(at, len(values) - 1)]] for name, values in samples.items()}
     again = Caller(caller.simulate, caller.broadcasts, caller.by_row, name=caller.name)
-    if not _nearly_equal(again(own, columns, strict=True), readings[[at]]):
+    own = _parameters_and_columns_of_sample(samples, columns, at)
+    if not _nearly_equal(again(*own, strict=True), readings[[at]]):
         raise ParameterError(
             caller.name,
             "different when it is called again with the same parameters",

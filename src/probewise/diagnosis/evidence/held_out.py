@@ -157,8 +157,8 @@ def _refit_log_densities(
         return np.asarray(np.logaddexp(narrow, wide))
 
     density = log_density(miss)
-    if own.censored.any():
-        density -= np.where(own.censored, log_density(np.zeros(len(miss))), 0.0)
+    if own.is_censored.any():
+        density -= np.where(own.is_censored, log_density(np.zeros(len(miss))), 0.0)
     return np.asarray(density * own.kept)
 
 
@@ -199,9 +199,8 @@ def sequential_log_densities(
     -------
     Log densities, (n_out,), whose sum is the log of the joint density; of censored readings, relative to the peak.
     """
-    censored = law.censored[out] if law.censored.size else np.zeros(int(out.sum()), dtype=np.bool_)
     whitened, sd = innovations_given_rest(law, np.concatenate([slopes, miss[:, None]], axis=1), out)
-    turned, innovations, kept = whitened[:, :-1], whitened[:, -1], law.kept[out]
+    turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
     mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
     noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
     shares, widths = np.array([1 - law.share, law.share]), _variances_of_narrow_and_wide(law, out, sd)

@@ -115,14 +115,19 @@ class NoiseLaw:
     @property
     def _counted(self) -> BoolArray:
         """Mask of the readings that are neither lost nor censored, (n_points,)."""
-        return ~(self.lost | self.censored) if self.censored.size else ~self.lost
+        return ~(self.lost | self.is_censored)
+
+    @property
+    def is_censored(self) -> BoolArray:
+        """Mask of the readings at an end of the instrument's range, (n_points,), also without one."""
+        return self.censored if self.censored.size else np.zeros(len(self.sd), dtype=np.bool_)
 
     def without_readings_beyond_end(self, residuals: FloatArray) -> NoiseLaw:
         """Return the distribution without the censored readings that a fit with these residuals predicts beyond.
 
         Such a reading tells nothing, whatever small change is added to the prediction.
         """
-        beyond = self.censored & (residuals == 0) if self.censored.size else self.censored
+        beyond = self.is_censored & (residuals == 0)
         return replace(self, lost=self.lost | beyond) if beyond.any() else self
 
     @property

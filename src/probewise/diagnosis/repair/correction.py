@@ -178,6 +178,5 @@ def _held_out_log_densities(found: Fit, problem: Linearised, columns: FloatArray
     miss = (found.residuals - design @ amount)[out]
     total = sigma_2 * own.sd**2 + np.einsum("ij,jk,ik->i", design[out], covariance, design[out])
     # At an end of the range a likelihood is relative to its peak, as for fits (`held_out_gain`).
-    is_density = ~own.censored if own.censored.size else np.True_
-    peak = -0.5 * np.log(2 * math.pi * total) * is_density
+    peak = np.where(own.is_censored, 0.0, -0.5 * np.log(2 * math.pi * total))
     return np.asarray((peak - 0.5 * miss**2 / total) * own.kept)

@@ -27,11 +27,14 @@ def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterat
     slopes = law(found.slopes[:, : system.n_params]) / found.sd
     z, curvature = found.z[: system.n_params], slopes.T @ slopes + np.eye(system.n_params)
     downhill = slopes.T @ law(found.residuals[:, None])[:, 0] / found.sd - z
+    covariance = np.linalg.inv(curvature)
+    variance = np.diag(covariance)
+    with np.errstate(all="ignore"):  # of what the readings do not tell: no number, and no note
+        # Row k of the inverse without the prior of parameter k is that with it over 1 - variance (Sherman-Morrison).
+        steps = (covariance @ downhill + z * variance) / (1 - variance)
+        sds = np.sqrt(variance / (1 - variance))
     for k, (name, prior) in enumerate(system.marginals.items()):
-        own = np.zeros(len(z))
-        own[k] = 1.0
-        without = np.linalg.pinv(curvature - np.outer(own, own), hermitian=True)
-        step, sd = float(without[k] @ (downhill + z[k] * own)), float(np.sqrt(without[k, k]))
+        step, sd = float(steps[k]), float(sds[k])
         if isinstance(prior, Uniform | LogUniform):
             end = float(ndtr(-abs(z[k])) / (np.exp(-0.5 * z[k] ** 2) / np.sqrt(2 * np.pi)))
             if np.sign(z[k]) * step - end > _FAR * sd:

@@ -286,9 +286,8 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
         return
     # One wild reading would move the middle of the range, which tells a ceiling from a floor.
     readings = about.table.columns[about.system.simulator.reading][_expected_readings_and_inliers(about)[1]]
-    lowest, highest = about.system.simulator.noise.range
-    within = readings >= (-np.inf if lowest is None else lowest)
-    within &= readings <= (np.inf if highest is None else highest)
+    lowest, highest = about.system.simulator.noise.ends
+    within = (readings >= lowest) & (readings <= highest)
     # Outside the declared range are no readings of the quantity, such as 9999 for an error.
     least, most = (float(end(readings[within] if within.any() else readings)) for end in (np.min, np.max))
 

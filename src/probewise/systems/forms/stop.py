@@ -153,8 +153,7 @@ class _RowsInTurn:
 
 def _is_declared_end(level: float, recording: Recording) -> bool:
     """Return whether a reading is at a declared end, to within rounding."""
-    at_level = recording.readings == level
-    return level in recording.plan.instrumentation.declared_ends or bool(recording.censored[at_level].any())
+    return bool(recording.censored[recording.readings == level].any())
 
 
 def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:

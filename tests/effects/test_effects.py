@@ -34,7 +34,9 @@ from probewise.effects import (
     LogHeavyTailedPrior,
     MissingTooth,
     Nonlinearity,
+    Overshoot,
     PeriodicPositionError,
+    Polarisation,
     Reflection,
     Saturation,
     ScanAngleError,
@@ -624,6 +626,41 @@ def test_lag_is_the_recursion_in_every_scan():
                 a = np.exp(-(plan.time_s[k] - plan.time_s[k - 1]) / tau)
                 held[k] = a * held[k - 1] + (1 - a) * y[k]
         np.testing.assert_allclose(v, held, atol=1e-12)
+
+
+def test_an_overshoot_is_left_by_every_rise_and_decays():
+    """Pulse by pulse; falls leave nothing, and the time between scans counts."""
+    rng = np.random.default_rng(4)
+    plan, thetas = PLAN.take(np.arange(90, 320)), np.array([[0.1, 0.4], [-0.05, 6.0]])
+    values = rng.normal(size=(2, len(plan)))
+    found = Overshoot().apply(values, thetas, plan)
+    for (share, tau), y, v in zip(thetas, values, found, strict=True):
+        expected = y.copy()
+        for k in range(1, len(plan)):
+            if y[k] > y[k - 1]:
+                expected[k:] += share * (y[k] - y[k - 1]) * np.exp(-(plan.time_s[k:] - plan.time_s[k]) / tau)
+        np.testing.assert_allclose(v, expected, atol=1e-12)
+    np.testing.assert_array_equal(Overshoot().apply(-np.sort(-values, axis=1), thetas, plan), -np.sort(-values, axis=1))
+
+
+def test_an_overshoot_needs_time_that_passes():
+    plan = replace(there_and_back(), time_s=np.zeros(6))
+    assert Overshoot.for_extent(Extent(10.0, 60.0, plan)) is None
+
+
+def test_polarised_light_is_the_law_of_malus():
+    """A polarised share p of the light gives I (1 - p + 2 p cos^2(psi - phi))."""
+    plan, p, phi = replace(there_and_back(), orientation_rad=np.linspace(0.0, 3.0, 6)), 0.03, 0.8
+    theta = p * np.array([[np.cos(2 * phi), np.sin(2 * phi)]])
+    out = Polarisation().apply(np.full((1, 6), 50.0), theta, plan)
+    np.testing.assert_allclose(out[0], 50 * (1 - p + 2 * p * np.cos(plan.orientation_rad - phi) ** 2))
+
+
+def test_polarisation_shows_only_in_orientations_that_differ():
+    opposite = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.3 + np.pi], 3))
+    assert Polarisation.for_extent(Extent(10.0, 60.0, opposite)) is None
+    turned = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.7], 3))
+    assert Polarisation.for_extent(Extent(10.0, 60.0, turned)) is not None
 
 
 def test_saturation_is_a_hard_limit_as_its_softness_goes_to_zero():

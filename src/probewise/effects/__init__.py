@@ -29,10 +29,11 @@ from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun,
 from probewise.effects.noise_distribution import FittedReadings, log_density, reading_variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.origin import CountsFromOrigin, Origin, origins_of
+from probewise.effects.polarisation import Polarisation
 from probewise.effects.pose import Backlash, PositionScale
 from probewise.effects.predictive_mixture import PredictiveMixture
 from probewise.effects.rails import BentRails, MissingTooth
-from probewise.effects.readings import Hysteresis, Lag
+from probewise.effects.readings import Hysteresis, Lag, Overshoot
 from probewise.effects.reflection import Reflection
 from probewise.effects.response import Nonlinearity
 from probewise.effects.saturation import Saturation
@@ -84,7 +85,18 @@ VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
 UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
     {
         effect.name: effect
-        for effect in (ArmKnock, GainStep, BentRails, MissingTooth, StickSlip, Reflection, SlowTurn, SlowSinking)
+        for effect in (
+            ArmKnock,
+            GainStep,
+            BentRails,
+            MissingTooth,
+            StickSlip,
+            Reflection,
+            SlowTurn,
+            SlowSinking,
+            Overshoot,
+            Polarisation,
+        )
     }
 )
 """Physics outside the vocabulary, by name: a diagnosis reports it as unknown, and suggests it as a possible cause."""
@@ -198,7 +210,9 @@ __all__ = [
     "OrientationError",
     "Origin",
     "Outliers",
+    "Overshoot",
     "PeriodicPositionError",
+    "Polarisation",
     "PositionScale",
     "PredictiveMixture",
     "Quantisation",

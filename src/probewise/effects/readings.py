@@ -1,4 +1,4 @@
-"""Memory in the readings: hysteresis in the direction of motion, and a time lag."""
+"""Memory in the readings: hysteresis in the direction of motion, a time lag, and an overshoot."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.motion import direction_varies, sign_of_motion
 from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
@@ -83,22 +84,12 @@ class Lag(NamedEffect[FloatArray]):
         return Product({"tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Return the lagged readings, (n_samples, n_points).
-
-        Each lagged reading is an affine map of the one before. A parallel prefix scan composes the maps in pairs, then
-        pairs of pairs, until each reading's map starts at the beginning of its scan.
-        """
+        """Return the lagged readings, (n_samples, n_points)."""
         same = np.diff(plan.scan, prepend=-1) == 0
-        waited = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
+        waited_s = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
         tau_s = theta[:, :1]
-        carry = np.where(tau_s > 0, np.exp(-waited / np.where(tau_s > 0, tau_s, 1.0)), 0.0)  # 0 where a scan begins
-        held = (1 - carry) * value
-        reach, longest = 1, int(np.bincount(plan.scan).max(initial=1))
-        while reach < longest:
-            held[:, reach:] = held[:, reach:] + carry[:, reach:] * held[:, :-reach]
-            carry[:, reach:] = carry[:, reach:] * carry[:, :-reach]
-            reach *= 2
-        return held
+        kept = np.where(tau_s > 0, np.exp(-waited_s / np.where(tau_s > 0, tau_s, 1.0)), 0.0)  # 0 where a scan begins
+        return _decaying_sum((1 - kept) * value, kept, longest=int(np.bincount(plan.scan).max(initial=1)))
 
     def bank(self) -> FloatArray:
         return single_column_bank(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
@@ -108,3 +99,66 @@ class Lag(NamedEffect[FloatArray]):
             f"each reading keeps part of the previous one, with a time constant of {value_with_sd(mean[0], sd[0])} s: "
             "the electronics lag"
         )
+
+
+@dataclass(frozen=True)
+class Overshoot(NamedEffect[FloatArray]):
+    """An overshoot of the photodetector: each rise of the signal adds `share` of itself, which decays with `tau_s`.
+
+    reading_k + share x sum over j <= k of max(y_j - y_(j-1), 0) exp(-(t_k - t_j) / tau_s), y the signal without it.
+    Below 0, `share` is the part of each rise that comes late. Falls have none.
+    """
+
+    typical: float = 0.02
+    shortest_s: float = 0.2
+    longest_s: float = 20.0
+
+    name = "overshoot"
+    words = "an overshoot where the light grows"
+    stage = Stage.OFFSET
+    units = ("1", "s")
+    covariates = ("time", "direction", "level")
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with time constants from the median time between readings to thirty times it.
+
+        None if all readings share one time.
+        """
+        if not np.any(np.diff(extent.plan.time_s) > 0):
+            return None
+        return cls(shortest_s=extent.gap_s, longest_s=30 * extent.gap_s)
+
+    @cached_property
+    def prior(self) -> Product:
+        return Product({"share": HeavyTailedPrior(self.typical), "tau_s": LogUniform(self.shortest_s, self.longest_s)})
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        waited_s = np.maximum(np.diff(plan.time_s, prepend=plan.time_s[:1]), 0.0)
+        rise = np.maximum(np.diff(value, axis=1, prepend=value[:, :1]), 0.0)
+        decayed = _decaying_sum(rise, np.exp(-waited_s / theta[:, 1:2]), longest=value.shape[1])
+        return np.asarray(value + theta[:, :1] * decayed)
+
+    def bank(self) -> FloatArray:
+        return single_column_bank(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 6))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        share, tau = value_with_sd(abs(mean[0]), sd[0], factor=100), value_with_sd(mean[1], sd[1])
+        if mean[0] > 0:
+            return f"each rise of the signal overshoots by {share} %, which decay with a time constant of {tau} s"
+        return f"{share} % of each rise of the signal comes late, with a time constant of {tau} s"
+
+
+def _decaying_sum(added: FloatArray, kept: FloatArray, *, longest: int) -> FloatArray:
+    """Return s with s_k = kept_k s_(k-1) + added_k, (n_samples, n_points); no sum reaches over `longest` points.
+
+    Each s_k is an affine map of the one before. A parallel prefix scan composes the maps in pairs, then pairs of
+    pairs, until each map starts at the beginning of its sum.
+    """
+    held, carry = np.broadcast_arrays(added, kept)
+    held, carry, reach = held.copy(), carry.copy(), 1
+    while reach < longest:
+        held[:, reach:] = held[:, reach:] + carry[:, reach:] * held[:, :-reach]
+        carry[:, reach:] = carry[:, reach:] * carry[:, :-reach]
+        reach *= 2
+    return held

@@ -1,0 +1,46 @@
+"""Diagnose the cases of chosen kinds of a campaign again, with the engine of today.
+
+    python benchmarks/challenge_again.py CASES.jsonl[.xz] --kind outside --workers 2 --out again.jsonl
+
+An interrupted run resumes where it stopped. `challenges_side_by_side.py` compares the two files.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+from challenges_side_by_side import read_cases
+
+from probewise import __version__
+from probewise.campaign import run_campaign
+from probewise.challenge.case import Task, run_case
+
+
+def main() -> None:
+    """Diagnose the cases that are missing in the file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", type=Path)
+    parser.add_argument("--kind", action="append", required=True, help="a kind of cases, as outside; may be repeated")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    keys = [key for key, result in read_cases(options.cases).items() if result.get("kind") in options.kind]
+    if not keys:
+        parser.error(f"{options.cases} holds no case of kind {', '.join(options.kind)}")
+    tasks = {key: Task(*map(int, key.split(" / "))) for key in keys}
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        run_campaign(
+            run_case,
+            tasks,
+            path=options.out,
+            settings={"challenge": __version__, "seed": tasks[keys[0]].seed},
+            executor=pool,
+            noun="cases",
+        )
+
+
+if __name__ == "__main__":
+    main()

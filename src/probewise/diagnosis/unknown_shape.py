@@ -86,6 +86,10 @@ class SensorAndShape:
         """Description of the sensor's SSF, in words."""
         return self.sensor.ssf_in_words
 
+    def coordinates(self, theta: FloatArray) -> FloatArray | None:
+        """Return None: what it simulates is no array of readings."""
+        return None
+
     @property
     def predicts_in_bulk(self) -> bool:
         """Whether many samples cost little more than one: False."""

@@ -261,6 +261,10 @@ class System:
         """Map standard-normal coordinates, (n_samples, n_params), to parameters of that shape."""
         return self.prior.from_unit_cube(ndtr(z))
 
+    def coordinates(self, theta: FloatArray) -> FloatArray:
+        """Map parameters to standard-normal coordinates, (n_samples, n_params) both."""
+        return np.asarray(ndtri(self.prior.to_unit_cube(theta)))
+
     def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
         """Return the chain of the system with effects, ordered by stage; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))

@@ -75,6 +75,10 @@ class CalibratedSensor(ABC):
         """False: every sample costs as much as the first."""
         return False
 
+    def coordinates(self, theta: FloatArray) -> FloatArray | None:
+        """Return None: what it simulates is no array of readings."""
+        return None
+
     @property
     def predicts_cheaply_nearby(self) -> bool:
         """False: a prediction costs as much near another one as elsewhere."""

@@ -30,7 +30,7 @@ _VALLEY_DAMPINGS = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # times the curvatur
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
-def _difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+def difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return z and points one small step along each coordinate, (n_params + 1, n_params), and the signed steps."""
     # Steps point inwards, to stay within the bounds.
     steps = np.where(z > 0, -_STEP, _STEP)
@@ -101,7 +101,7 @@ class Model:
 
         The slopes are by all coordinates or, (n_points, n_coordinates), by those with the indices `by`.
         """
-        points, steps = _difference_points_and_steps(z)
+        points, steps = difference_points_and_steps(z)
         if by is not None:
             points, steps = points[[0, *(1 + by)]], steps[by]
         return _prediction_and_slopes(self.predict(points, plan), steps)
@@ -247,7 +247,7 @@ def _fit_coroutine(
             return np.asarray(law.minus_log_likelihood(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
     def request_slopes(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
-        points, steps = _difference_points_and_steps(z)
+        points, steps = difference_points_and_steps(z)
         return _prediction_and_slopes((yield points)[:, usable], steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
@@ -272,7 +272,7 @@ def _fit_coroutine(
         tries = _points_after_steps(z, tries)
         # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
         about = (
-            [_difference_points_and_steps(at) for at in tries] if model.sensor.predicts_in_bulk and not nearby else []
+            [difference_points_and_steps(at) for at in tries] if model.sensor.predicts_in_bulk and not nearby else []
         )
         batch = yield np.concatenate([points for points, _ in about]) if about else tries[: 1 if nearby else None]
         if nearby and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:

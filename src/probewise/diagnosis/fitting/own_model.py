@@ -82,6 +82,10 @@ class OwnModel(Null):
         """Map standard-normal coordinates to parameters, (n_samples, n_params) both."""
         return self.prior.from_unit_cube(ndtr(z))
 
+    def coordinates(self, theta: FloatArray) -> FloatArray:
+        """Map parameters to standard-normal coordinates, (n_samples, n_params) both."""
+        return np.asarray(ndtri(self.prior.to_unit_cube(theta)))
+
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> _OwnModelWithEffects:
         """Return the model with effects; `n_nodes` is not used.
 

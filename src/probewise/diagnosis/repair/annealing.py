@@ -34,6 +34,7 @@ def importance_resample(
     *,
     n_wanted: int,
     rng: np.random.Generator,
+    least: float = _LEAST_OF_IT * _ENOUGH,
 ) -> FloatArray | None:
     """Draw from a density by importance resampling, if the effective sample size suffices.
 
@@ -45,24 +46,25 @@ def importance_resample(
         Unnormalised log densities of the proposal and the target, (n, n_params) -> (n,); `log_p` is minus infinity
         outside its support.
     n_wanted
-        Number of samples to draw; the effective sample size should be half of it, and at least a quarter.
+        Number of samples to draw; the effective sample size should be half of it.
     rng
         Source of randomness.
+    least
+        Least acceptable effective sample size, as a share of `n_wanted`.
 
     Returns
     -------
     Samples in random order, (n_wanted, n_params); None if the effective sample size is too small.
     """
-    least = _LEAST_OF_IT * _ENOUGH * n_wanted
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
     share = _n_distinct_effective(gain, first[:n_wanted]) / len(gain)
-    if share * len(first) < least:
+    if share * len(first) < least * n_wanted:
         return None
     enough = min(math.ceil(_ENOUGH * n_wanted / share), len(first))
     if enough > n_wanted:
         more = first[n_wanted:enough]
         gain = np.append(gain, log_p(more) - log_q(more))
-    if _n_distinct_effective(gain, first[: len(gain)]) < least:
+    if _n_distinct_effective(gain, first[: len(gain)]) < least * n_wanted:
         return None
     rows = resampled_rows(np.exp(gain - gain.max()), n_wanted, rng)
     return np.asarray(first[rng.permutation(rows)])

@@ -31,7 +31,7 @@ _ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly 
 
 
 @dataclass(frozen=True, eq=False)
-class _Group:
+class AmplitudeGroup:
     """Amplitudes with one component of the mixture in common: one alone, or values with one scale.
 
     `at` (n,): numbers of their coordinates; `prior`: theirs; `typical`: the unit of their values here; `sds`
@@ -52,6 +52,10 @@ class _Group:
         unit = self.prior.to_unit_cube(values * self.typical)
         return np.asarray(np.clip(ndtri(unit), -FARTHEST, FARTHEST))
 
+    def log_prior_of_value(self, values: FloatArray) -> FloatArray:
+        """Return the log prior density of values of one amplitude, in typical sizes, (n_samples,), up to a constant."""
+        return np.asarray(self.prior.log_prob(values[:, None] * self.typical))
+
     def values_by_coordinates(self, z: FloatArray) -> FloatArray:
         """Return the derivatives of the values by the coordinates at z (n,), (n, n)."""
         steps = _STEP * np.eye(len(z))
@@ -67,7 +71,7 @@ class LinearAmplitudes:
     likelihood by x, the latter at x = 0.
     """
 
-    groups: tuple[_Group, ...]
+    groups: tuple[AmplitudeGroup, ...]
     x: FloatArray
     curvature: FloatArray
     downhill: FloatArray
@@ -84,7 +88,7 @@ class LinearAmplitudes:
             Whitened slopes (n_points, n_params) and residuals (n_points,), in noise sds.
         """
         z_sd = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes + np.eye(len(found.z)))))
-        groups = tuple(group for group in _groups_of_amplitudes(found) if np.any(z_sd[list(group.at)] > _STRAIGHT))
+        groups = tuple(group for group in two_sided_amplitude_groups(found) if np.any(z_sd[list(group.at)] > _STRAIGHT))
         if not groups:
             return None
         x, by_x = found.z.copy(), slopes.copy()
@@ -124,19 +128,19 @@ class LinearAmplitudes:
         return np.asarray(likelihood - 0.5 * np.sum(z**2, axis=1))
 
 
-def _groups_of_amplitudes(found: Fit) -> Iterator[_Group]:
+def two_sided_amplitude_groups(found: Fit) -> Iterator[AmplitudeGroup]:
     """List the amplitudes of a fit's effects that may have either sign, values with one scale together."""
     for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
         own = effect.prior
         if isinstance(own, SharedScalePrior):
             every = tuple(range(columns.start, columns.stop))
-            yield _Group(every, own, own.typical, own.component_sds / own.typical)
-        for k, one in _two_sided_amplitude_priors(effect).items():
+            yield AmplitudeGroup(every, own, own.typical, own.component_sds / own.typical)
+        for k, one in _two_sided_priors(effect).items():
             alone = Product({own.names[k]: one})
-            yield _Group((columns.start + k,), alone, one.typical, one.component_sds / one.typical)
+            yield AmplitudeGroup((columns.start + k,), alone, one.typical, one.component_sds / one.typical)
 
 
-def _two_sided_amplitude_priors(effect: NamedEffect[Any]) -> dict[int, HeavyTailedPrior]:
+def _two_sided_priors(effect: NamedEffect[Any]) -> dict[int, HeavyTailedPrior]:
     """Return the heavy-tailed priors of the amplitudes that may have either sign, by the number of the parameter."""
     marginals = list(getattr(effect.prior, "marginals", {}).values())
     own = {k: marginals[k] for k in effect.amplitudes if k < len(marginals)}

@@ -21,6 +21,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.repair.annealing import Density, draw_by_annealing, importance_resample
+from probewise.diagnosis.repair.conditionally_linear import ConditionallyLinearDensity
 from probewise.diagnosis.repair.linear_amplitudes import LinearAmplitudes
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
@@ -45,6 +46,8 @@ N_SAMPLES = 500
 N_WALKERS = 250
 _MOVES = 6  # moves of posterior samples after a step
 _N_FIRST = 1000  # draws of which posterior samples are chosen by weight
+_LEAST = 0.25  # least effective share of draws by a linear view of the simulation,
+_NEARLY_ALL = 0.8  # and where slices of the simulation itself cost little
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
@@ -131,8 +134,9 @@ def sample_model(
 
     Samples of the Laplace approximation are moved to the posterior in two stages, the first through a quadratic
     surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse.
-    Where many samples cost little more than one, they are drawn by importance instead: from a `ProfiledDensity` if an
-    effect has a nonlinear coordinate, or else from `LinearAmplitudes`.
+    If an effect on the readings has a nonlinear coordinate, they are drawn by importance instead, from a
+    `ConditionallyLinearDensity`; where many samples cost little more than one, from a `ProfiledDensity` if an effect
+    has a nonlinear coordinate, or else from `LinearAmplitudes`.
 
     Parameters
     ----------
@@ -245,7 +249,14 @@ def _posterior_draws(
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
-    if model.sensor.predicts_in_bulk:
+    in_bulk = model.sensor.predicts_in_bulk
+    given = ConditionallyLinearDensity.of(found, law, recording, steps @ steps.T, sd)
+    if given is not None:
+        first, least = given.draw(N_SAMPLES if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
+        weighed = importance_resample(first, given.log_density, log_posterior, n_wanted=N_SAMPLES, rng=rng, least=least)
+        if weighed is not None:
+            return weighed
+    if in_bulk:
         profiled = ProfiledDensity.of(found, law, recording)
         if profiled is not None:
             weighed = profiled.importance_resample(log_posterior, n_first=_N_FIRST, n_wanted=N_SAMPLES, rng=rng)

@@ -56,7 +56,7 @@ def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):
 def test_a_case_goes_through_strict_json_into_every_row(number):
     """And one of them again: it depends on its seed and number alone."""
     found = run_case(Task(1, number))
-    if number == 9:
+    if number == 1:
         assert {**run_case(Task(1, number)), "cpu_s": None} == {**found, "cpu_s": None}
     found = json.loads(json.dumps(found, allow_nan=False))
     assert "failed" not in found

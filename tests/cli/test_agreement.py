@@ -32,6 +32,7 @@ class Arm:
 """
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_frames")
 def test_a_run_and_the_diagnosis_of_its_journal_agree(sensor_file, tmp_path):

@@ -68,6 +68,7 @@ def test_more_play_than_the_approach_takes_up_depends_on_the_direction(tmp_path)
     assert (off[~from_below] > off[from_below].max() + 0.3).all()
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_frames")
 def test_play_that_is_not_known_is_another_circle_to_the_robot_which_says_so(sensor_file, tmp_path):

@@ -111,6 +111,7 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     assert found.judged.unknown_probability < 0.05
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
@@ -233,6 +234,7 @@ CASES = [
 ]
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 @pytest.mark.parametrize(("effect", "combination"), CASES)
 def test_each_effect_is_named_in_a_two_way_recording(effect, combination):

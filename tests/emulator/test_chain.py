@@ -52,7 +52,7 @@ def test_an_arm_that_is_built_otherwise_finds_the_circle_and_never_touches_the_t
     run("calibrate", "mine.csv", "--out", "my_sensor", "--method", "quick", "--orders", "1", "2")
     truth = ",".join(f"{number:g}" for number in TRUTH.values())
     said = run(
-        *("explore", "--sensor", "my_sensor/sensor.json", "--geometry", "fitted.toml", *arm),
+        *("explore", "--sensor", "my_sensor/sensor.json", "--geometry", "fitted.toml", *arm, "--trust", "1"),
         *("--truth", truth, "--out", "found"),
     )
     assert "of these sds its own error makes up" in said

@@ -480,6 +480,7 @@ def test_an_effect_found_in_a_run_counts_from_0_beside_one_from_far_away(sensor,
     np.testing.assert_allclose(predict(mended, plan).mean, expected, rtol=1e-9)
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 def test_a_robot_that_doubts_finds_the_circle_and_what_is_wrong_with_its_sensor():
     """Without doubt it ends sure and wrong on this circle or does not end.

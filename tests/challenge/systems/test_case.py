@@ -27,6 +27,7 @@ def test_a_case_is_the_same_each_time():
     assert json.dumps(one) == json.dumps(again)
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 def test_a_slow_wave_is_not_left_to_a_walk_of_the_noise():
     """A case that was `unknown` at .71: fitted beside a walk alone, a wave of a run and a half had no amplitude."""

@@ -172,6 +172,7 @@ def test_a_prior_that_holds_more_than_what_was_found_in_it_is_a_doubt(stepped, m
     assert "agrees to a nat and its own error, but it doubts itself" in sentence_with_agreement("A reason.", weighings)
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 def test_a_peak_that_the_search_has_lost_is_found_from_the_fit(stepped, monkeypatch):
     """Samples of the line in quite another place: a ledge of the likelihood from which nothing leads back."""

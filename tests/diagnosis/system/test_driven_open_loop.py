@@ -29,6 +29,7 @@ def positioning():
     return {"t_s": time, "force_n": np.array(force), "q_m": np.array(position) + noise}
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 def test_friction_and_an_offset_are_found_in_a_positioning_system_that_runs_away_without_them(positioning):
     bare = Simulator(

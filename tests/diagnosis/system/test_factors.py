@@ -50,6 +50,7 @@ def test_a_misfit_that_asks_for_a_small_change_offers_the_linear_one_alone():
     assert len(bind_forms(_about(1.0))[NAME].variants()) == 1
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 def test_a_rate_that_doubles_every_ten_degrees_is_named_with_its_slope_at_the_mean():
     """By a factor of 64 over the table: linearly, it would fall below zero at the cold end."""

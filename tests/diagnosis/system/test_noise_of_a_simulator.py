@@ -60,6 +60,7 @@ def test_known_sds_are_noise_of_the_rows_and_no_outliers():
     np.testing.assert_allclose(predicted.sd, sigma, rtol=0.2)
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 def test_three_faults_of_the_noise_are_each_given_a_size():
     rng = np.random.default_rng(7)

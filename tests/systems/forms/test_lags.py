@@ -133,6 +133,7 @@ def test_the_smooth_variant_has_a_twentieth_of_the_prior_of_the_first():
     np.testing.assert_allclose(templates.variant_probabilities(np.log([3.0, 1.0, 4.0])), [20 / 21, 1 / 21])
 
 
+@pytest.mark.single_case
 @pytest.mark.slow
 @pytest.mark.parametrize(("tau", "delay"), [(0.6, 0.0), (0.0, 0.5)])
 def test_a_thermometer_that_is_read_once_in_its_time_constant_is_told_from_one_that_comes_late(tau, delay):

@@ -648,6 +648,15 @@ def test_an_overshoot_needs_time_that_passes():
     assert Overshoot.for_extent(Extent(10.0, 60.0, plan)) is None
 
 
+@pytest.mark.parametrize(("gap", "told"), [(0.03, True), (0.0, False)])
+def test_a_size_of_either_sign_is_told_with_its_range(gap, told):
+    """And one that is not told from 0 has no sign to tell."""
+    share = 0.01 * np.random.default_rng(3).standard_normal(500)
+    samples = np.stack([share + gap * np.sign(share), np.full(500, 6.0)], axis=1)
+    said = sentence_from_samples(Overshoot(), samples)
+    assert ("; its size share may have either sign, between -0.05" in said) is told
+
+
 def test_polarised_light_is_the_law_of_malus():
     """A polarised share p of the light gives I (1 - p + 2 p cos^2(psi - phi))."""
     plan, p, phi = replace(there_and_back(), orientation_rad=np.linspace(0.0, 3.0, 6)), 0.03, 0.8

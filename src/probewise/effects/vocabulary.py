@@ -19,6 +19,8 @@ from probewise.sensor.stages import Effect, NoiseParameters
 
 V = TypeVar("V")
 
+_BOTH_SIGNS = 0.05  # least share of samples of either sign
+_NEAR_ZERO, _FEW_NEAR_ZERO = 0.1, 0.01  # in medians of their sizes; of a normal distribution about 0, .054 are so near
 _LEAST_WITH_POINT = 1e-7  # a smaller sd has no two digits among eight after the point
 
 
@@ -238,9 +240,24 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
 
 
 def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
-    """Describe an effect by samples of its parameters, (n_samples, n_params), and its origin, if that is not 0."""
+    """Describe an effect by samples of its parameters, (n_samples, n_params), and its origin, if that is not 0.
+
+    Of an amplitude that is not 0, but of either sign, it says so and between what values it lies.
+    """
     sentence = effect.sentence(*mean_and_sd_of_samples(samples))
+    for k in effect.amplitudes:
+        if _is_of_either_sign(samples[:, k]):
+            low, high = np.quantile(samples[:, k], [0.025, 0.975])
+            name, unit = effect.prior.names[k], "" if effect.units[k] == "1" else f" {effect.units[k]}"
+            sentence += f"; its size {name} may have either sign, between {low:.2g} and {high:.2g}{unit} (95 %)"
     return f"{sentence} ({effect.counted_from})" if effect.counted_from else sentence
+
+
+def _is_of_either_sign(values: FloatArray) -> bool:
+    """Return whether samples, (n_samples,), are on both sides of 0, but hardly any near it."""
+    positive = np.mean(values > 0)
+    near = np.mean(np.abs(values) < _NEAR_ZERO * np.median(np.abs(values)))
+    return bool(_BOTH_SIGNS < positive < 1 - _BOTH_SIGNS and near < _FEW_NEAR_ZERO)
 
 
 def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]:

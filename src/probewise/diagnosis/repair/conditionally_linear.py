@@ -155,8 +155,8 @@ class ConditionallyLinearDensity:
     @property
     def _probable_range(self) -> tuple[float, float]:
         """The range of the nodes that are not improbable, with one more on either side."""
-        (probable,) = np.flatnonzero(self._probable_mask)[[0, -1]][None]
-        return float(self.nodes[max(probable[0] - 1, 0)]), float(self.nodes[min(probable[1] + 1, len(self.nodes) - 1)])
+        first, last = np.flatnonzero(self._probable_mask)[[0, -1]]
+        return float(self.nodes[max(first - 1, 0)]), float(self.nodes[min(last + 1, len(self.nodes) - 1)])
 
     def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""

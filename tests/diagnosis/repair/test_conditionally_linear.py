@@ -4,13 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from refitted import refitted_with
 
-from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.repair.samples import sample_model
-from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.refits import Refits
-from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.systems import RunTable, Simulator
 
@@ -33,12 +29,7 @@ def fitted(request):
     y = 10 * np.exp(-_TIME / 30) + 1.5 * np.exp(-_TIME / 25) + _SD * np.random.default_rng(5).standard_normal(_N)
     simulator = Simulator("y", "cm", {"level": (0, 20)}, simulate=request.param, time="t", run="run")
     prepared = prepare_system(simulator, RunTable({"t": _TIME, "run": _RUN, "y": y}, time="t", run="run"))
-    prior = prepared.apparatus.prior_odds(prepared.effects)
-    refits = Refits(prepared.null, NoiseModels(prepared.recording, {}, prior), TemplateCache(prepared.usable_rows))
-    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.noise_effect_names}
-    state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
-    fit_nulls(state, prepared, max_order=1)
-    return prepared, state.refits.refit_with_effect(state.null, state.effects["settling"])[0]
+    return prepared, refitted_with(prepared, "settling")
 
 
 def _probabilities_by_quadrature(readings, effect):

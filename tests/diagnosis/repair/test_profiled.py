@@ -2,15 +2,11 @@
 
 import numpy as np
 import pytest
+from refitted import refitted_with
 from scipy.special import ndtr
 
-from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.samples import sample_model
-from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.refits import Refits
-from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.systems import RunTable, Simulator
 
@@ -28,12 +24,7 @@ def _settled(seed):
         time="t", run="run",
     )  # fmt: skip
     prepared = prepare_system(simulator, RunTable({"t": time, "run": run, "y": y}, time="t", run="run"))
-    prior = prepared.apparatus.prior_odds(prepared.effects)
-    refits = Refits(prepared.null, NoiseModels(prepared.recording, {}, prior), TemplateCache(prepared.usable_rows))
-    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.noise_effect_names}
-    state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
-    fit_nulls(state, prepared, max_order=1)
-    candidate = state.refits.refit_with_effect(state.null, state.effects["settling"])[0]
+    candidate = refitted_with(prepared, "settling")
     return prepared.recording, candidate, candidate.evidence[()]
 
 

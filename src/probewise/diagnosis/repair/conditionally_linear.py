@@ -128,7 +128,7 @@ class ConditionallyLinearDensity:
         precision = np.ones((len(amplitude.sds), len(x)))
         precision[:, own] = amplitude.sds**-2.0
         every = curvature[:, None] + precision[:, :, None] * np.eye(len(x))
-        roots = np.linalg.cholesky(every)
+        roots = np.asarray(np.linalg.cholesky(every), dtype=np.float64)
         means = np.linalg.solve(every, downhill[:, None, :, None])[..., 0]
         volume = np.log(np.diagonal(roots, axis1=2, axis2=3)).sum(axis=2) - 0.5 * np.log(precision).sum(axis=1)
         log_prior = -0.5 * nodes**2

@@ -1,4 +1,4 @@
-"""Polarised light: the signal varies with twice the sensor's orientation."""
+"""Polarised light: the signal varies as the cosine of twice the sensor's orientation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST_EQUAL = 0.01
 
 @dataclass(frozen=True)
 class Polarisation(LinearEffect[FloatArray]):
-    """Glossy paper polarises the light and the sensor sees one direction more strongly (the law of Malus).
+    """Glossy paper partly polarises the light, and the sensor is more sensitive to one polarisation (law of Malus).
 
     signal x (1 + cos_frac cos 2 psi + sin_frac sin 2 psi), psi the sensor's orientation.
     """

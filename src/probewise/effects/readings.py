@@ -103,10 +103,10 @@ class Lag(NamedEffect[FloatArray]):
 
 @dataclass(frozen=True)
 class Overshoot(NamedEffect[FloatArray]):
-    """An overshoot of the photodetector: each rise of the signal adds `share` of itself, which decays with `tau_s`.
+    """An overshoot: at each rise the detector reads too high by `share` times the rise, an excess that decays.
 
-    reading_k + share x sum over j <= k of max(y_j - y_(j-1), 0) exp(-(t_k - t_j) / tau_s), y the signal without it.
-    Below 0, `share` is the part of each rise that comes late. Falls have none.
+    y_k + share x sum over j <= k of max(y_j - y_(j-1), 0) exp(-(t_k - t_j) / tau_s), y the readings without it. If
+    `share` is negative, that fraction of each rise arrives late. Falls cause nothing.
     """
 
     typical: float = 0.02

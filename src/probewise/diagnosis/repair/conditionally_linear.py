@@ -1,9 +1,9 @@
-"""The posterior of an effect on the readings that is linear in all but one parameter, such as a time constant.
+"""The posterior of an effect on the readings, over a grid of one of its parameters, such as a time constant.
 
-Given that parameter and the component of the amplitude's prior, a mixture of normal distributions, the tangent of the
-simulation makes all else jointly normal: evidences are in closed form, over a fine grid of that parameter and over all
-components. A settling about as slow as what it is added to is an example: amplitude and time constant lie on a
-hyperbola, whose two branches no normal approximation holds.
+The prior of its amplitude is a mixture of normal distributions. Fix one component of it and the value of the gridded
+parameter, and replace the simulation by its tangent: all other parameters are then approximately jointly normal, and
+their evidence is in closed form. A settling about as slow as what it is added to is an example: its amplitude and time
+constant lie on a hyperbola, whose two branches no single normal distribution fits.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ _BLOCK = 2_000_000  # numbers in memory for one block of nodes
 
 @dataclass(frozen=True, eq=False)
 class ConditionallyLinearDensity:
-    """A density of a fit's coordinates: a grid in one of them, and normal mixtures of all others at each node.
+    """A density of a fit's coordinates: a grid in one of them, and at each node a mixture of normals in the others.
 
-    The others are the value of one amplitude, in typical sizes, and the straight coordinates of all else.
+    Those are the value of the effect's amplitude, in units of its typical size, and the straight coordinates (see
+    `LinearView`) of every other parameter.
 
     Parameters
     ----------
@@ -69,7 +70,9 @@ class ConditionallyLinearDensity:
 
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, recording: Recording, covariance: FloatArray, sd: float) -> Self | None:
-        """Return the density over the least known of the coordinates that are not linear; None if there is none.
+        """Return the density over the least known of the coordinates that can be gridded; None if there is none.
+
+        It can be that of an effect on the readings, without change points, with one amplitude of either sign.
 
         Parameters
         ----------

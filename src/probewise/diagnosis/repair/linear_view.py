@@ -1,4 +1,4 @@
-"""A model whose simulated readings are linear in its parameters; the effects on the readings act as they are."""
+"""A model whose simulation is linearised; its effects on the readings are applied exactly."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ _STEP = 1e-6  # of a coordinate, for differences
 
 @dataclass(frozen=True, eq=False)
 class LinearView:
-    """The tangent, in the model's own parameters, of what a model simulates before its effects on the readings.
+    """The tangent of what a model simulates before its effects on the readings.
 
-    Its straight coordinates are linear in the parameters of the null, and are the coordinates of all else. Those of a
-    uniform prior are not straight: many a simulation is linear in a level from which it starts.
+    It is linear in straight coordinates. For a parameter of the null (the model without effects) that is a linear
+    function of the parameter; for one of an effect it is its coordinate, whose prior is standard normal. Many
+    simulations are linear in a parameter, such as a starting level, but not in the coordinate of its uniform prior.
 
     Parameters
     ----------
@@ -42,9 +43,10 @@ class LinearView:
 
     @classmethod
     def of(cls, found: Fit) -> Self | None:
-        """Return the tangent at a fit; None if the model simulates no readings, or none that are finite there.
+        """Return the tangent at a fit; None if the model does not simulate readings, or not all of them are finite.
 
-        A light sensor simulates what each of its Gaussians sees.
+        A light sensor simulates what each of its Gaussians sees. Also None where parameters have no coordinates of
+        their own (`Null.coordinates`).
         """
         model = found.model
         downstream = [model.coordinate_slice(effect.name) for effect in model.effects if acts_on_readings(effect)]

@@ -11,7 +11,9 @@ from probewise.diagnosis.repair.repair import PredictionAndResiduals, Repair, re
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.recordings import Plan, Recording, Uniform
 
-LAG = SimpleNamespace(name="lag", counted_from="", sentence=lambda mean, sd: f"it lags by {mean[0]:.0f} s")
+LAG = SimpleNamespace(
+    name="lag", counted_from="", amplitudes=(), sentence=lambda mean, sd: f"it lags by {mean[0]:.0f} s"
+)
 
 
 def repair(absent=None, residuals=(1.0, np.nan)):

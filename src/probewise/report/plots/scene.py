@@ -23,6 +23,8 @@ OUTLINE_BLUE = "#3fa7ff"  # likewise; hypotheses are blue, as in the paper
 DARK_EDGE = "#c8c8c8"  # edge of a square whose reading was dark
 GROUND = "#2a1a12"  # background of the legend, as dark as the map at its darkest: everything on the map shows on it
 
+_NOTHING = 1e-9  # of a utility
+
 
 def playing_field(
     utility: FloatArray,
@@ -75,7 +77,9 @@ def playing_field(
     dx, dy = (x_mm[1] - x_mm[0]) / 2, (y_mm[1] - y_mm[0]) / 2
     if np.isnan(utility).any():
         paint_out_of_reach(ax)
-    top = utility_max if utility_max is not None else max(float(np.nanmax(utility)), 1e-9)
+    top = utility_max if utility_max is not None else float(np.nanmax(utility))
+    if top <= _NOTHING:
+        top = 1.0  # a scale of nothing would have a power of ten
     image = ax.imshow(
         np.ma.masked_invalid(utility),
         origin="lower",

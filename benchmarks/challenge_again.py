@@ -14,9 +14,7 @@ from pathlib import Path
 
 from challenges_side_by_side import read_cases
 
-from probewise import __version__
-from probewise.campaign import run_campaign
-from probewise.challenge.case import Task, run_case
+from probewise.challenge.run import run_cases
 
 
 def main() -> None:
@@ -30,16 +28,9 @@ def main() -> None:
     keys = [key for key, result in read_cases(options.cases).items() if result.get("kind") in options.kind]
     if not keys:
         parser.error(f"{options.cases} holds no case of kind {', '.join(options.kind)}")
-    tasks = {key: Task(*map(int, key.split(" / "))) for key in keys}
+    seeds, numbers = zip(*(map(int, key.split(" / ")) for key in keys), strict=True)
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        run_campaign(
-            run_case,
-            tasks,
-            path=options.out,
-            settings={"challenge": __version__, "seed": tasks[keys[0]].seed},
-            executor=pool,
-            noun="cases",
-        )
+        run_cases(numbers, seed=seeds[0], path=options.out, executor=pool)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""One effect, refitted as a diagnosis does it."""
+"""The state of a search after its nulls, and one effect refitted in it, as a diagnosis does."""
 
 from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.search.noises import NoiseModels
@@ -7,11 +7,18 @@ from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.state import SearchState
 
 
-def refitted_with(prepared, name):
-    """The likeliest candidate with one effect on the mean, under white noise."""
+def state_with_nulls(prepared, on_noise=None):
+    """The nulls are fitted, under white noise and the effects on the noise by name."""
     prior = prepared.apparatus.prior_odds(prepared.effects)
-    refits = Refits(prepared.null, NoiseModels(prepared.recording, {}, prior), TemplateCache(prepared.usable_rows))
+    noises = NoiseModels(prepared.recording, on_noise or {}, prior)
+    refits = Refits(prepared.null, noises, TemplateCache(prepared.usable_rows))
     on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.noise_effect_names}
     state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
     fit_nulls(state, prepared, max_order=1)
+    return state
+
+
+def refitted_with(prepared, name):
+    """The likeliest candidate with one effect on the mean, under white noise."""
+    state = state_with_nulls(prepared)
     return state.refits.refit_with_effect(state.null, state.effects[name])[0]

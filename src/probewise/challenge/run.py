@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from typing import Any
 
@@ -56,7 +56,21 @@ def run_challenge(
     """
     if n_cases < 1:
         raise ParameterError("n_cases", n_cases, "1 or more")
-    tasks = [Task(seed, number) for number in range(n_cases)]
+    return run_cases(range(n_cases), seed=seed, work=work, of=of, path=path, executor=executor, progress=progress)
+
+
+def run_cases(
+    numbers: Iterable[int],
+    *,
+    seed: int,
+    work: Callable[[Task], Mapping[str, Any]] = run_case,
+    of: str = "",
+    path: str | os.PathLike[str],
+    executor: Executor | None = None,
+    progress: Progress = silent,
+) -> tuple[Mapping[str, Any], ...]:
+    """Run the cases of these numbers, or resume them; all else is as in `run_challenge`."""
+    tasks = [Task(seed, number) for number in numbers]
     results = run_campaign(
         work,
         {task.key: task for task in tasks},

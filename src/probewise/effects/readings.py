@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.decaying_sum import decaying_sum
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
@@ -89,7 +90,7 @@ class Lag(NamedEffect[FloatArray]):
         waited_s = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
         tau_s = theta[:, :1]
         kept = np.where(tau_s > 0, np.exp(-waited_s / np.where(tau_s > 0, tau_s, 1.0)), 0.0)  # 0 where a scan begins
-        return _decaying_sum((1 - kept) * value, kept, longest=int(np.bincount(plan.scan).max(initial=1)))
+        return decaying_sum((1 - kept) * value, kept, longest=int(np.bincount(plan.scan).max(initial=1)))
 
     def bank(self) -> FloatArray:
         return single_column_bank(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
@@ -136,7 +137,7 @@ class Overshoot(NamedEffect[FloatArray]):
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         waited_s = np.maximum(np.diff(plan.time_s, prepend=plan.time_s[:1]), 0.0)
         rise = np.maximum(np.diff(value, axis=1, prepend=value[:, :1]), 0.0)
-        decayed = _decaying_sum(rise, np.exp(-waited_s / theta[:, 1:2]), longest=value.shape[1])
+        decayed = decaying_sum(rise, np.exp(-waited_s / theta[:, 1:2]), longest=value.shape[1])
         return np.asarray(value + theta[:, :1] * decayed)
 
     def bank(self) -> FloatArray:
@@ -147,18 +148,3 @@ class Overshoot(NamedEffect[FloatArray]):
         if mean[0] > 0:
             return f"each rise of the signal overshoots by {share} %, which decay with a time constant of {tau} s"
         return f"{share} % of each rise of the signal comes late, with a time constant of {tau} s"
-
-
-def _decaying_sum(added: FloatArray, kept: FloatArray, *, longest: int) -> FloatArray:
-    """Return s with s_k = kept_k s_(k-1) + added_k, (n_samples, n_points); no sum reaches over `longest` points.
-
-    Each s_k is an affine map of the one before. A parallel prefix scan composes the maps in pairs, then pairs of
-    pairs, until each map starts at the beginning of its sum.
-    """
-    held, carry = np.broadcast_arrays(added, kept)
-    held, carry, reach = held.copy(), carry.copy(), 1
-    while reach < longest:
-        held[:, reach:] = held[:, reach:] + carry[:, reach:] * held[:, :-reach]
-        carry[:, reach:] = carry[:, reach:] * carry[:, :-reach]
-        reach *= 2
-    return held

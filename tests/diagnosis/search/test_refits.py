@@ -7,14 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refitted import state_with_nulls
 
-from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.search import search as searching
-from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import fit_nulls
 from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, is_significantly_better
 from probewise.diagnosis.search.searched import Evidences, posterior_of
-from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.twins import are_proportional
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.effects import CorrelatedNoise, Extent, RandomWalk
@@ -45,16 +42,8 @@ def state(prepared):
 
 
 def _state(prepared):
-    prior = prepared.apparatus.prior_odds(prepared.effects)
     extent = Extent.of(prepared.recording)
-    on_noise = {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)}
-    refits = Refits(
-        prepared.null, NoiseModels(prepared.recording, on_noise, prior), TemplateCache(prepared.usable_rows)
-    )
-    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.noise_effect_names}
-    state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
-    fit_nulls(state, prepared, max_order=1)
-    return state
+    return state_with_nulls(prepared, {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)})
 
 
 def test_a_twin_has_the_evidence_of_a_refit_of_its_own(state):

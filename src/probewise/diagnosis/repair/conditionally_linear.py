@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.special import logsumexp
@@ -23,7 +23,6 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.repair.linear_amplitudes import AmplitudeGroup, two_sided_amplitude_groups
 from probewise.diagnosis.repair.linear_view import LinearView, acts_on_readings
-from probewise.effects import NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import effects_with_columns
 
@@ -117,7 +116,7 @@ class ConditionallyLinearDensity:
         x = found.z[rest]
         x[own] = amplitude.values(found.z[None, list(amplitude.at)])[0, 0]
         moved = x + np.concatenate([np.zeros((1, len(x))), _STEP * np.eye(len(x))])
-        points = np.tile(_inserted(moved, at, own, amplitude), (len(nodes), 1, 1))
+        points = np.tile(_inserted(moved, at, amplitude), (len(nodes), 1, 1))
         points[:, :, at] = nodes[:, None]
         sigma = law.likeliest_sigma(law(found.residuals)[:, None])
         n_at_once = max(1, _BLOCK // (len(moved) * len(found.residuals)))
@@ -171,7 +170,7 @@ class ConditionallyLinearDensity:
         apart = np.linalg.solve(self.roots[node, component].transpose(0, 2, 1), eps)[..., 0]
         value = self.nodes[node] + (rng.random(n_samples) - 0.5) * (self.nodes[1] - self.nodes[0])
         middle = self._interpolated_means(value)[np.arange(n_samples), component]
-        out = _inserted(middle + apart, self.at, self._own, self.amplitude)
+        out = _inserted(middle + apart, self.at, self.amplitude)
         out[:, self.at] = value
         return self.view.coordinates(out)
 
@@ -236,9 +235,9 @@ def _number_without(at: int, other: int) -> int:
     return other - (other > at)
 
 
-def _inserted(x: FloatArray, at: int, own: int, amplitude: AmplitudeGroup) -> FloatArray:
+def _inserted(x: FloatArray, at: int, amplitude: AmplitudeGroup) -> FloatArray:
     """Return coordinates, (n, n_params), of all but one in which an amplitude is a value, (n, n_params - 1)."""
-    out = x.copy()
+    out, own = x.copy(), _number_without(at, amplitude.at[0])
     out[:, [own]] = amplitude.coordinates(x[:, [own]])
     return np.insert(out, at, 0.0, axis=1)
 
@@ -248,11 +247,7 @@ def _grid_coordinates_with_amplitudes(found: Fit) -> Iterator[tuple[int, Amplitu
     groups = {group.at: group for group in two_sided_amplitude_groups(found) if len(group.at) == 1}
     for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
         amplitudes = tuple(columns.start + k for k in effect.amplitudes)
-        if _is_on_readings(effect) and amplitudes in groups:
+        if acts_on_readings(effect) and not effect.has_change_point and amplitudes in groups:
             for at in range(columns.start, columns.stop):
                 if at not in amplitudes:
                     yield at, groups[amplitudes]
-
-
-def _is_on_readings(effect: NamedEffect[Any]) -> bool:
-    return acts_on_readings(effect) and not effect.has_change_point

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -48,9 +48,10 @@ class LinearView:
         A light sensor simulates what each of its Gaussians sees. Also None where parameters have no coordinates of
         their own (`Null.coordinates`).
         """
-        model = found.model
-        downstream = [model.coordinate_slice(effect.name) for effect in model.effects if acts_on_readings(effect)]
-        upstream = np.delete(np.arange(model.n_params), np.r_[(*downstream, slice(0, 0))])
+        model, is_upstream = found.model, np.ones(found.model.n_params, dtype=np.bool_)
+        for effect in filter(acts_on_readings, model.effects):
+            is_upstream[model.coordinate_slice(effect.name)] = False
+        upstream = np.flatnonzero(is_upstream)
         points, steps = difference_points_and_steps(found.z)
         theta = model.sensor.theta(found.z[None, : model.sensor.n_params])
         if model.sensor.coordinates(theta) is None:
@@ -101,6 +102,6 @@ class LinearView:
         return self.model.chain.readings_from_simulated_view(view, self.model.theta(z), self.model.plan)
 
 
-def acts_on_readings(effect: NamedEffect[object]) -> bool:
+def acts_on_readings(effect: NamedEffect[Any]) -> bool:
     """Return whether an effect changes readings that are simulated already."""
     return effect.stage >= Stage.SEEN

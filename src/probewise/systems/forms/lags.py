@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.effects.decaying_sum import decaying_sum
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
@@ -80,6 +81,8 @@ def lagged_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> Fl
     out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
     tau, smooth = theta[:, :1], theta[:, 1:2] > 0.5
     for rows in table.rows_by_scan():
+        if len(rows) < 2:
+            continue
         time, x = table.time_s[rows], out[:, rows]
         gaps = np.diff(time)
         with np.errstate(divide="ignore"):
@@ -87,8 +90,8 @@ def lagged_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> Fl
         gain = (1 - carry) * x[:, 1:]
         if smooth.any():
             gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(Spline(time, x), tau, carry), gain)
-        for k in range(1, len(rows)):
-            out[:, rows[k]] = carry[:, k - 1] * out[:, rows[k - 1]] + gain[:, k - 1]
+        added, kept = np.insert(gain, 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
+        out[:, rows] = decaying_sum(added, kept, longest=len(rows))
     return out
 
 

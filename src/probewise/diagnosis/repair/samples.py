@@ -250,7 +250,7 @@ def _posterior_draws(
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
     in_bulk = model.sensor.predicts_in_bulk
-    given = ConditionallyLinearDensity.of(found, law, recording, steps @ steps.T, sd)
+    given = ConditionallyLinearDensity.of(found, law, recording, steps.T @ steps, sd)
     if given is not None:
         first, least = given.draw(N_SAMPLES if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
         weighed = importance_resample(first, given.log_density, log_posterior, n_wanted=N_SAMPLES, rng=rng, least=least)

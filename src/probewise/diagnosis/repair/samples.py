@@ -14,18 +14,12 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats,
 from probewise.calibration.fields import choose_pixel_mm, gaussians_sorted_by_mass, posterior_mean_ssf_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
-from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.repair.annealing import Density, draw_by_annealing, importance_resample
-from probewise.diagnosis.repair.conditionally_linear import ConditionallyLinearDensity
-from probewise.diagnosis.repair.linear_amplitudes import LinearAmplitudes
-from probewise.diagnosis.repair.profiled import ProfiledDensity
-from probewise.diagnosis.repair.quadratic import QuadraticPredictions
-from probewise.diagnosis.repair.surrogate import SurrogatePosterior
+from probewise.diagnosis.repair.posterior_draws import posterior_draws
 from probewise.diagnosis.repair.variant_weights import weights_beside_other_effects
 from probewise.effects import (
     NUISANCES,
@@ -43,14 +37,6 @@ from probewise.recordings.plan import Recording
 from probewise.sensor import ACCURATE_NODES, Chain
 
 N_SAMPLES = 500
-N_WALKERS = 250
-_MOVES = 6  # moves of posterior samples after a step
-_N_FIRST = 1000  # draws of which posterior samples are chosen by weight
-_LEAST = 0.25  # least effective share of draws by a linear view of the simulation,
-_NEARLY_ALL = 0.8  # and where slices of the simulation itself cost little
-# The surrogate costs next to nothing.
-_N_NEAR = 2000
-_MOVES_NEAR = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +118,7 @@ def sample_model(
 ) -> ModelSamples:
     """Draw 500 samples of a model from its posterior about a fit, under one noise model.
 
-    Samples of the Laplace approximation are moved to the posterior in two stages, the first through a quadratic
-    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse.
-    If an effect on the readings has a nonlinear coordinate, they are drawn by importance instead, from a
-    `ConditionallyLinearDensity`; where many samples cost little more than one, from a `ProfiledDensity` if an effect
-    has a nonlinear coordinate, or else from `LinearAmplitudes`.
+    `posterior_draws` draws their coordinates. Parameters of noise effects, variants and the noise's sd are drawn here.
 
     Parameters
     ----------
@@ -150,14 +132,14 @@ def sample_model(
     rng
         Source of randomness.
     annealed
-        Whether samples are moved to the posterior; otherwise they stay those of the Laplace approximation, with
-        `LinearAmplitudes`.
+        Whether samples are of the posterior; otherwise of Laplace's approximation, with `LinearAmplitudes`.
     progress
         Called with the progress of annealing.
     """
     law, n_samples = noise.likeliest_law, N_SAMPLES
     weights = weights_beside_other_effects(found, law, np.flatnonzero(recording.usable), weights)
-    z = np.clip(_posterior_draws(found, noise, recording, annealed, progress, rng=rng), -FARTHEST, FARTHEST)
+    draws = posterior_draws(found, noise, recording, N_SAMPLES, annealed=annealed, rng=rng, progress=progress)
+    z = np.clip(draws, -FARTHEST, FARTHEST)
     # Samples that are not annealed serve for the effects only: their noise is that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
     residuals = recording.readings[recording.usable] - predicted
@@ -209,84 +191,6 @@ def draw_noise_sd(law: NoiseLaw, residuals: FloatArray, *, rng: np.random.Genera
 def noise_sd_by_node(noise: NoiseEvidence, *, with_rounding: bool) -> FloatArray:
     """Return the sd of the noise at each node of a rounding noise model, (n_nodes,), with the rounding or without."""
     return np.array([own.sigma * (own.sd_factor_of_rounding if with_rounding else 1.0) for own in noise.nodes.laws])
-
-
-def _posterior_draws(
-    found: Fit,
-    noise: NoiseEvidence,
-    recording: Recording,
-    annealed: bool,
-    progress: Progress,
-    *,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Draw coordinates, (N_SAMPLES, n_params), from the posterior; from Laplace's approximation unless `annealed`."""
-    law, model = noise.likeliest_law, found.model
-    whitened, turned = law(found.residuals)[:, None], law(found.slopes)
-    sigma = law.likeliest_sigma(whitened)
-    sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), 1e-150)
-    curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
-    # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps leave
-    # the SSF's geometry unchanged, which speeds up vectorised predictions.
-    order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
-    at, steps = np.ix_(order, order), np.empty_like(curvature)
-    steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
-    normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, 1e-150))[:, 0]
-    if not annealed:
-        linear = LinearAmplitudes.of(found, turned / sd, normal / sd)
-        if linear is not None:
-            return linear.draw(N_SAMPLES, rng=rng)
-    center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
-    center = np.clip(center, -FARTHEST, FARTHEST)
-    if not np.isfinite(model.predict(center[None, :])[0, recording.usable]).all():
-        center = found.z  # the step left the domain of the formula
-    draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
-    if not annealed:
-        return np.asarray(center + draws @ steps)
-    problem, usable = HypothesisProblem(model, recording, noise.with_likeliest_node_alone), recording.usable
-
-    def log_posterior(z: FloatArray) -> FloatArray:
-        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
-        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
-
-    in_bulk = model.sensor.predicts_in_bulk
-    given = ConditionallyLinearDensity.of(found, law, recording, steps.T @ steps, sd)
-    if given is not None:
-        first, least = given.draw(N_SAMPLES if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
-        weighed = importance_resample(first, given.log_density, log_posterior, n_wanted=N_SAMPLES, rng=rng, least=least)
-        if weighed is not None:
-            return weighed
-    if in_bulk:
-        profiled = ProfiledDensity.of(found, law, recording)
-        if profiled is not None:
-            weighed = profiled.importance_resample(log_posterior, n_first=_N_FIRST, n_wanted=N_SAMPLES, rng=rng)
-            if weighed is not None:
-                return weighed
-        linear = LinearAmplitudes.of(found, turned / sd, normal / sd)
-        if linear is not None:
-            first = linear.draw(_N_FIRST, rng=rng)
-            weighed = importance_resample(first, linear.log_density, log_posterior, n_wanted=N_SAMPLES, rng=rng)
-            if weighed is not None:
-                return weighed
-    quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
-    near = SurrogatePosterior.of(quadratic, center, steps, recording.readings[usable], law)
-
-    def log_laplace(e: FloatArray) -> FloatArray:
-        return np.asarray(-0.5 * np.sum(e**2, axis=1))
-
-    def log_posterior_of_steps(e: FloatArray) -> FloatArray:
-        return log_posterior(center + e @ steps)
-
-    def resampled_or_annealed(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
-        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng)
-        if weighed is not None:
-            return weighed
-        return draw_by_annealing(
-            first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress
-        )
-
-    e = resampled_or_annealed(draws, log_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
-    return center + resampled_or_annealed(e, near.log_density, log_posterior_of_steps, _MOVES, N_SAMPLES) @ steps
 
 
 def _sd_without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:

@@ -4,8 +4,8 @@ My pendulum does not swing as it should
 
 Shows how a simulator of one's own is diagnosed. The pendulum here is slowed down by the air, by the square of its
 speed; the simulator in ``simulators/pendulum.py`` knows only friction in proportion to the speed. The recording is
-made by SciPy's integrator, which shares no code with what explains it. With ``--out swings.csv`` it is written, for the
-command line.
+made by SciPy's integrator, which shares no code with what explains it. With ``--out swings.csv`` it is only written, for
+the command line.
 """
 
 # %%
@@ -54,6 +54,7 @@ parser.add_argument("--out", type=Path)
 out = parser.parse_args(sys.argv[1:] if sys.argv[0].endswith("plot_pendulum.py") else []).out
 if out is not None:
     out.write_text(run_table_csv(RunTable(swings, "t_s", "release")), encoding="utf-8")
+    sys.exit()  # the rest shows what the command line does with this file
 
 # %%
 # The simulator: a law of motion, here from Python; ``simulators/pendulum.py`` says the same in a file.

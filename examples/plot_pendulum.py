@@ -4,8 +4,8 @@ My pendulum does not swing as it should
 
 Shows how a simulator of one's own is diagnosed. The pendulum here is slowed down by the air, by the square of its
 speed; the simulator in ``simulators/pendulum.py`` knows only friction in proportion to the speed. The recording is
-made by SciPy's integrator, which shares no code with what explains it. With ``--out swings.csv`` it is only written, for
-the command line.
+made by SciPy's integrator, which shares no code with what explains it. With ``--out swings.csv`` it is only written,
+for the command line.
 """
 
 # %%

@@ -32,7 +32,11 @@ FILES = {
         ('data["power_w"]', 'data["power"]'), "line 10: simulate raises KeyError: 'power'; allowed: columns run, t_s,",
     ),
     "readings of another shape": (("return p", "return np.ones(3)\n    return p"), "shape (3,); allowed: (36,)"),
-    "no number at all": (("return p", 'return np.nan * data["t_s"]\n    return p'), "NaN at every place"),
+    "an effect of one's own without mass": (
+        ("noise =", 'extra = {"drag": {"prior": (1, 1), "null": 0.0, "says": "drag {value}"}}\nnoise ='),
+        "extra['drag']['prior'] is (1, 1); allowed:",
+    ),
+    "no number at all": (("return p", 'return np.nan * data["t_s"]\n    return p'), "not finite at any of the"),
     "a prior without mass": (("(0, 10)", "(10, 10)"), "parameters['gain'] is (10, 10)"),
     "a prior of nothing": (("(0, 10)", "()"), "parameters['gain'] is ()"),
     "a run that the table lacks": (('"run"\n', '"pass"\n'), "column pass: no such column; the header has 'run', 't_s'"),
@@ -144,6 +148,28 @@ def test_a_table_given_twice_is_refused(capsys, tmp_path):
     assert "these hold the same rows" in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "data.csv"),))
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (cell(5, "temp_c", "warm"), "more.csv: reading 'temp_c' in row 5 is warm; allowed: a number in each row"),
+        (cell(5, "t_s", "1"), "more.csv: column 't_s' in row 5 is 1.0; allowed: 10 or more"),
+    ],
+)
+def test_a_mistake_in_a_further_table_is_told_with_its_file_and_row(capsys, tmp_path, text, said):
+    (tmp_path / "more.csv").write_text(text)
+    assert said in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "more.csv"),))
+
+
+def test_an_error_of_a_rate_is_answered_by_what_a_rate_is(capsys, tmp_path):
+    said = refused(capsys, tmp_path, law_whose_rates('raise ValueError("too hot")'))
+    assert "rates raises ValueError: too hot; allowed: a function that returns a rate for each state" in said
+
+
+def test_readings_of_a_law_that_have_another_shape_are_told_of_observe(capsys, tmp_path):
+    law = law_whose_rates('return {"temp_c": -s["temp_c"]}') + "\n\ndef observe(s, p, u):\n    return np.ones(3)\n"
+    assert "observe returns an array of shape (3,); allowed: (" in refused(capsys, tmp_path, law)
+
+
 def test_a_journal_is_refused(capsys, tmp_path):
     (tmp_path / "journal.jsonl").write_text("{}\n")
     assert "a journal; allowed: a CSV table" in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "journal.jsonl"),))
@@ -158,7 +184,7 @@ def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():
     prepared = prepare_system(
         simulator, _table(np.where(x == 3, np.nan, x), 2 * x + 0.1 * np.sin(9 * x)), with_effects=False
     )
-    assert "1 readings left out: a column that the simulator reads is missing there" in prepared.recording.notes
+    assert "1 reading left out: a column that the simulator reads is missing there" in prepared.recording.notes
     assert 3 not in prepared.usable_rows
 
 

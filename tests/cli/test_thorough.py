@@ -18,5 +18,5 @@ def test_a_thorough_diagnosis_states_both_evidences(recording_file, sensor_file,
     jsonschema.validate(document, diagnosis_schema())
     assert [] in [weighed["effects"] for weighed in document["thorough"]]
     assert all(weighed["agree"] for weighed in document["thorough"])
-    assert document["reason"].endswith("nested sampling agrees to a nat and its own error.")
+    assert document["reason"].endswith("nested sampling agrees to within a nat plus its standard error.")
     assert "ln Z, nested sampling" in (out / "report.html").read_text(encoding="utf-8")

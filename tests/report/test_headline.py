@@ -144,7 +144,7 @@ def test_a_formula_is_no_covariate():
 def test_the_likeliest_of_rivals_too_long_to_be_listed_is_named():
     rivals = [("hysteresis",), ("lag",)]
     said = headline(found("cannot_tell", rivals[0], rivals=rivals))
-    assert said.startswith("Something is missing, most likely an offset between both directions of motion;")
+    assert said.startswith("Something is missing, most likely an offset that depends on the direction;")
 
 
 def test_many_rivals_of_which_none_is_probable_are_not_named():

@@ -39,8 +39,10 @@ def test_the_same_table_twice_is_refused():
 
 def test_texts_where_the_first_has_numbers_are_refused():
     first, second = runs(), runs((25.0,), names="7")
-    texts = second.with_columns({"room_c": np.full(len(second), "warm")})
-    with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv"):
+    cells = second.columns["room_c"].astype(str)
+    cells[2] = "warm"
+    texts = second.with_columns({"room_c": cells})
+    with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv in row 4 is 'warm'"):
         concatenate_tables([first, texts], ["a.csv", "b.csv"])
 
 

@@ -82,7 +82,7 @@ def test_a_row_that_lacks_a_column_is_not_predicted_and_the_others_are():
     table = runs()
     power = table.columns["power_w"].copy()
     power[3] = np.nan
-    with pytest.warns(DoubtfulResultWarning, match=r"1 rows .* first row 5"):
+    with pytest.warns(DoubtfulResultWarning, match=r"1 row .* first row 5"):
         found = predicted(fitted(), table.with_columns({"power_w": power}))
     assert np.flatnonzero(np.isnan(found.mean)).tolist() == [3]
 
@@ -175,13 +175,18 @@ def test_a_model_with_a_lag_refuses_a_time_that_falls_within_a_run_and_one_witho
 _STEP_AT = 24.5
 
 
-def _model_with_a_step_at_a_row():
-    """A constant of 1 that jumps by 2 after row 24 of 40, of a recording without a time."""
+def _step_without_a_time():
+    """A constant of 1 that jumps by 2 after row 24 of 40, of a recording without a time: the fit without the jump."""
     rng = np.random.default_rng(4)
     x = rng.normal(size=40)
     table = RunTable({"x": x, "y": 1.0 + x + 2.0 * (np.arange(40) > _STEP_AT)})
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"])
-    about = ReferenceFit(System.of(simulator, table), table, np.zeros(1), 0.1)
+    return ReferenceFit(System.of(simulator, table), table, np.zeros(1), 0.1)
+
+
+def _model_with_a_step_at_a_row():
+    about = _step_without_a_time()
+    simulator, table = about.system.simulator, about.table
     names = ("a", *(f"offset_step.{name}" for name in bind_forms(about)["offset_step"].prior.names))
     model = FittedSystem(
         simulator,
@@ -192,6 +197,12 @@ def _model_with_a_step_at_a_row():
         known=extract_stored_fit(about),
     )
     return model, table
+
+
+def test_a_step_at_a_row_is_told_as_a_spreadsheet_counts():
+    """The step is between data rows 24 and 25, counted from 0; data row 25 is row 27 of the file."""
+    form = bind_forms(_step_without_a_time())["offset_step"]
+    assert "at row 27 of the table" in form.sentence(np.array([2.0, _STEP_AT]), np.array([0.1, 0.3]))
 
 
 def test_a_step_at_a_row_is_there_in_the_recording_and_its_first_rows():
@@ -267,7 +278,7 @@ def test_an_effect_with_a_memory_goes_on_after_a_row_that_lacks_an_input(effect)
         known=extract_stored_fit(about),
     )
     whole = predicted(model, table).mean
-    with pytest.warns(DoubtfulResultWarning, match=r"1 rows .* first row 5"):
+    with pytest.warns(DoubtfulResultWarning, match=r"1 row .* first row 5"):
         found = predicted(model, _with_missing_power(table, 3))
     assert np.flatnonzero(np.isnan(found.mean)).tolist() == [3]
     others = np.arange(len(table)) != 3

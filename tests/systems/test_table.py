@@ -39,7 +39,7 @@ def test_two_columns_of_one_name_are_refused():
         def items(self) -> Iterator[tuple[str, list[float]]]:  # type: ignore[override]  # as of a data frame
             return iter([("x", [1.0]), ("x", [2.0])])
 
-    with pytest.raises(ParameterError, match=r"columns is 'x'; allowed: each column once"):
+    with pytest.raises(ParameterError, match=r"columns is 'x twice'; allowed: each column once"):
         RunTable(Frame())
 
 

@@ -39,7 +39,7 @@ def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunT
     Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,
     ParameterError if two tables are the same.
     """
-    from probewise.systems import concatenate_tables, read_run_table
+    from probewise.systems import as_recording, concatenate_tables, read_run_table
 
     tables = []
     for path in paths:
@@ -52,4 +52,10 @@ def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunT
             header = ", ".join(repr(name) for name in table.columns)
             allowed = f"the reading, as in {with_reading[0].name}; the header has {header}"
             raise FileError(path, f"no column {simulator.reading!r}", allowed)
+        if len(paths) > 1:  # after they are joined, a row would be one of no file
+            try:
+                as_recording(simulator, table)
+                table.require_rising_time()
+            except ParameterError as error:
+                raise FileError(path, f"{error.name} is {error.value}", error.allowed) from error
     return concatenate_tables(tables, [path.name for path in paths])

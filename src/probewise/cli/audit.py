@@ -69,7 +69,7 @@ def _audit_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanA
     refuse_sensor_options(arguments, "sensor")
     simulator = read_simulator(arguments.simulator)
     table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)
-    progress("laying out effects")
+    progress("building the effects")
     return audit_system(simulator, table)
 
 

@@ -32,12 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--systems",
         action="store_true",
-        help="recordings of twelve kinds of system, each with its owner's file, instead of a light sensor's",
+        help="recordings of twelve kinds of system, each with its simulator's file, instead of a light sensor's",
     )
     add_count_option(
         parser,
         "--rounds",
-        "take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: none)",
+        "take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: no further "
+        "readings)",
         default=1,
     )
     add_executor(parser)

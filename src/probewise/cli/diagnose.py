@@ -52,8 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--thorough",
         action="store_true",
-        help="compute the evidence of the leading hypotheses by nested sampling too; it counts where it differs from "
-        "the Laplace approximation by more than a nat and its own error (says first how long it may take)",
+        help="compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
+        "approximation where they differ by more than one nat plus its standard error and no run gives a warning "
+        "(first says how long it may take)",
     )
     add_out_directory(parser)
     add_seed_and_quiet(parser)

@@ -28,7 +28,7 @@ class Words:
 
     `null`: the calibrated model; `find_signal`: how to obtain a signal; `settles_nothing`: no reading separates two
     aliased effects; `run`: name of a group of rows; `next_plan`, `model`: files of the next readings and of the
-    repaired model; `no_cure`: no further rows would make an effect detectable; `covariates`: words for a table's time,
+    repaired model; `no_cure`: what to say where no scan to add is proposed; `covariates`: words for a table's time,
     row, level and previous row; None: not a table. `own_names`: what a person has named, such as columns, which no
     sentence capitalises.
     """

@@ -32,7 +32,7 @@ class Hysteresis(LinearEffect[FloatArray]):
     unit: str = field(default="", kw_only=True)
 
     name = "hysteresis"
-    words = "an offset between both directions of motion"
+    words = "an offset that depends on the direction"
     stage = Stage.OFFSET
     units = ("reading",)
     covariates = ("direction",)

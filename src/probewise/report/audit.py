@@ -87,7 +87,7 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
 
 def _alias_class_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     if not audit.classes:
-        return (paragraph("These rows can tell all effects apart that they can detect."),)
+        return (paragraph("These rows tell apart all effects that they can detect."),)
     opening = "Classes of aliased effects, directly or through others in the class:"
     rows = ((str(k), ", ".join(map(spoken_name, names))) for k, names in enumerate(audit.classes, start=1))
     return (paragraph(opening), table(("class", "effects"), rows))

@@ -373,7 +373,7 @@ def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         return ()
     return (
         table(
-            ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree to a nat and the error"),
+            ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree to a nat plus the error"),
             (
                 (
                     hypothesis_in_words(w.effects),
@@ -461,8 +461,11 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
 def _why_nothing_held_out(diagnosis: Diagnosis) -> str:
     if not diagnosis.repair.changes_predictions:
         return "The predicted mean is as calibrated: there is no repair to test on held-out readings."
-    run = diagnosis.apparatus.words.run
-    return f"No {run} could be held out: that takes two {run}s of eight readings or more."
+    if isinstance(diagnosis.apparatus, SimulatorApparatus):
+        return (
+            "Nothing could be held out: that takes two runs of eight readings or more, or a single run with about 40."
+        )
+    return "No scan could be held out: that takes two scans of eight readings or more."
 
 
 def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
@@ -542,7 +545,7 @@ def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
     ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
-        return (paragraph("None: these readings can tell all effects apart that they can detect."),)
+        return (paragraph("None: these readings tell apart all effects that they can detect."),)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
     if not rest:
         return (_alias_table(first),)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise.diagnosis import ALARM, Diagnosis
+from probewise.diagnosis.residuals.bases import MEMORY, PRODUCTS, SCAN_ENDS
 from probewise.effects import PROPOSAL, UNNAMED
 from probewise.report.covariate import covariate_in_words_and_unit
 from probewise.report.effect_words import effect_in_words, effects_in_words, hypothesis_in_words, join_lists, join_names
@@ -70,7 +71,7 @@ def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
 def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
-    covariate, _ = covariate_in_words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
+    covariate = _covariate_with_article(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
     known = effects_in_words([e.name for e in diagnosis.effects if e.probability >= _SURE])
     short = "Something is missing that no known effect explains"
     plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short
@@ -79,8 +80,17 @@ def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     elif top.endswith(", far out"):
         said = [f"Outlying readings cluster in {covariate}: something is missing there that no known effect explains."]
     else:
-        said = [f"{plain}; it depends most on the {covariate}."] if top else []
+        said = [f"{plain}; it depends most on {covariate}."] if top else []
     return [*said, f"{plain}.", f"{short}."]
+
+
+def _covariate_with_article(diagnosis: Diagnosis, family: str) -> str:
+    """Return what a family of bases depends on, in words, with an article unless it is a user's own name."""
+    said, _ = covariate_in_words_and_unit(diagnosis, family)
+    is_own = family == PRODUCTS or said in diagnosis.apparatus.words.own_names
+    return {MEMORY: "earlier readings", SCAN_ENDS: f"the ends of {diagnosis.apparatus.words.run}s"}.get(
+        family, said if is_own else f"the {said}"
+    )
 
 
 def _undecided_versions(diagnosis: Diagnosis) -> list[str]:

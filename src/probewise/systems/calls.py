@@ -280,7 +280,7 @@ class ProgressWithCallCount:
 
     def _report_call_count(self) -> None:
         stage, done, total, note = self._now
-        most = "" if self._caller.broadcasts else f" of at most {MOST_CALLS:,}"
+        most = "" if self._caller.broadcasts else f" of about {MOST_CALLS:,}"
         calls = f"{self._caller.n_calls:,}{most} calls of simulate"
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
 
@@ -306,7 +306,9 @@ def _require_finite_and_repeatable(
     """Raise ParameterError unless readings hold a finite number, and another call with its sample returns the same."""
     sound = np.isfinite(readings).any(axis=1)
     if not sound.any():
-        raise ParameterError(caller.name, "NaN at every place of the prior that was tried", "finite readings")
+        found = f"not finite at any of the {sound.size} points of the prior that were tried"
+        allowed = "finite readings: look for empty cells, divisions by 0 and priors that are too wide"
+        raise ParameterError(caller.name, found, allowed)
     at = int(np.argmax(sound))
     again = Caller(caller.simulate, caller.broadcasts, caller.by_row, name=caller.name)
     own = _parameters_and_columns_of_sample(samples, columns, at)
@@ -402,4 +404,7 @@ def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], 
             return np.array(np.broadcast_to(readings, wanted))
         except ValueError:
             pass
-    raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number for each row")
+    one = "for each row"
+    if len(wanted) > 1:
+        one = "for each sample and row: it is called with parameters (n_samples, 1); else leave vectorized out"
+    raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number {one}")

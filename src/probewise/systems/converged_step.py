@@ -117,8 +117,10 @@ def _halved_until_still(
         if not _has_affordable_steps(now, table) or _cost_of_integration(now, table) > most:
             raise ParameterError(
                 "rates",
-                f"readings still move by {moved:.3g} rms {system.simulator.unit} when the step is halved",
-                "a law that some thousand steps integrate: set max_step_s, or bring simulate with an integrator",
+                f"readings still change by {moved:.3g} {system.simulator.unit} (rms) when the step of "
+                f"{2 * now.max_step:.3g} {system.simulator.time_unit} is halved",
+                "a law that some thousand steps integrate; set a shorter max_step_s, or write simulate with your own "
+                "integrator",
             )
 
 

@@ -81,7 +81,7 @@ def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulato
     return Simulator(
         reading=_checked_text(said, "reading"),
         unit=_checked_text(said, "unit"),
-        parameters={name: parse_prior(name, prior) for name, prior in given.items()},
+        parameters={name: parse_prior(f"parameters[{name!r}]", prior) for name, prior in given.items()},
         simulate=_checked_function(said, "simulate") if "simulate" in said else None,
         law=law,
         time=_checked_text(said, "time") if said.get("time") is not None else None,
@@ -128,4 +128,4 @@ def _checked_function(said: Mapping[str, Any], name: str) -> Any:
 def _parse_extra(name: str, given: object) -> Extra:
     if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
         raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
-    return Extra(parse_prior(name, given["prior"]), float(given["null"]), str(given["says"]))
+    return Extra(parse_prior(f"extra[{name!r}]['prior']", given["prior"]), float(given["null"]), str(given["says"]))

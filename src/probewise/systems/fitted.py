@@ -34,7 +34,7 @@ from probewise.systems.table import RunTable
 FORMAT = "system/1"
 _ORIGINS = 1  # rule by which effects on a recording far from 0 count: files of earlier versions, from 0, have none
 _BEND = 2  # rule by which a bend has its ends: files of earlier versions, without the sd that tells outliers, have less
-_WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` writes"
+_WHAT = "a repaired.json or calibrated.json of `probewise diagnose --simulator`, or a fitted.json of `probewise fit`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +51,17 @@ class FittedSystem(NamedSamples):
     samples
         Equally weighted posterior samples, (n_samples, n_params), at least 500.
     noise_sd
-        Sd of one new reading for each sample, (n_samples,).
+        Sd of one new reading for each sample, (n_samples,), in the unit of the readings; relative if the simulator's
+        `noise` names a column of sds.
     effects
         Names of the effects, including noise effects.
     absent
         By effect, the mask of the samples in which the effect is absent, (n_samples,).
     level
-        Smallest and largest of the readings predicted for the recording.
+        Smallest and largest of the readings predicted for the recording, in their unit.
     max_step, stiff
-        Largest integration step, if there is a law, and whether a linearly implicit method takes it.
+        Largest integration step at fourth order, in the unit of time, infinite without a law; and whether a linearly
+        implicit method takes it.
     known
         The recording and fit by which the effects were scaled and given origins; None if there are noise effects at
         most.
@@ -99,7 +101,7 @@ class FittedSystem(NamedSamples):
         if lacking:
             raise ParameterError("names", self.names, f"all parameters of the simulator; {lacking[0]} is missing")
         if self.known is None and not set(self.effects) <= set(EFFECTS):
-            raise ParameterError("effects", list(self.effects), "none without the recording that they were bound about")
+            raise ParameterError("effects", list(self.effects), "effects on the noise alone, unless `known` is given")
         require_masks_of_absent_effects(self.absent, self.effects, len(samples))
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "noise_sd", noise_sd)
@@ -183,7 +185,7 @@ class FittedSystem(NamedSamples):
             if own["fingerprint"] != simulator.fingerprint:
                 raise FileError(
                     path, f"fitted with {own['source']} of fingerprint {own['fingerprint']}",
-                    f"that file unchanged; {simulator.source} has {simulator.fingerprint}, diagnose again with it",
+                    f"that file unchanged; {simulator.source} has {simulator.fingerprint}: diagnose or fit again",
                 )  # fmt: skip
             samples, known = np.array(document["samples"], dtype=np.float64), document["bound_about"]
             fitted = cls(
@@ -208,13 +210,13 @@ class FittedSystem(NamedSamples):
             if found != _ORIGINS and fitted._counts_from_far_origin:
                 # Its samples of a drift or of a phase would mean other ones.
                 raise FileError(
-                    path, f"origins {found!r}: a recording far from 0, of which its effects counted from elsewhere",
-                    f"{_ORIGINS}, as a model of this version has; diagnose again",
+                    path, f"written by an earlier version (origins {found!r}), which counted from another origin",
+                    "a model written by this version; diagnose again",
                 )  # fmt: skip
             if document.get("bend") != _BEND and fitted._has_bend:
                 raise FileError(
-                    path, f"bend {document.get('bend')!r}: its bend ends elsewhere",
-                    f"{_BEND}, as a model of this version has; diagnose again",
+                    path, f"written by an earlier version (bend {document.get('bend')!r}), whose bend had other ends",
+                    "a model written by this version; diagnose again",
                 )  # fmt: skip
             return fitted
         except FileError:
@@ -226,7 +228,7 @@ class FittedSystem(NamedSamples):
 
 
 def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator) -> FittedSystem:
-    """Read repaired.json or calibrated.json, for the simulator that it was made with.
+    """Read repaired.json, calibrated.json or fitted.json, for the simulator that it was made with.
 
     Raises
     ------
@@ -237,14 +239,15 @@ def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator) -> Fi
 
 
 def write_fitted_system(fitted: FittedSystem, path: str | os.PathLike[str]) -> None:
-    """Write repaired.json or calibrated.json atomically."""
+    """Write a fitted simulator (repaired.json, calibrated.json, fitted.json) atomically."""
     require_fitted_system(fitted)
     write_text_atomically(path, fitted.to_json())
 
 
 def require_fitted_system(fitted: object) -> None:
     """Raise ParameterError unless `fitted` is a FittedSystem; the message says how to obtain one."""
-    allowed = "a FittedSystem: repaired_of(diagnosis), calibrated_of(diagnosis), of probewise.diagnosis"
+    made_by = "repaired_of(diagnosis), calibrated_of(diagnosis) or fit_simulator(...).fitted"
+    allowed = f"a FittedSystem: {made_by}, of probewise.diagnosis"
     if isinstance(getattr(fitted, "fitted", None), FittedSystem):
         allowed = f"a FittedSystem: take its .fitted, this is the {type(fitted).__name__}"
     require_kind("fitted", fitted, FittedSystem, allowed)

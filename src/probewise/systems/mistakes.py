@@ -64,6 +64,8 @@ def user_function_error(
     elif is_of_values and texts:
         shown = ", ".join(f"{name} ({_first_non_numeric_cell(columns[name])!r})" for name in texts[:4])
         allowed = f"calculations with numeric columns; these contain text: {shown}"
+    elif law is not None and what == "rates":
+        allowed = f"a function that returns a rate for each state somewhere in the prior: {', '.join(law.states)}"
     else:
         allowed = f"a function that returns a reading for each of the {_n_rows(columns)} rows somewhere in the prior"
     return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.errors import ShapeError
 from probewise.systems.law_inputs import BetweenRows, LawInputs, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.rosenbrock import Rosenbrock
 from probewise.systems.rows_in_runs import RowsInRuns
@@ -153,7 +154,11 @@ def readings_of_states(
     with np.errstate(all="ignore"):
         given = map(read_only_views, (states, parameters, columns))
         out = np.asarray(call_on_read_only(law.observe, *given), dtype=np.float64)
-    return np.array(np.broadcast_to(out, first.shape))
+    try:
+        return np.array(np.broadcast_to(out, first.shape))
+    except ValueError:
+        allowed = f"{first.shape} or one that broadcasts to it: a number for each sample and row"
+        raise ShapeError(f"observe returns an array of shape {out.shape}; allowed: {allowed}") from None
 
 
 def integrate_states(

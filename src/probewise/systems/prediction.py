@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -36,7 +35,13 @@ from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
-from probewise.systems.table import RunRecording, RunTable, covariate_of_column, relative_sds_of_column
+from probewise.systems.table import (
+    RunRecording,
+    RunTable,
+    covariate_of_column,
+    is_number_or_missing,
+    relative_sds_of_column,
+)
 
 _OF_A_COLUMN = "sensitivity:", "depends:"  # effects, besides those on an input, that name a column last
 _FEW = 20  # samples used to find rows that cannot be predicted
@@ -49,10 +54,10 @@ class SystemPrediction(ShowsItself):
     """Predictive distribution of each row's reading, all arrays (n_points,).
 
     `mean` is within the declared range of the instrument. `sd` is that of one new reading, noise and parameters
-    together; it ignores the range. `log_density` is the natural logarithm of the predictive density of that row's
-    reading alone, per unit of the reading, NaN without a reading; for a reading at an end of the declared range, it is
-    the log probability of reading that end. `n_failed` of `n_samples` samples were left out because the simulator gives
-    no finite readings for them.
+    together, in the unit of the readings as `mean`; it ignores the range. `log_density` is the natural logarithm of the
+    predictive density of that row's reading alone, per unit of the reading, NaN without a reading; for a reading at an
+    end of the declared range, it is the log probability of reading that end. `n_failed` of `n_samples` samples were
+    left out because the simulator gives no finite readings for them.
     """
 
     table: RunTable
@@ -87,7 +92,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     if readings is None:
         readings = np.full(len(table), np.nan)
     elif readings.dtype != np.float64:
-        bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_number_or_missing(cell)), 0)
+        bad = next((k for k, cell in enumerate(readings.tolist()) if not is_number_or_missing(cell)), 0)
         raise ParameterError(
             f"reading {simulator.reading!r} in row {bad + 2}",
             str(readings[bad]),
@@ -104,14 +109,6 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
             name = f'noise["sd"], column {sd!r} in row {wrong[0] + 2}'
             raise ParameterError(name, float(values[wrong[0]]), "greater than 0 wherever there is a reading")
     return recording
-
-
-def _is_number_or_missing(text: str) -> bool:
-    """Return whether a cell is a finite number, or one of the ways to write that there is none."""
-    try:
-        return not math.isinf(float(text))
-    except ValueError:
-        return text == ""
 
 
 def predict_system(
@@ -146,6 +143,10 @@ def predict_system(
     ParameterError
         If a column is missing, no row has the numbers that it needs, or the simulator gives finite readings for no
         sample.
+    FileError
+        If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
+    ShapeError
+        If `simulate` does not return one reading per row.
 
     Warns
     -----
@@ -203,8 +204,9 @@ def predict_system(
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
         warnings.warn(
-            f"{int(lost.sum())} rows cannot be predicted, first row {int(np.argmax(lost)) + 2}: a number they need "
-            "is missing; where an effect looks back to it, it is interpolated",
+            f"{int(lost.sum())} row{'' if lost.sum() == 1 else 's'} cannot be predicted, first row "
+            f"{int(np.argmax(lost)) + 2}: a number that they need is missing; where an effect looks back to it, it is "
+            "interpolated",
             DoubtfulResultWarning,
             stacklevel=2,
         )
@@ -328,13 +330,11 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
             table.require_rising_time()
         lacking = _column_names_read_by_effects(fitted, forms) - set(table.covariates)
         if lacking:
-            name = min(lacking)
-            raise ParameterError(
-                "columns",
-                name,
-                "a table with numbers in this column, which an effect of the model reads; "
-                f"it has {', '.join(table.columns)}",
+            found = "missing or without numbers"
+            allowed = (
+                f"numbers in this column, which an effect of the model reads; the table has {', '.join(table.columns)}"
             )
+            raise ParameterError(f"column {min(lacking)!r}", found, allowed)
     out = []
     for name in fitted.effects:
         if name in forms:
@@ -347,7 +347,7 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
         elif name in EFFECTS:
             out.append(EFFECTS[name]())
         else:
-            raise ParameterError("effects", name, "an effect that this version can bind again; diagnose anew with it")
+            raise ParameterError("effects", name, "an effect that this version knows; diagnose again with it")
     return cast(list[NamedEffect[Any]], out)
 
 

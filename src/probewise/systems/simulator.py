@@ -24,7 +24,10 @@ Columns: TypeAlias = Mapping[str, NDArray[Any]]
 """Columns of the table by name, (n_points,)."""
 
 Simulate: TypeAlias = Callable[[Values, Columns], FloatArray]
-"""Function of parameters and columns; returns noise-free readings, (n_points,)."""
+"""Function of parameters and columns; returns noise-free readings.
+
+(n_points,), or (n_samples, n_points) where parameters are (n_samples, 1).
+"""
 
 Rates: TypeAlias = Callable[[Values, Values, Values], Mapping[str, Any]]
 """Function of states, parameters and columns; returns the rate of each state; arrays broadcast."""
@@ -34,6 +37,7 @@ Observe: TypeAlias = Callable[[Values, Values, Values], Any]
 
 Hold: TypeAlias = Literal["previous", "linear"]
 
+_A_RANGE = "(low, high) with low < high; None for an open end"
 _TAKEN = (*(n for n, kind in EFFECTS.items() if getattr(kind, "stage", None) is Stage.NOISE), "unknown", "clean")
 
 
@@ -85,7 +89,8 @@ class Noise:
     Parameters
     ----------
     sd
-        Sd of a reading: a number, the name of a column, or None if unknown.
+        Expected sd of a reading, in its unit; or the name of a column of sds, of which only the ratios count; or None.
+        The size of the noise is fitted in any case.
     step
         Rounding step of the readings; None if not declared.
     range
@@ -116,19 +121,19 @@ class Noise:
             raise ParameterError("noise", given, f'a dict with some of "sd", "step", "range", "zero"{meant}')
         ends = given.get("range", (None, None))
         if not isinstance(ends, Sequence) or isinstance(ends, str) or len(ends) != 2:
-            raise ParameterError('noise["range"]', ends, "(low, high), low < high")
+            raise ParameterError('noise["range"]', ends, _A_RANGE)
         return cls(given.get("sd"), given.get("step"), (ends[0], ends[1]), given.get("zero", 0.0))
 
     def __post_init__(self) -> None:
         if not (self.sd is None or isinstance(self.sd, str) or _is_positive_number(self.sd)):
-            raise ParameterError('noise["sd"]', self.sd, "a number greater than 0, or the name of a column")
+            raise ParameterError('noise["sd"]', self.sd, "a number greater than 0, the name of a column, or None")
         if not (self.step is None or _is_positive_number(self.step)):
-            raise ParameterError('noise["step"]', self.step, "greater than 0")
+            raise ParameterError('noise["step"]', self.step, "a number greater than 0, or None")
         if not _is_finite_number(self.zero):
-            raise ParameterError('noise["zero"]', self.zero, "a finite number, the reading of nothing")
+            raise ParameterError('noise["zero"]', self.zero, "a finite number, the reading at zero signal")
         low, high = (bound if end is None else end for end, bound in zip(self.range, (-np.inf, np.inf), strict=True))
         if not (_is_number(low) and _is_number(high) and low < high):
-            raise ParameterError('noise["range"]', self.range, "(low, high), low < high")
+            raise ParameterError('noise["range"]', self.range, _A_RANGE)
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -146,9 +151,11 @@ class Law:
     states
         Initial value of each state in every run: the name of a parameter, or a number.
     rates
-        Function of states, parameters and columns that returns the rate of each state.
+        Function of states, parameters and columns that returns the rate of each state by name, per unit of time. All
+        are arrays that broadcast against each other: np.where and np.sin, no `if` and no math.sin.
     observe
-        Function of states, parameters and columns that returns the reading; None: the first state.
+        Function of states, parameters and columns that returns the reading, an array that broadcasts to the states'
+        shape; None: the first state.
     hold
         Interpolation of columns between rows: "previous" (held) or "linear".
     max_step_s
@@ -214,7 +221,8 @@ class Simulator:
     extra
         The user's own effects, by name.
     vectorized
-        Whether `simulate` takes parameters (n_samples, 1) and returns (n_samples, n_points).
+        Whether `simulate` takes parameters (n_samples, 1), those of `per_run` (n_samples, n_points), and returns
+        (n_samples, n_points). False: trial calls find out.
     source, fingerprint
         The file that it was read from, and the fingerprint of its text.
     """
@@ -238,9 +246,9 @@ class Simulator:
     def __post_init__(self) -> None:
         if (self.simulate is None) == (self.law is None):
             found = "neither" if self.simulate is None else "both"
-            raise ParameterError(
-                "simulate, rates", found, "one of them: def simulate(p, data), or states and def rates(s, p, u)"
-            )
+            from_python = "simulate=..., or law=Law(states, rates)"
+            in_a_file = "def simulate(p, data), or states and def rates(s, p, u)"
+            raise ParameterError("simulate, rates", found, f"one of them: {from_python}; in a file {in_a_file}")
         checked_text("reading", self.reading, "the name of the column that is predicted")
         require_kind("unit", self.unit, str, "a text")
         for name, column in (("time", self.time), ("run", self.run)):
@@ -254,7 +262,9 @@ class Simulator:
         require_mapping("parameters", self.parameters, "the prior of each by name: {'tau_s': ('log', 1, 1000)}")
         if not self.parameters:
             raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
-        object.__setattr__(self, "parameters", {n: parse_prior(n, prior) for n, prior in self.parameters.items()})
+        object.__setattr__(
+            self, "parameters", {n: parse_prior(f"parameters[{n!r}]", prior) for n, prior in self.parameters.items()}
+        )
         object.__setattr__(self, "per_run", checked_texts("per_run", self.per_run, "names of parameters"))
         object.__setattr__(self, "controls", checked_texts("controls", self.controls, "names of columns"))
         object.__setattr__(self, "noise", Noise.of(self.noise))
@@ -275,7 +285,8 @@ class Simulator:
                         f"states[{state!r}]", start, f"a number or a parameter: {', '.join(self.parameters)}"
                     )
         own = {
-            n: replace(e, prior=parse_prior(n, e.prior)) if isinstance(e, Extra) else e for n, e in self.extra.items()
+            n: replace(e, prior=parse_prior(f"extra[{n!r}].prior", e.prior)) if isinstance(e, Extra) else e
+            for n, e in self.extra.items()
         }
         object.__setattr__(self, "extra", own)
         for name, effect in self.extra.items():
@@ -300,8 +311,10 @@ def require_simulator(simulator: object) -> None:
     require_kind("simulator", simulator, Simulator, f"{allowed}; then comes the table")
 
 
-def parse_prior(name: str, given: object) -> Marginal:
+def parse_prior(what: str, given: object) -> Marginal:
     """Parse a user's prior: (low, high), ("log", low, high), ("normal", mean, sd), or a prior object.
+
+    `what` is its name in errors.
 
     Raises
     ------
@@ -312,15 +325,15 @@ def parse_prior(name: str, given: object) -> Marginal:
     if isinstance(given, Marginal):
         return given
     if not isinstance(given, Sequence) or isinstance(given, str) or not given:
-        raise ParameterError(f"parameters[{name!r}]", given, allowed)
+        raise ParameterError(what, given, allowed)
     kinds: dict[object, Callable[[float, float], Marginal]] = {"log": LogUniform, "normal": Normal, "uniform": Uniform}
     kind, numbers = (given[0], given[1:]) if isinstance(given[0], str) else ("uniform", given)
     if kind not in kinds or len(numbers) != 2 or not all(_is_number(n) for n in numbers):
-        raise ParameterError(f"parameters[{name!r}]", given, allowed)
+        raise ParameterError(what, given, allowed)
     try:
         return kinds[kind](float(numbers[0]), float(numbers[1]))
     except ParameterError as error:
-        raise ParameterError(f"parameters[{name!r}]", given, f"{error.allowed}: a prior with mass") from error
+        raise ParameterError(what, given, f"{error.allowed}: a prior with mass") from error
 
 
 def _is_finite_number(value: object) -> bool:

@@ -43,7 +43,7 @@ class System:
     runs
         Names of the runs.
     max_step
-        Largest integration step, if there is a law.
+        Largest integration step at fourth order, in the unit of time, if there is a law.
     stiff
         Whether the law is integrated by a linearly implicit method.
     caller
@@ -81,7 +81,8 @@ class System:
         Raises
         ------
         ParameterError
-            If a column that the simulator names is missing, or no reading is finite at any trial point of the prior.
+            If a column that the simulator names is missing, the table has no column besides the reading, no reading is
+            finite at any trial point of the prior, or another call with the same parameters returns other readings.
         ShapeError
             If it does not return one reading per row.
         FileError
@@ -153,8 +154,9 @@ class System:
         if not readings and wrong is not None:
             raise user_function_error("rates", wrong, self.simulator, columns) from wrong
         if not np.isfinite(readings).any():
+            found = f"not finite at any of the {len(self.starts)} points of the prior that were tried"
             raise ParameterError(
-                "rates", "NaN at every place of the prior that was tried", "finite states and readings"
+                "rates, observe", found, "finite states and readings: narrower priors or a shorter max_step_s"
             )
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -62,7 +63,7 @@ class RunTable:
         columns: dict[str, NDArray[Any]] = {}
         for name, values in self.columns.items():
             if name in columns:  # a data frame may have two of one name
-                raise ParameterError("columns", name, "each column once")
+                raise ParameterError("columns", f"{name} twice", "each column once")
             columns[name] = _checked_column(name, values)
         if not columns:
             raise ParameterError("columns", (), "one or more")
@@ -79,9 +80,10 @@ class RunTable:
         if self.time is not None:
             values = columns[self.time]
             if values.dtype != np.float64 or not np.isfinite(values).all():
-                raise ParameterError(
-                    f"column {self.time!r}", "a time that is missing or no number", "a number in each row"
-                )
+                wrong = (k for k, cell in enumerate(values.tolist()) if not _is_finite_number(cell))
+                k = next(wrong, 0)
+                where = f"column {self.time!r} in row {k + 2}"
+                raise ParameterError(where, str(values[k]), "a time, a finite number, in each row")
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -241,6 +243,18 @@ def relative_sds_of_column(table: RunTable, column: str, typical: float | None =
     if median is None:
         return np.ones(len(table))
     return np.where(there, values, 1.0) / np.where(there, median if typical is None else typical, 1.0)
+
+
+def is_number_or_missing(cell: Any) -> bool:
+    """Return whether a cell is a finite number, or one of the ways to write that there is none."""
+    try:
+        return not math.isinf(float(cell))
+    except ValueError:
+        return bool(cell == "")
+
+
+def _is_finite_number(cell: Any) -> bool:
+    return is_number_or_missing(cell) and str(cell) not in ("", "nan")
 
 
 def _checked_column(name: str, values: Any) -> NDArray[Any]:

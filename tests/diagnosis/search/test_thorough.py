@@ -169,7 +169,8 @@ def test_a_prior_that_holds_more_than_what_was_found_in_it_is_a_doubt(stepped, m
     assert all("holds more" in w.doubts[-1] for w in weighings)
     assert all(w.agree for w in weighings)
     assert found is stepped
-    assert "agrees to a nat and its own error, but it doubts itself" in sentence_with_agreement("A reason.", weighings)
+    said = sentence_with_agreement("A reason.", weighings)
+    assert "agrees to within a nat plus its standard error, but its runs gave a warning" in said
 
 
 @pytest.mark.single_case
@@ -233,15 +234,14 @@ def test_within_a_nat_laplace_stands(stepped, monkeypatch):
 def test_a_run_with_doubts_does_not_win(stepped, monkeypatch):
     found, weighings = moved(stepped, monkeypatch, 5.0, doubts=("few effective samples",))
     assert found is stepped
-    assert "left as they were, but it doubts itself" in sentence_with_agreement("A reason.", weighings)
+    assert "left as they were, but its runs gave a warning" in sentence_with_agreement("A reason.", weighings)
 
 
 def test_the_reason_says_whether_they_agree():
     near, far = Weighing(("lag",), 1, -10.0, -10.4, 0.1), Weighing((), 1, -12.0, -14.0, 0.1)
     assert sentence_with_agreement("A reason.", ()) == "A reason."
-    assert (
-        sentence_with_agreement("A reason.", (near,)) == "A reason; nested sampling agrees to a nat and its own error."
-    )
+    agreed = "A reason; nested sampling agrees to within a nat plus its standard error."
+    assert sentence_with_agreement("A reason.", (near,)) == agreed
     assert "clean by −2.0 nats" in sentence_with_agreement("A reason.", (near, far))
     of_column = replace(far, effects=("depends:gain:flow-in",))
     assert "depends:gain:flow-in by −2.0 nats" in sentence_with_agreement("A reason.", (near, of_column))
@@ -276,6 +276,6 @@ def test_a_recording_is_weighed_alike_both_ways():
     assert "ambient_step" in {w.label for w in found.report.weighings}
     assert {w.label for w in found.report.weighings} == {note.partition(", run ")[0] for _, _, _, note in seen[1:]}
     assert all(w.agree for w in found.report.weighings)
-    assert found.reason.endswith("nested sampling agrees to a nat and its own error.")
+    assert found.reason.endswith("nested sampling agrees to within a nat plus its standard error.")
     assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.report.weighings)
     assert "thorough" not in diagnosis_json(replace(found, report=replace(found.report, weighings=())))

@@ -56,7 +56,7 @@ def test_what_needs_a_time_says_so_where_none_was_recorded():
 
 def test_readings_that_change_nowhere_are_refused():
     simulator = heater(simulate=lambda p, data: p["start_c"] + 0.0 * data["t_s"], noise=Noise(sd=0.1), per_run=())
-    with pytest.raises(ParameterError, match="one reading in all rows"):
+    with pytest.raises(ParameterError, match="the same in all rows"):
         audit_system(simulator, TABLE)
 
 

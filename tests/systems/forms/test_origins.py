@@ -224,7 +224,7 @@ def test_a_model_of_a_version_that_counted_from_0_is_refused_where_its_effects_c
     about = _about(shift, far, _function)
     document = json.loads(_model(about, effect).to_json())
     assert document.pop("origins") == 1
-    with pytest.raises(FileError, match=r"origins 0: .*diagnose again"):
+    with pytest.raises(FileError, match=r"origins 0\).*diagnose again"):
         FittedSystem.from_json(json.dumps(document), about.system.simulator)
 
 

@@ -40,7 +40,8 @@ class NextMeasurement:
     `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
     true; rivals that the readings cannot tell apart count as one. `between`: each of the hypotheses, in words;
     `effects`: the effects of each; `probabilities`: of each, as used here, (n_rivals,); `nats` (n_rivals, n_rivals):
-    expected log Bayes factor of each, if true, over each other. `minutes`: duration with breaks.
+    expected log Bayes factor of each, if true, over each other. `minutes`: duration with breaks; of a table without a
+    time in a known unit, a guess of one second per row.
     """
 
     plan: Plan

@@ -24,6 +24,12 @@ from probewise.diagnosis.residuals.covariate import Covariate
 PRODUCTS = "products of two columns"
 """The family of products of covariates."""
 
+MEMORY = "what was seen before"
+"""The family of what a reading keeps of earlier ones."""
+
+SCAN_ENDS = "ends of scans"
+"""The family of transients at the ends of scans or runs."""
+
 _LIKE = 0.9  # cosine from which a basis duplicates a named effect
 _MOST_GROUPS = 24
 _N_STEPS = 15  # change points of a covariate
@@ -88,8 +94,8 @@ def bank_of_unknown_effects(
     ]
     found += [(PRODUCTS, template) for template in _product_bases(multiplied, len(signal))]
     if scan is not None:
-        found += [("what was seen before", template[back]) for template in _memory_bases(signal[order], starts)]
-        found += [("ends of scans", template[back]) for template in _scan_end_bases(len(signal), starts)]
+        found += [(MEMORY, template[back]) for template in _memory_bases(signal[order], starts)]
+        found += [(SCAN_ENDS, template[back]) for template in _scan_end_bases(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
     return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 

@@ -48,12 +48,12 @@ def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
     apart = ", ".join(f"{w.label} by {_signed(w.gap)} nats" for w in weighings if not w.agree)
     doubt = next((f"{w.label}: {doubt}" for w in weighings for doubt in w.doubts), None)
     if not apart:
-        said = "nested sampling agrees to a nat and its own error"
+        said = "nested sampling agrees to within a nat plus its standard error"
     elif doubt is not None:
         said = f"nested sampling would move {apart}, and probabilities are left as they were"
     else:
         said = f"nested sampling moves {apart}, and the probabilities are by its evidence"
-    return f"{reason.rstrip('.')}; {said}{'' if doubt is None else f', but it doubts itself ({doubt})'}."
+    return f"{reason.rstrip('.')}; {said}{'' if doubt is None else f', but its runs gave a warning ({doubt})'}."
 
 
 def _signed(nats: float) -> str:

@@ -118,12 +118,12 @@ class SimulatorApparatus:
             run="run",
             next_plan="next.csv",
             model="repaired.json",
-            no_cure="more rows, or columns and runs that vary otherwise",
+            no_cure="more rows, or columns and runs that vary differently",
             covariates={
                 "time": own.time or "time",
-                "row": "row of the table",
+                "row": "row number (from 0)",
                 "level": f"predicted {own.reading}",
-                "previous": f"change of {own.reading} since the row before",
+                "previous": f"change of predicted {own.reading} since the row before",
             },
             own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
         )

@@ -31,7 +31,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     """Determine for each effect whether readings in the rows of a table can detect it and tell it from the others.
 
     The simulator is evaluated at the middle of its prior. If the readings there are constant, as those of a pendulum at
-    rest, another point of the prior is taken, and `assumed` says so. The column of readings is not used.
+    rest, or not finite, another point of the prior is taken, and `assumed` says so. The column of readings is not used.
 
     Parameters
     ----------
@@ -48,8 +48,12 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     Raises
     ------
     ParameterError
-        If the table lacks a column that the simulator reads, time falls within a run, or the readings are constant
-        everywhere in the prior.
+        If the table lacks a column that the simulator reads, time falls within a run, or the predicted readings are
+        constant, or not finite in some row, at all points of the prior that are tried.
+    FileError
+        If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
+    ShapeError
+        If `simulate` does not return one reading per row.
     """
     table = table_for(simulator, table)
     table.require_rising_time()
@@ -118,7 +122,7 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
             at = (
                 "the middle of the prior"
                 if k == 0
-                else "a point of the prior other than its middle, where readings are constant"
+                else "another point of the prior (at its middle, readings are constant or not finite)"
             )
             return z, predicted, at
         never &= ~np.isfinite(predicted)
@@ -127,7 +131,9 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
             f"no finite reading in {int(never.sum())} of {len(table)} rows, first in row {int(np.argmax(never)) + 2}"
         )
         raise ParameterError("the table", found, "a number in each cell that the simulator reads")
-    raise ParameterError("the table", "one reading in all rows", "rows over which the predicted reading changes")
+    raise ParameterError(
+        "the predicted reading", "the same in all rows, wherever the prior was tried", "rows over which it changes"
+    )
 
 
 def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tuple[float, str]:

@@ -71,7 +71,12 @@ def diagnose_system(
     Raises
     ------
     ParameterError
-        If the table lacks a column that the simulator names or any reading, or time falls within a run.
+        If the table lacks a column that the simulator names, has too few readings, or time falls within a run; if
+        readings are not finite, or change when `simulate` is called again; or if no affordable step integrates the law.
+    FileError
+        If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
+    ShapeError
+        If `simulate` does not return one reading per row.
     NotConvergedError
         If the fit of the simulator did not converge.
     """
@@ -130,7 +135,7 @@ def prepare_system(
         )
     n_within = int((recording.usable & ~recording.censored).sum())
     if recording.censored.any() and n_within < system.least_readings:
-        allowed = f"{system.least_readings} or more: those at its ends tell no noise"
+        allowed = f"{system.least_readings} or more: readings at its ends do not determine the noise"
         raise ParameterError("readings within the declared range", n_within, allowed)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
@@ -163,7 +168,10 @@ def _progress_with_call_count(progress: Progress, system: System) -> Progress:
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return notes on a simulator's calls (cut short, failed, interpolated) and its declared noise; else ()."""
+    """Return notes on calls of a simulator or integration of its law (cut short, failed, interpolated, stiff); else ().
+
+    With those on its declared noise.
+    """
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
@@ -176,8 +184,8 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         return (*out, *_notes_on_integration(tally, apparatus.evaluations_of_a_search, sets_step=sets_step))
     if caller.cut_short:
         out.append(
-            f"simulate takes one sample at a time: in {CALLS_OF_A_SEARCH:,} calls not every combination of effects "
-            "that promised something was fitted; if simulate takes arrays, the search is complete"
+            f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls some promising combinations of "
+            "effects were not fitted; if simulate takes arrays, the search is complete"
         )
     if caller.n_failed:
         out.append(f"simulate raised an error for {caller.n_failed:,} parameter vectors, which count as impossible")
@@ -195,15 +203,14 @@ def _notes_on_integration(tally: IntegrationTally, most: int, *, sets_step: bool
     if tally.cut_short:
         way_out = "a larger max_step_s, shorter runs" if sets_step else "shorter runs"
         yield (
-            f"integrating the law takes long: in {most:,} evaluations of its rates not every "
-            f"combination of effects that promised something was fitted; with {way_out} or fewer rows the search is "
-            "complete"
+            f"integrating the law takes long: after {most:,} evaluations of its rates some promising combinations of "
+            f"effects were not fitted; with {way_out} or fewer rows the search is complete"
         )
     if tally.too_stiff:
         yield (
             "the law is stiff: parameters that may fit the readings would need more integration steps than are taken, "
-            "and count as impossible; their intervals may be too narrow; set max_step_s, or bring simulate with an "
-            "integrator"
+            "and count as impossible; their intervals may be too narrow; set a shorter max_step_s, or write simulate "
+            "with an integrator of your own"
         )
     if tally.n_failed:
         yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"

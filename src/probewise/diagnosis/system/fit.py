@@ -64,7 +64,8 @@ class SystemFit(ShowsItself):
     evidence
         Log evidence.
     predicted, sd
-        Mean and sd of every row's posterior predictive distribution, (n_points,); the sd includes the noise.
+        Mean and sd of every row's posterior predictive distribution, (n_points,), in the unit of the readings; the sd
+        includes the noise.
     """
 
     recording: Recording
@@ -130,7 +131,12 @@ def fit_simulator(
     Raises
     ------
     ParameterError
-        If the table lacks a column that the simulator names, or has too few readings, or all are equal.
+        If the table lacks a column that the simulator names, has too few readings, or all are equal; if readings are
+        not finite, or change when `simulate` is called again; or if no affordable step integrates the law.
+    FileError
+        If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
+    ShapeError
+        If `simulate` does not return one reading per row.
     NotConvergedError
         If the fit did not converge.
     """

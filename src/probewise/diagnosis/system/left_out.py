@@ -98,10 +98,10 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
 def _note_on_gaps(system: System, n_lost: int, gaps: IntArray) -> str:
     """Say that readings are left out, since cells are missing in the rows `gaps`, counted from 0."""
     if system.simulator.law is None:
-        return f"{n_lost} readings left out: a column that the simulator reads is missing there"
+        return f"{_count_of_readings(n_lost)} left out: a column that the simulator reads is missing there"
     more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
     return (
-        f"{n_lost} readings left out: a column that the law reads is missing in row {gaps[0] + 2}{more}, "
+        f"{_count_of_readings(n_lost)} left out: a column that the law reads is missing in row {gaps[0] + 2}{more}, "
         "and a law ends at the first gap of its run; fill the gaps in to use them"
     )
 
@@ -184,3 +184,7 @@ def without_readings_near_ends(system: System, recording: RunRecording, near_end
             f"{int(cut.sum())} readings near an end of the declared range are left out: the end cuts off their noise"
         )
     return replace(recording, readings=np.where(cut, np.nan, recording.readings), notes=(*recording.notes, *said))
+
+
+def _count_of_readings(n: int) -> str:
+    return f"{n} reading{'' if n == 1 else 's'}"

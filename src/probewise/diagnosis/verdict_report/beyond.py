@@ -80,7 +80,8 @@ def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: n
     if fit is not None and with_formula > max(value, log_z + ALIASED_NATS):
         formula, said = _formula_beside(searched, best, fit, rng=rng)
     smaller = "A smaller misfit" if share < 0.5 else "A misfit"
-    sentence = f"{smaller} remains ({p_in_words(p_value)}, {share:.0%} of the gain in log evidence){shows}{said}."
+    gain = f"what has no name would add {share:.0%} of the whole gain in log evidence"
+    sentence = f"{smaller} remains ({p_in_words(p_value)}; {gain}){shows}{said}."
     return Remainder(p_value, share, where, sentence, formula)
 
 

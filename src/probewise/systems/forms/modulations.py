@@ -97,8 +97,10 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool
         return np.asarray(theta[:, :1] * (change_points.variable_at_rows(rows) > theta[:, 1:2]))
 
     def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
-        when = f"row {mean[1]:.0f}" if by_row else mean_with_sd(mean[1], sd[1], time_unit)
-        return f"{what} jumps by {mean_with_sd(mean[0], sd[0], unit)} at {when} and stays there"
+        jump = f"{what} jumps by {mean_with_sd(mean[0], sd[0], unit)}"
+        if by_row:  # a point between two rows, counted from 0
+            return f"{jump} at row {int(mean[1]) + 3} of the table (the header is row 1) and stays there"
+        return f"{jump} at {mean_with_sd(mean[1], sd[1], time_unit)} and stays there"
 
     def jump_in_time(parameter: str) -> ActBetween:
         return lambda between, theta: between.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))
@@ -166,7 +168,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
             f"{what} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], unit)} and a period of "
-            f"{1 / mean[1]:.4g} {time_unit}"
+            f"{mean_with_sd(1 / mean[1], sd[1] / mean[1] ** 2, time_unit)}"
         ),
         covariates=("time",),
         counted_from=origin_in_words(table.time, origin, time_unit),

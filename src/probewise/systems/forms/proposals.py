@@ -184,8 +184,8 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
             return value.with_term(state, lambda s, p, u: a * np.maximum(sign * (s[state] - at), 0.0))
 
         def says(mean: FloatArray, sd: FloatArray, text: str = text) -> str:
-            sizes = f"a = {mean_with_sd(mean[0], sd[0], '')}, at = {mean_with_sd(mean[1], sd[1], '')}"
-            return f"the rate of {state} lacks a {text}, {sizes}: a proposal, not a known effect"
+            sizes = f"a = {mean_with_sd(mean[0], sd[0], '')} and at = {mean_with_sd(mean[1], sd[1], '')}"
+            return f"the rate of {state} lacks the term a {text} with {sizes}: a proposal, not a known effect"
 
         guess = trial_rate(about, state) / (high - low)
         entries = np.array([[[guess, at]] for at in np.quantile(values, _THRESHOLDS)])
@@ -272,7 +272,7 @@ def _single_term_form(
         entries=np.full((1, 1, 1), typical),
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"{what} lacks {text}, a = {mean_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect"
+            f"{what} lacks the term {text} with a = {mean_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect"
         ),
         expression=text,
     )

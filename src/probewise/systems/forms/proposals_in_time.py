@@ -70,8 +70,8 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
         amplitudes=(0,),
         says=lambda mean, sd: (
             f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} during "
-            f"{mean_with_sd(mean[3], sd[3], '')} of every {1 / mean[1]:.4g} {about.time_unit}: "
-            "a proposal, not a known effect"
+            f"{mean_with_sd(mean[3], sd[3], '')} of every "
+            f"{mean_with_sd(1 / mean[1], sd[1] / mean[1] ** 2, about.time_unit)}: a proposal, not a known effect"
         ),
         expression=f"a {text}",
         counted_from=origin_in_words(table.time, origin, about.time_unit),

@@ -204,7 +204,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         amplitudes=(0,),
         says=lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "
-            f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
+            f"per {about.time_unit} and a period of {mean_with_sd(1 / mean[1], sd[1] / mean[1] ** 2, about.time_unit)}"
         ),
         joined=starting_point_of_wave,
         counted_from=origin_in_words(time, origin, about.time_unit),

@@ -114,7 +114,7 @@ def rebind_forms(
         found |= _bind_wanted_forms(per_run, simulator, beyond)
     lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
     if lost:
-        raise ParameterError("effects", lost[0], "a term that this version can bind again")
+        raise ParameterError("effects", lost[0], "a term that this version knows; diagnose again with it")
     return {name: found[name] for name in wanted if name in found}
 
 

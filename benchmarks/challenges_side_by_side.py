@@ -19,7 +19,12 @@ from typing import Any
 from scipy.stats import binomtest
 
 from probewise.campaign import read_campaign
-from probewise.challenge.scoring import Result, credible_set_holds_truth, is_out_of_vocabulary
+from probewise.challenge.scoring import (
+    Result,
+    credible_set_holds_truth,
+    is_out_of_vocabulary,
+    is_recognised_as_out_of_vocabulary,
+)
 from probewise.challenge.table import is_confidently_wrong, is_leading_name_right, names_effect_on_mean, score
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text_of_rows
@@ -30,7 +35,7 @@ COUNTED: Mapping[str, tuple[Callable[[Result], bool], Callable[[Result], bool]]]
     "clean, physics named": (lambda r: r["kind"] == "clean", names_effect_on_mean),
     "single effect, right name first": (lambda r: r["kind"] == "single", is_leading_name_right),
     "two effects, right names first": (lambda r: r["kind"] == "pair", is_leading_name_right),
-    "out of vocabulary, unknown": (is_out_of_vocabulary, lambda r: r["verdict"] == "unknown"),
+    "out of vocabulary, unknown or named right": (is_out_of_vocabulary, is_recognised_as_out_of_vocabulary),
     "aliased pair, cannot_tell": (lambda r: r["kind"] == "alias", lambda r: r["verdict"] == "cannot_tell"),
     "credible set holds the truth": (lambda r: True, lambda r: credible_set_holds_truth(r, merged=False)),
     "wrong name stated above .9": (lambda r: True, is_confidently_wrong),

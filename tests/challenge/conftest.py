@@ -51,8 +51,8 @@ def single(name="lag", size=8.0, *, hide=None, **others):
     return case("single", size, truth=[name], hides=[hide or hidden(name, size)], **others)
 
 
-def outside(size=12.0, *, cosines=None, **others):
-    like = hidden("chirp", size, cosines=cosines or {}, in_vocabulary=False)
+def outside(size=12.0, *, name="chirp", cosines=None, **others):
+    like = hidden(name, size, cosines=cosines or {}, in_vocabulary=False)
     return case("outside", size, truth=["unknown"], hides=[like], **others)
 
 

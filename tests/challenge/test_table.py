@@ -15,6 +15,7 @@ from probewise.challenge import (
     score,
 )
 from probewise.challenge.estimates import estimated_mean, estimated_share, estimated_statistic
+from probewise.challenge.table import is_confidently_wrong
 
 
 def row(results, name):
@@ -193,8 +194,17 @@ def test_what_has_no_name_should_be_unknown_and_nothing_else(make):
         make.single(said=["unknown"]),
         make.single(),
     ]
-    assert row(results, "outside the vocabulary: unknown, lambda 12").found.value == 0.5
+    assert row(results, "outside the vocabulary: unknown, or a rare effect named right, lambda 12").found.value == 0.5
     assert row(results, "false unknown").found.value == 0.5
+
+
+def test_the_rare_effect_that_acts_as_the_concealed_one_is_right_and_another_is_not(make):
+    results = [
+        make.outside(name="bent_rail", said=[said], p=0.95) for said in ("bent_rails", "unknown", "arm_knock", "lag")
+    ]
+    found = row(results, "outside the vocabulary: unknown, or a rare effect named right, lambda 12").found
+    assert (found.value, found.n) == (0.5, 4)
+    assert [is_confidently_wrong(result) for result in results] == [False, False, True, True]
 
 
 def test_aliases_are_told_apart_by_the_advised_readings(make):

@@ -12,13 +12,13 @@ import pytest
 
 from probewise.diagnosis import PriorOdds
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.effects import UNNAMED, VOCABULARY, Extent
+from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import Stage
 
 OF_NO_LAW = SimpleNamespace(about=SimpleNamespace(states_with_rates_by_definition=frozenset()))
 EXTENT = Extent(10.0, 60.0, two_way_plan())
-EFFECTS = {**VOCABULARY, **UNNAMED}
+EFFECTS = {**VOCABULARY, **RARE_EFFECTS}
 
 
 def test_everything_about_the_mean_sums_to_one_but_for_what_is_unknown_beside():
@@ -27,17 +27,17 @@ def test_everything_about_the_mean_sums_to_one_but_for_what_is_unknown_beside():
     named = [n for n, kind in VOCABULARY.items() if kind.stage is not Stage.NOISE and effects[n] is not None]
     total = math.exp(odds.log_prior_with_unknown(()))
     total += sum(math.exp(odds.log_prior_on_mean(names)) for k in range(4) for names in combinations(named, k))
-    total += sum(math.exp(odds.log_prior_on_mean((name,))) for name in UNNAMED)
+    total += sum(math.exp(odds.log_prior_on_mean((name,))) for name in RARE_EFFECTS)
     assert total == pytest.approx(1.0, abs=1e-9)
 
 
 def test_half_of_the_unknown_has_a_name_of_our_own():
     odds = PriorOdds.for_effects({name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()})
-    assert sum(math.exp(odds.log_prior_on_mean((name,))) for name in UNNAMED) == pytest.approx(
+    assert sum(math.exp(odds.log_prior_on_mean((name,))) for name in RARE_EFFECTS) == pytest.approx(
         math.exp(odds.log_prior_with_unknown(()))
     )
     beside = odds.log_prior_on_mean(("arm_knock", "backlash")) - odds.log_prior_on_mean(("backlash",))
-    assert math.exp(beside) * len(UNNAMED) == pytest.approx(odds.unknown_beside * odds.out_of_vocabulary)
+    assert math.exp(beside) * len(RARE_EFFECTS) == pytest.approx(odds.unknown_beside * odds.out_of_vocabulary)
 
 
 def test_two_effects_of_a_simulator_are_no_less_likely_than_one_beside_a_fault_of_the_noise():

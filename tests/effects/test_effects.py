@@ -11,7 +11,7 @@ import pytest
 
 from probewise.diagnosis.verdict_report.findings import parameters_found
 from probewise.effects import (
-    UNNAMED,
+    RARE_EFFECTS,
     VOCABULARY,
     AlbedoGradient,
     AmbientGradient,
@@ -94,7 +94,7 @@ def base() -> Chain:
     )
 
 
-EFFECTS = {**VOCABULARY, **UNNAMED}
+EFFECTS = {**VOCABULARY, **RARE_EFFECTS}
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from probewise.effects import UNNAMED, VOCABULARY, Extent, Known
+from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent, Known
 from probewise.priors import Empty
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene
@@ -25,12 +25,12 @@ MIXTURE = FixedMixture(np.ones(1), np.array([[1.0, 1.5]]), np.array([[[16.0, 0.0
 
 
 def known(name):
-    effect = {**VOCABULARY, **UNNAMED}[name].for_extent(Extent(10.0, 60.0, PLAN)).variants()[0]
+    effect = {**VOCABULARY, **RARE_EFFECTS}[name].for_extent(Extent(10.0, 60.0, PLAN)).variants()[0]
     return Known(effect, SIZES[name])
 
 
 def test_the_sizes_are_those_of_all_effects_on_the_footprint():
-    kinds = {**VOCABULARY, **UNNAMED}
+    kinds = {**VOCABULARY, **RARE_EFFECTS}
     assert {name for name, kind in kinds.items() if kind.stage == Stage.FOOTPRINT} == set(SIZES)
 
 

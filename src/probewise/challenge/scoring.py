@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from probewise.diagnosis.names import Names
@@ -18,19 +19,35 @@ HONEST_NATS = 3.0
 
 _LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the one inside (section 4)
 
+COUNTERPARTS: Mapping[str, str] = MappingProxyType(
+    {
+        "bent_rail": "bent_rails",
+        "twisted_rail": "bent_rails",
+        "place_step": "missing_tooth",
+        "stick_slip": "stick_slip",
+        "slipped_paper": "arm_knock",
+        "ghost": "reflection",
+        "cross_talk": "polarisation",
+        "after_glow": "overshoot",
+    }
+)
+"""The rare effect of a diagnosis that acts as a concealed effect out of vocabulary does."""
+
 Result = Mapping[str, Any]
 
 
 def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
     """Return all right names of one concealed effect: its own and its aliases.
 
-    An effect outside the vocabulary has only its aliases; "unknown" is right if it has none.
+    An effect outside the vocabulary has only its aliases; if it has none, "unknown" is right, and the rare effect that
+    acts alike.
     """
     cosines: Mapping[str, float] = hidden["cosines"]
     if hidden["in_vocabulary"]:
         squared = hidden["size_lambda"] ** 2 / 2
         return frozenset({hidden["name"], *(n for n, rho in cosines.items() if squared * (1 - rho**2) < HONEST_NATS)})
-    return frozenset(n for n, rho in cosines.items() if rho >= _LIKE) or frozenset({"unknown"})
+    alike = frozenset(n for n, rho in cosines.items() if rho >= _LIKE)
+    return alike or frozenset({"unknown", COUNTERPARTS.get(hidden["name"], "unknown")})
 
 
 def right_names_of_each_effect(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
@@ -116,7 +133,14 @@ def is_distinguishable_from_ssf(result: Result) -> bool:
 
 def is_out_of_vocabulary(result: Result) -> bool:
     """Return whether a concealed effect is outside the vocabulary and has no alias there."""
-    return frozenset({"unknown"}) in right_names_of_each_effect(result, merged=True)
+    return any("unknown" in right for right in right_names_of_each_effect(result, merged=True))
+
+
+def is_recognised_as_out_of_vocabulary(result: Result) -> bool:
+    """Return whether the verdict is unknown, or names the rare effect that acts as the concealed one does."""
+    physics = set(result["combination"]) - NOISE
+    counterparts = {COUNTERPARTS.get(hidden["name"]) for hidden in result["hidden"]}
+    return result["verdict"] == "unknown" or (result["verdict"] == "named" and physics == counterparts)
 
 
 def acts_on_mean(result: Result) -> bool:

@@ -29,6 +29,7 @@ from probewise.challenge.scoring import (
     is_distinguishable_from_ssf,
     is_leading_name_right,
     is_out_of_vocabulary,
+    is_recognised_as_out_of_vocabulary,
     leading_hypothesis,
     leading_probability_and_correctness,
     names_in_label,
@@ -308,8 +309,8 @@ def _rows_on_out_of_vocabulary(done: list[Result]) -> list[ScoreRow]:
     return [
         *(
             ScoreRow(
-                f"outside the vocabulary: unknown, lambda {size:g}",
-                estimated_share([r["verdict"] == "unknown" for r in outside if r["size"] == size]),
+                f"outside the vocabulary: unknown, or a rare effect named right, lambda {size:g}",
+                estimated_share([is_recognised_as_out_of_vocabulary(r) for r in outside if r["size"] == size]),
                 least,
             )
             for size, least in targets.items()

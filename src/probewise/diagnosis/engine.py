@@ -70,7 +70,7 @@ def diagnose(
         Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape, or `OwnModel` for any
         simulator.
     effects
-        The vocabulary of effects, by name. Library effects outside it (`UNNAMED`) are tried too, but count as unknown.
+        The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; see `judge`.
     thorough
         Function that computes the evidence of the leading hypotheses a second time, such as
         `partial(weigh_thoroughly, rng=rng)`, by nested sampling.

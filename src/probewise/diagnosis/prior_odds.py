@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, Self
 
 from probewise.diagnosis.names import Names
-from probewise.effects import UNNAMED, NamedEffect, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects import RARE_EFFECTS, NamedEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
 
 
@@ -19,7 +19,7 @@ class PriorOdds:
 
     Mean: `clean_mean` for no effect, `unknown` for one out of vocabulary, and the rest divided among combinations by
     size (`by_size`), then equally; `unknown_beside` is the share of those with an additional unknown effect. The share
-    `out_of_vocabulary` of the unknown is divided among the effects of `UNNAMED`; the rest has no formula.
+    `out_of_vocabulary` of the unknown is divided among the effects of `RARE_EFFECTS`; the rest has no formula.
     Noise: `white`, and the rest divided among noise models by size, then equally; with no effect on the mean, the rest
     has together the probability `not_white_alone`, by default the same.
     `complexity_penalty` (nats) is the penalty of an effect per Gaussian of the SSF that it makes superfluous, since
@@ -34,7 +34,7 @@ class PriorOdds:
     """
 
     n_named: int = 24
-    n_unnamed: int = len(UNNAMED)
+    n_unnamed: int = len(RARE_EFFECTS)
     n_noises: int = 6
     clean_mean: float = 0.60
     unknown: float = 0.06

@@ -82,7 +82,7 @@ VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
 )
 """Every effect that the diagnosis considers, by name."""
 
-UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
+RARE_EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
     {
         effect.name: effect
         for effect in (
@@ -99,9 +99,15 @@ UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
         )
     }
 )
-"""Physics outside the vocabulary, by name: a diagnosis reports it as unknown, and suggests it as a possible cause."""
+"""Rare physics outside the vocabulary, by name.
 
-EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, **UNNAMED})
+A diagnosis names it where it leaves hardly any other explanation; otherwise it suggests it as a form of the unknown.
+"""
+
+UNNAMED = RARE_EFFECTS
+"""The old name of `RARE_EFFECTS`."""
+
+EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
 
 PROPOSAL = "formula:"
@@ -109,8 +115,8 @@ PROPOSAL = "formula:"
 
 
 def is_out_of_vocabulary(name: str) -> bool:
-    """Return whether an effect has a formula but no name in the vocabulary."""
-    return name in UNNAMED or name.startswith(PROPOSAL)
+    """Return whether an effect is outside the vocabulary: a rare one, or a proposed formula."""
+    return name in RARE_EFFECTS or name.startswith(PROPOSAL)
 
 
 AGAIN = "~again"
@@ -168,6 +174,7 @@ __all__ = [
     "EFFECTS",
     "NUISANCES",
     "PROPOSAL",
+    "RARE_EFFECTS",
     "UNNAMED",
     "VOCABULARY",
     "AlbedoGradient",

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import ALARM, Diagnosis, Place
-from probewise.effects import UNNAMED, name_without_copy_suffix
+from probewise.effects import RARE_EFFECTS, name_without_copy_suffix
 from probewise.recordings import Plan
 from probewise.report.covariate import (
     axis_label,
@@ -203,7 +203,7 @@ def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float
     It is 0 unless the verdict is `unknown` and the most probable form of the effect is a family of bases.
     """
     shares = diagnosis.judged.unknown_shares
-    if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
+    if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in RARE_EFFECTS:
         return 0.0
     within = " within scans" if place.scan is not None and place.covariate != diagnosis.apparatus.words.run else ""
     return sum(p for family, p in shares.items() if family.partition(",")[0] == place.covariate + within)

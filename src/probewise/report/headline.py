@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise.diagnosis import ALARM, Diagnosis
 from probewise.diagnosis.residuals.bases import MEMORY, PRODUCTS, SCAN_ENDS
-from probewise.effects import PROPOSAL, UNNAMED
+from probewise.effects import PROPOSAL, RARE_EFFECTS
 from probewise.report.covariate import covariate_in_words_and_unit
 from probewise.report.effect_words import effect_in_words, effects_in_words, hypothesis_in_words, join_lists, join_names
 from probewise.report.words import count_with_noun
@@ -75,7 +75,7 @@ def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     known = effects_in_words([e.name for e in diagnosis.effects if e.probability >= _SURE])
     short = "Something is missing that no known effect explains"
     plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short
-    if top in UNNAMED or top.startswith(PROPOSAL):
+    if top in RARE_EFFECTS or top.startswith(PROPOSAL):
         said = [f"{plain}; it looks most like {effect_in_words(top)}."]
     elif top.endswith(", far out"):
         said = [f"Outlying readings cluster in {covariate}: something is missing there that no known effect explains."]

@@ -6,6 +6,7 @@ from probewise.diagnosis.advice.aliases import Alias
 from probewise.diagnosis.judgement.judged import (
     Hypothesis,
     Judged,
+    decided_rare_combination,
     ranked_hypotheses,
     verdict_and_combination,
     with_shared_effects,
@@ -36,6 +37,23 @@ def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_n
     held = {h.effects: h.probability for h in found}
     assert held == {("lag",): pytest.approx(0.5), ("unknown",): pytest.approx(0.4), ("lag", "outliers"): 0.1}
     assert [h.probability for h in found] == sorted(held.values(), reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("unknown", "named"),
+    [
+        ({("arm_knock",): 0.9, ("unknown",): 0.05}, ("arm_knock",)),
+        ({("arm_knock", "lag"): 0.55, ("bent_rails",): 0.05}, ("arm_knock", "lag")),
+        ({("arm_knock",): 0.6, ("unknown",): 0.3}, ()),  # bases explain it about as well
+        ({("arm_knock",): 0.6, ("bent_rails",): 0.2}, ()),
+        ({("arm_knock",): 0.4}, ()),  # names of the vocabulary have the rest
+        ({("formula:reading:y:x^2",): 0.99}, ()),  # a proposal is none
+        ({("unknown",): 0.9}, ()),
+    ],
+)
+def test_a_rare_effect_is_named_where_it_leaves_hardly_any_other_explanation(unknown, named):
+    leader = max((names for names in unknown if names != ("unknown",)), key=lambda names: unknown[names], default=())
+    assert decided_rare_combination(leader, unknown) == named
 
 
 def test_physics_is_named_on_an_alarm_only():

@@ -12,14 +12,14 @@ from heater import ABOUT
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.repair.averaging import can_share_one_model, mix_over_hypotheses, mix_over_orders
 from probewise.diagnosis.repair.samples import ModelSamples
-from probewise.effects import UNNAMED, VOCABULARY, Extent
+from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import ACCURATE_NODES
 from probewise.systems.forms import bind_forms
 
 PLAN = two_way_plan()
 EXTENT = Extent(10.0, 60.0, PLAN)
-BUILT = {name: kind.for_extent(EXTENT) for name, kind in {**VOCABULARY, **UNNAMED}.items()}
+BUILT = {name: kind.for_extent(EXTENT) for name, kind in {**VOCABULARY, **RARE_EFFECTS}.items()}
 
 
 def samples_of(n_gaussians: int, n: int = 500) -> ModelSamples:

@@ -13,7 +13,7 @@ from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary, noise_effects_in_vocabulary
-from probewise.effects import name_without_copy_suffix
+from probewise.effects import PROPOSAL, name_without_copy_suffix
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
@@ -123,9 +123,18 @@ class Judged:
 
 
 def judge(searched: Searched, test: GlobalTest) -> Judged:
-    """Return the verdict, with probabilities and aliases, from a search and the global test."""
+    """Return the verdict, with probabilities and aliases, from a search and the global test.
+
+    A combination with effects out of vocabulary counts as unknown, unless these are the ones that are `named_rare`.
+    """
     prepared, posterior = searched.prepared, searched.posterior
-    hypotheses = ranked_hypotheses(posterior.probabilities, searched.evidences.reported_shares)
+    named_rare = _named_rare_effects(searched) if test.p_value <= ALARM else ()
+
+    def reported_shares(mean: Names) -> Mapping[Names, float]:
+        is_named = named_rare and effects_out_of_vocabulary(mean) == named_rare
+        return {mean: 1.0} if is_named else searched.evidences.reported_shares(mean)
+
+    hypotheses = ranked_hypotheses(posterior.probabilities, reported_shares)
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
@@ -164,12 +173,34 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         hypotheses,
         aliases=pairs,
         order_probabilities=dict(posterior.order_probabilities),
-        unknown_shares=searched.probabilities_of_unknown_forms(),
+        unknown_shares=searched.probabilities_of_unknown_forms(besides=named_rare),
         too_little=prepared.has_too_little_data,
     )
     if searched.prior.shared_is_named and not judged.too_little:
         judged = with_shared_effects(judged, prepared.pure_noise_effect_names, certain=frozenset(searched.certain))
     return judged
+
+
+def _named_rare_effects(searched: Searched) -> Names:
+    """Return the rare effects of the combination that is named, () if there is none; see `decided_rare_combination`."""
+    unknown = {
+        mean: p * searched.evidences.reported_shares(mean).get(("unknown",), 0.0)
+        for mean, p in searched.posterior.marginal_over_noise.items()
+    }
+    leader = searched.leading_combination_out_of_vocabulary()
+    return effects_out_of_vocabulary(decided_rare_combination(leader, unknown))
+
+
+def decided_rare_combination(leader: Names, unknown: Mapping[Names, float]) -> Names:
+    """Return the `leader` of what is out of vocabulary if it leaves hardly any other explanation; else ().
+
+    It has rare effects, no proposed formula, and half of the probability; the rest of `unknown`, the probabilities of
+    all that would count as unknown, has at most a fifth of its own.
+    """
+    own = unknown.get(leader, 0.0)
+    rest = sum(unknown.values()) - own
+    is_formula = any(name.startswith(PROPOSAL) for name in leader)
+    return () if is_formula or own < 0.5 or rest > OUT_OF_THE_QUESTION * own else leader
 
 
 def with_shared_effects(

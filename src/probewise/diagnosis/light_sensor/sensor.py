@@ -21,7 +21,7 @@ from probewise.diagnosis.light_sensor.scheduling import Scan, plan_of_alternativ
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.effects import EFFECTS, NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
+from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
 
@@ -52,7 +52,7 @@ class LightSensorApparatus:
         absorbs effects on the SSF, so these are left out.
         """
         extent, plan = Extent.of(recording), recording.plan
-        kinds = {**self.vocabulary, **UNNAMED, **NUISANCES}
+        kinds = {**self.vocabulary, **RARE_EFFECTS, **NUISANCES}
         able = {name: effect for name, kind in kinds.items() if (effect := kind.for_extent(extent)) is not None}
         return {
             name: effect

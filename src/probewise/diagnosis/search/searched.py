@@ -375,13 +375,17 @@ class Searched:
         leader = max(own, key=lambda names: own[names], default=())
         return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
 
-    def probabilities_of_unknown_forms(self) -> dict[str, float]:
-        """Return the share of each form of an unknown effect: effects out of vocabulary, families of bases."""
+    def probabilities_of_unknown_forms(self, *, besides: Names = ()) -> dict[str, float]:
+        """Return the share of each form of an unknown effect: effects out of vocabulary, families of bases.
+
+        `besides`: effects out of vocabulary that do not count as unknown.
+        """
         by_mean = self.posterior.marginal_over_noise
         unknown = by_mean.get(("unknown",), 0.0)
         shares = {family: unknown * p for family, p in self.evidences.unknown_shares.items()}
         for names, p in by_mean.items():
-            for name in effects_out_of_vocabulary(names):
+            unnamed = effects_out_of_vocabulary(names)
+            for name in unnamed if unnamed != besides else ():
                 shares[name] = shares.get(name, 0.0) + p
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}

@@ -77,7 +77,7 @@ def effects_found(
     *,
     rng: np.random.Generator,
 ) -> tuple[EffectFound, ...]:
-    """Return the findings on every effect of the vocabulary with a probability above 0.001, most probable first.
+    """Return the findings on every effect with a name and a probability above 0.001, most probable first.
 
     Parameters
     ----------
@@ -103,7 +103,9 @@ def effects_found(
         p = sum(h.probability for h in hypotheses if name in h.effects)
         if beside.get(name, 0.0) >= _STANDS_BESIDE:
             p += unknown * beside[name]
-        if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)) or effects_out_of_vocabulary((name,)):
+        if effects_out_of_vocabulary((name,)) and not any(name in h.effects for h in hypotheses):
+            continue  # it counts as unknown
+        if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)):
             continue
         holder, noise = (best.fit, best.noise) if name in samples.effects else _likeliest_candidate_with(searched, name)
         if holder is None:

@@ -39,7 +39,7 @@ Result = Mapping[str, Any]
 def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
     """Return all right names of one concealed effect: its own and its aliases.
 
-    An effect outside the vocabulary has only its aliases; if it has none, "unknown" is right, and the rare effect that
+    Of an effect outside the vocabulary these are its aliases, or "unknown" if it has none, and the rare effect that
     acts alike.
     """
     cosines: Mapping[str, float] = hidden["cosines"]
@@ -47,7 +47,8 @@ def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
         squared = hidden["size_lambda"] ** 2 / 2
         return frozenset({hidden["name"], *(n for n, rho in cosines.items() if squared * (1 - rho**2) < HONEST_NATS)})
     alike = frozenset(n for n, rho in cosines.items() if rho >= _LIKE)
-    return alike or frozenset({"unknown", COUNTERPARTS.get(hidden["name"], "unknown")})
+    counterpart = COUNTERPARTS.get(hidden["name"])
+    return (alike or frozenset({"unknown"})) | ({counterpart} if counterpart is not None else set())
 
 
 def right_names_of_each_effect(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
@@ -139,8 +140,8 @@ def is_out_of_vocabulary(result: Result) -> bool:
 def is_recognised_as_out_of_vocabulary(result: Result) -> bool:
     """Return whether the verdict is unknown, or names the rare effect that acts as the concealed one does."""
     physics = set(result["combination"]) - NOISE
-    counterparts = {COUNTERPARTS.get(hidden["name"]) for hidden in result["hidden"]}
-    return result["verdict"] == "unknown" or (result["verdict"] == "named" and physics == counterparts)
+    right = {COUNTERPARTS[hidden["name"]] for hidden in result["hidden"] if hidden["name"] in COUNTERPARTS}
+    return result["verdict"] == "unknown" or (result["verdict"] == "named" and bool(right) and physics == right)
 
 
 def acts_on_mean(result: Result) -> bool:

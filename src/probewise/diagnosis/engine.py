@@ -70,7 +70,7 @@ def diagnose(
         Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape, or `OwnModel` for any
         simulator.
     effects
-        The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; see `judge`.
+        The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; see `reported_hypotheses`.
     thorough
         Function that computes the evidence of the leading hypotheses a second time, such as
         `partial(weigh_thoroughly, rng=rng)`, by nested sampling.
@@ -206,9 +206,11 @@ def _separating_readings_in_words(
 
     Nothing is known of hypotheses that differ in their noise alone, or that are not among those compared.
     """
-    formulas = {names for names in asked.effects if effects_out_of_vocabulary(names)} if asked else set()
+    told = combinations_in_reason(judged)
     named: dict[Names, str] = {}
-    for names in combinations_in_reason(judged):
+    on_mean = {tuple(sorted({*names} - searched.prepared.noise_effect_names)) for names in told}
+    formulas = {names for names in asked.effects if effects_out_of_vocabulary(names)} - on_mean if asked else set()
+    for names in told:
         if names == ("unknown",):  # without a formula it predicts what the null does
             named |= dict.fromkeys(formulas or {()}, "unknown")
         else:

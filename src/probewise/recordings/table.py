@@ -127,6 +127,15 @@ def _is_number(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None
 
 
+def first_cell_without_number(cells: Sequence[object], *, missing: bool = True) -> int | None:
+    """Return the index of the first cell that is no finite number and, if `missing`, not missing; None without one."""
+    for k, cell in enumerate(cells):
+        text = str(cell).strip()
+        if not _is_number(text) and not (missing and text in MISSING):
+            return k
+    return None
+
+
 def count_numbers(cells: Sequence[str]) -> int:
     """Count the cells that hold a plain decimal number (float() would accept 'infinity' and '1_000' too)."""
     if _parsed_numbers(cells) is not None:

@@ -545,7 +545,7 @@ def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
     ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
-        return (paragraph("None: these readings tell apart all effects that they can detect."),)
+        return (paragraph("None: these readings tell apart all effects of the vocabulary that they can detect."),)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
     if not rest:
         return (_alias_table(first),)

@@ -31,7 +31,7 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
             r"\bcosine\b",
             "1 where two effects change the readings in the same proportions, 0 where unrelated",
         ),
-        "unknown": (r"\bunknown\b", "an effect for which this program has no formula"),
+        "unknown": (r"\bunknown\b", "something that no effect which this program knows explains"),
     }
 )
 """For each term: a pattern that finds its uses in a text, and its explanation."""

@@ -406,5 +406,5 @@ def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], 
             pass
     one = "for each row"
     if len(wanted) > 1:
-        one = "for each sample and row: it is called with parameters (n_samples, 1); else leave vectorized out"
+        one = "for each sample and row: it is called with parameters (n_samples, 1), as vectorized = True says"
     raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number {one}")

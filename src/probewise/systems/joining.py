@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from probewise.errors import ParameterError
 from probewise.recordings.table import number_text
-from probewise.systems.table import RunTable, is_number_or_missing
+from probewise.systems.table import RunTable, column_error
 
 _FILE = "file"
 
@@ -87,9 +87,8 @@ def _concatenated_column(
         if part is None:
             out.append(np.full(n, np.nan) if numeric else np.full(n, ""))
         elif numeric and part.dtype != np.float64:
-            k = next((k for k, cell in enumerate(part.tolist()) if not is_number_or_missing(cell)), 0)
             allowed = f"a number, or nothing where it is missing, as in {sources[0]}"
-            raise ParameterError(f"column {name!r} of {source} in row {k + 2}", str(part[k]), allowed)
+            raise column_error(f"column {name!r} of {source}", part, allowed)
         else:
             out.append(part if numeric else np.array([_text(value) for value in part.tolist()]))
     return np.concatenate(out)

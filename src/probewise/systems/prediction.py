@@ -38,8 +38,8 @@ from probewise.systems.system import System, SystemChain
 from probewise.systems.table import (
     RunRecording,
     RunTable,
+    column_error,
     covariate_of_column,
-    is_number_or_missing,
     relative_sds_of_column,
 )
 
@@ -92,12 +92,8 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     if readings is None:
         readings = np.full(len(table), np.nan)
     elif readings.dtype != np.float64:
-        bad = next((k for k, cell in enumerate(readings.tolist()) if not is_number_or_missing(cell)), 0)
-        raise ParameterError(
-            f"reading {simulator.reading!r} in row {bad + 2}",
-            str(readings[bad]),
-            "a number in each row, or nothing where it is missing",
-        )
+        allowed = "a number in each row, or nothing where it is missing"
+        raise column_error(f"reading {simulator.reading!r}", readings, allowed)
     sd = simulator.noise.sd
     recording = RunRecording(
         cast(Plan, own), np.array(readings), simulator.source, sd_column=sd if isinstance(sd, str) else ""
@@ -146,7 +142,7 @@ def predict_system(
     FileError
         If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
     ShapeError
-        If `simulate` does not return one reading per row.
+        If `simulate` or `observe` does not return one reading per row.
 
     Warns
     -----

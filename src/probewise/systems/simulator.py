@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_text, checked_texts, require_callable, require_kind, require_mapping
-from probewise.effects import EFFECTS
+from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
 from probewise.sensor import Stage
@@ -38,7 +38,8 @@ Observe: TypeAlias = Callable[[Values, Values, Values], Any]
 Hold: TypeAlias = Literal["previous", "linear"]
 
 _A_RANGE = "(low, high) with low < high; None for an open end"
-_TAKEN = (*(n for n, kind in EFFECTS.items() if getattr(kind, "stage", None) is Stage.NOISE), "unknown", "clean")
+_OF_NOISE = (n for n, kind in EFFECTS.items() if getattr(kind, "stage", None) is Stage.NOISE)
+_TAKEN = (*_OF_NOISE, *RARE_EFFECTS, "unknown", "clean")
 
 
 def read_only_views(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -296,7 +297,7 @@ class Simulator:
             if name in self.parameters:
                 raise ParameterError("extra", name, "names that no parameter has")
             if name in _TAKEN:
-                raise ParameterError("extra", name, f"names that no effect on the noise has: {', '.join(_TAKEN)}")
+                raise ParameterError("extra", name, f"names that no effect of this program has: {', '.join(_TAKEN)}")
 
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:

@@ -84,7 +84,7 @@ class System:
             If a column that the simulator names is missing, the table has no column besides the reading, no reading is
             finite at any trial point of the prior, or another call with the same parameters returns other readings.
         ShapeError
-            If it does not return one reading per row.
+            If `simulate` or `observe` does not return one reading per row.
         FileError
             If `simulate` raises an error at a trial call and no other call gives a finite reading, or a law raises at
             every one.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,7 @@ from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.ends import masks_of_readings_at_ends
-from probewise.recordings.table import LARGEST, csv_text, number_text, read_table
+from probewise.recordings.table import LARGEST, csv_text, first_cell_without_number, number_text, read_table
 
 _ONE_RUN = "all"
 _OF_COLUMN = "column:"
@@ -80,10 +79,9 @@ class RunTable:
         if self.time is not None:
             values = columns[self.time]
             if values.dtype != np.float64 or not np.isfinite(values).all():
-                wrong = (k for k, cell in enumerate(values.tolist()) if not _is_finite_number(cell))
-                k = next(wrong, 0)
-                where = f"column {self.time!r} in row {k + 2}"
-                raise ParameterError(where, str(values[k]), "a time, a finite number, in each row")
+                raise column_error(
+                    f"column {self.time!r}", values, "a time, a finite number, in each row", missing=False
+                )
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -245,16 +243,12 @@ def relative_sds_of_column(table: RunTable, column: str, typical: float | None =
     return np.where(there, values, 1.0) / np.where(there, median if typical is None else typical, 1.0)
 
 
-def is_number_or_missing(cell: Any) -> bool:
-    """Return whether a cell is a finite number, or one of the ways to write that there is none."""
-    try:
-        return not math.isinf(float(cell))
-    except ValueError:
-        return bool(cell == "")
-
-
-def _is_finite_number(cell: Any) -> bool:
-    return is_number_or_missing(cell) and str(cell) not in ("", "nan")
+def column_error(column: str, cells: NDArray[Any], allowed: str, *, missing: bool = True) -> ParameterError:
+    """Return the error of a column of texts that should be numbers: its first wrong cell, with the row (header = 1)."""
+    k = first_cell_without_number(cells.tolist(), missing=missing)
+    if k is None:
+        return ParameterError(column, "texts, all of them numbers", f"numbers: {allowed}")
+    return ParameterError(f"{column} in row {k + 2}", str(cells[k]), allowed)
 
 
 def _checked_column(name: str, values: Any) -> NDArray[Any]:

@@ -1,17 +1,21 @@
 """Verdicts on hand-made probabilities: no reading, no fit."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from probewise.diagnosis.advice.aliases import Alias
 from probewise.diagnosis.judgement.judged import (
     Hypothesis,
     Judged,
-    decided_rare_combination,
+    decided_rare_effects,
     ranked_hypotheses,
+    reported_hypotheses,
     verdict_and_combination,
     with_shared_effects,
 )
 from probewise.diagnosis.judgement.shared_effects import shared_effects
+from probewise.diagnosis.search.searched import Posterior
 
 NOISE = frozenset({"outliers"})
 
@@ -43,7 +47,8 @@ def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_n
     ("unknown", "named"),
     [
         ({("arm_knock",): 0.9, ("unknown",): 0.05}, ("arm_knock",)),
-        ({("arm_knock", "lag"): 0.55, ("bent_rails",): 0.05}, ("arm_knock", "lag")),
+        ({("arm_knock", "lag"): 0.55, ("bent_rails",): 0.05}, ("arm_knock",)),
+        ({("arm_knock",): 0.6, ("arm_knock", "lag"): 0.35}, ("arm_knock",)),
         ({("arm_knock",): 0.6, ("unknown",): 0.3}, ()),  # bases explain it about as well
         ({("arm_knock",): 0.6, ("bent_rails",): 0.2}, ()),
         ({("arm_knock",): 0.4}, ()),  # names of the vocabulary have the rest
@@ -51,9 +56,44 @@ def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_n
         ({("unknown",): 0.9}, ()),
     ],
 )
-def test_a_rare_effect_is_named_where_it_leaves_hardly_any_other_explanation(unknown, named):
+def test_a_rare_effect_is_decided_where_hardly_anything_else_out_of_vocabulary_explains_as_much(unknown, named):
     leader = max((names for names in unknown if names != ("unknown",)), key=lambda names: unknown[names], default=())
-    assert decided_rare_combination(leader, unknown) == named
+    assert decided_rare_effects(leader, unknown) == named
+
+
+def searched(probabilities):
+    """A search with these probabilities by effects on mean and noise, of which all out of vocabulary are unknown."""
+    posterior = Posterior(probabilities, {0: 1.0})
+    rare = [mean for mean, _ in probabilities if mean in (("arm_knock",), ("bent_rails",))]
+    return SimpleNamespace(
+        posterior=posterior,
+        evidences=SimpleNamespace(reported_shares=lambda mean: {("unknown",) if mean in rare else mean: 1.0}),
+        leading_combination_out_of_vocabulary=lambda: max(rare, key=lambda m: posterior.marginal_over_noise[m]),
+    )
+
+
+def test_a_decided_rare_effect_is_reported_by_name_on_an_alarm_only():
+    found = searched({(("arm_knock",), ()): 0.9, (("bent_rails",), ()): 0.04, (("lag",), ()): 0.06})
+    hypotheses, rare = reported_hypotheses(found, 1e-6)
+    assert rare == ("arm_knock",)
+    assert [h.effects for h in hypotheses] == [("arm_knock",), ("lag",), ("unknown",)]
+    hypotheses, rare = reported_hypotheses(found, 0.02)
+    assert (rare, hypotheses[0].effects) == ((), ("unknown",))
+
+
+def test_a_rare_effect_split_by_noise_behind_another_name_leaves_the_verdict_unknown():
+    """By name it would be .29 and .26, behind the lag's .43: weaker than the unknown that it was."""
+    found = searched(
+        {
+            (("arm_knock",), ()): 0.29,
+            (("arm_knock",), ("correlated_noise",)): 0.26,
+            (("lag",), ()): 0.43,
+            (("unknown",), ()): 0.02,
+        }
+    )
+    hypotheses, rare = reported_hypotheses(found, 1e-6)
+    assert rare == ()
+    assert (hypotheses[0].effects, hypotheses[0].probability) == (("unknown",), pytest.approx(0.57))
 
 
 def test_physics_is_named_on_an_alarm_only():

@@ -22,7 +22,7 @@ _CREDIBLE = 0.95
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A set of effects and its probability; () is clean, ("unknown",) an effect out of vocabulary."""
+    """A set of effects and its probability; () is clean, ("unknown",) what is out of vocabulary and not named."""
 
     effects: Names
     probability: float
@@ -100,7 +100,7 @@ class Judged:
 
     @property
     def unknown_probability(self) -> float:
-        """Probability of an effect on the mean that is out of vocabulary."""
+        """Probability of an effect on the mean that is out of vocabulary and not named."""
         return next((h.probability for h in self.hypotheses if h.effects == ("unknown",)), 0.0)
 
     @property
@@ -123,18 +123,9 @@ class Judged:
 
 
 def judge(searched: Searched, test: GlobalTest) -> Judged:
-    """Return the verdict, with probabilities and aliases, from a search and the global test.
-
-    A combination with effects out of vocabulary counts as unknown, unless these are the ones that are `named_rare`.
-    """
+    """Return the verdict, with probabilities and aliases, from a search and the global test."""
     prepared, posterior = searched.prepared, searched.posterior
-    named_rare = _named_rare_effects(searched) if test.p_value <= ALARM else ()
-
-    def reported_shares(mean: Names) -> Mapping[Names, float]:
-        is_named = named_rare and effects_out_of_vocabulary(mean) == named_rare
-        return {mean: 1.0} if is_named else searched.evidences.reported_shares(mean)
-
-    hypotheses = ranked_hypotheses(posterior.probabilities, reported_shares)
+    hypotheses, named_rare = reported_hypotheses(searched, test.p_value)
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
@@ -181,26 +172,38 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
     return judged
 
 
-def _named_rare_effects(searched: Searched) -> Names:
-    """Return the rare effects of the combination that is named, () if there is none; see `decided_rare_combination`."""
-    unknown = {
-        mean: p * searched.evidences.reported_shares(mean).get(("unknown",), 0.0)
-        for mean, p in searched.posterior.marginal_over_noise.items()
-    }
-    leader = searched.leading_combination_out_of_vocabulary()
-    return effects_out_of_vocabulary(decided_rare_combination(leader, unknown))
+def reported_hypotheses(searched: Searched, p_value: float) -> tuple[tuple[Hypothesis, ...], Names]:
+    """Return the hypotheses, most probable first, and the rare effects that they name; () if there are none.
 
-
-def decided_rare_combination(leader: Names, unknown: Mapping[Names, float]) -> Names:
-    """Return the `leader` of what is out of vocabulary if it leaves hardly any other explanation; else ().
-
-    It has rare effects, no proposed formula, and half of the probability; the rest of `unknown`, the probabilities of
-    all that would count as unknown, has at most a fifth of its own.
+    A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided (see
+    `decided_rare_effects`), the p-value of the global test is .01 or less, and the first hypothesis has them.
     """
-    own = unknown.get(leader, 0.0)
+    posterior, shares = searched.posterior, searched.evidences.reported_shares
+    unknown = {mean: p * shares(mean).get(("unknown",), 0.0) for mean, p in posterior.marginal_over_noise.items()}
+    rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
+
+    def shares_with_rare_named(mean: Names) -> Mapping[Names, float]:
+        return {mean: 1.0} if effects_out_of_vocabulary(mean) == rare else shares(mean)
+
+    if rare:
+        hypotheses = ranked_hypotheses(posterior.probabilities, shares_with_rare_named)
+        if {*rare} <= {*hypotheses[0].effects}:
+            return hypotheses, rare
+    return ranked_hypotheses(posterior.probabilities, shares), ()
+
+
+def decided_rare_effects(leader: Names, unknown: Mapping[Names, float]) -> Names:
+    """Return the rare effects of the `leader` if hardly anything else out of vocabulary explains the readings; else ().
+
+    `unknown` holds the probabilities of all combinations that would count as unknown. Those with the leader's rare
+    effects have half of the probability, and all others together at most a fifth of that. A proposed formula is no rare
+    effect.
+    """
+    rare = effects_out_of_vocabulary(leader)
+    own = sum(p for mean, p in unknown.items() if effects_out_of_vocabulary(mean) == rare)
     rest = sum(unknown.values()) - own
-    is_formula = any(name.startswith(PROPOSAL) for name in leader)
-    return () if is_formula or own < 0.5 or rest > OUT_OF_THE_QUESTION * own else leader
+    is_formula = any(name.startswith(PROPOSAL) for name in rare)
+    return () if not rare or is_formula or own < 0.5 or rest > OUT_OF_THE_QUESTION * own else rare
 
 
 def with_shared_effects(

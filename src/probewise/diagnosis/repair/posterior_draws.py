@@ -50,13 +50,14 @@ def posterior_draws(
 ) -> FloatArray:
     """Draw coordinates, (n_samples, n_params), from the posterior about a fit, under one noise model.
 
+    Unless `annealed`, they are draws of Laplace's approximation, or of `LinearAmplitudes` where it applies. Otherwise:
     If an effect on the readings has a nonlinear coordinate, they are resampled from a `ConditionallyLinearDensity`;
     where many samples cost little more than one, from a `ProfiledDensity` if an effect has a nonlinear coordinate, or
     else from `LinearAmplitudes`. Without any of these, samples of Laplace's approximation are moved to the posterior in
     two stages, the first through a quadratic surrogate: with several Gaussians the posterior is curved, and Laplace's
     samples predict new angles far worse.
 
-    Parameters are those of `sample_model`.
+    `n_samples` is their number; the other parameters are those of `sample_model`.
     """
     laplace = _Laplace.of(found, noise, recording)
     if not annealed:

@@ -123,7 +123,7 @@ class SimulatorApparatus:
                 "time": own.time or "time",
                 "row": "row number (from 0)",
                 "level": f"predicted {own.reading}",
-                "previous": f"change of predicted {own.reading} since the row before",
+                "previous": f"change of predicted {own.reading} between rows",
             },
             own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
         )

@@ -53,7 +53,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     FileError
         If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
     ShapeError
-        If `simulate` does not return one reading per row.
+        If `simulate` or `observe` does not return one reading per row.
     """
     table = table_for(simulator, table)
     table.require_rising_time()
@@ -115,7 +115,7 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
     With the predicted readings there, (n_points,), and the point in words. Raises ParameterError if there is none, or a
     row has no reading at any.
     """
-    never = np.ones(len(table), dtype=np.bool_)
+    never, is_constant = np.ones(len(table), dtype=np.bool_), False
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
         if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-12 * max(float(np.abs(predicted).max()), 1e-300):
@@ -126,11 +126,15 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
             )
             return z, predicted, at
         never &= ~np.isfinite(predicted)
+        is_constant |= bool(np.isfinite(predicted).all())
     if never.any():
         found = (
             f"no finite reading in {int(never.sum())} of {len(table)} rows, first in row {int(np.argmax(never)) + 2}"
         )
         raise ParameterError("the table", found, "a number in each cell that the simulator reads")
+    if not is_constant:
+        found = f"not finite in some row at any of the {len(system.starts)} points of the prior that were tried"
+        raise ParameterError("the predicted reading", found, "narrower priors, with which all readings are finite")
     raise ParameterError(
         "the predicted reading", "the same in all rows, wherever the prior was tried", "rows over which it changes"
     )

@@ -76,7 +76,7 @@ def diagnose_system(
     FileError
         If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
     ShapeError
-        If `simulate` does not return one reading per row.
+        If `simulate` or `observe` does not return one reading per row.
     NotConvergedError
         If the fit of the simulator did not converge.
     """

@@ -136,7 +136,7 @@ def fit_simulator(
     FileError
         If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
     ShapeError
-        If `simulate` does not return one reading per row.
+        If `simulate` or `observe` does not return one reading per row.
     NotConvergedError
         If the fit did not converge.
     """

@@ -142,7 +142,7 @@ def without_readings_at_scattered_stop(
 
 def _without_rows_at_stop(recording: RunRecording, stop: MeterStop, rows: BoolArray) -> RunRecording:
     level = f"{stop.level:.6g} {stop.unit}".rstrip()
-    note = f"{int(rows.sum())} readings left out: they stand at {level}, where the meter stops"
+    note = f"{_count_of_readings(rows.sum())} left out, at {level}, where the meter stops"
     return replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, note))
 
 
@@ -177,11 +177,12 @@ def without_readings_near_ends(system: System, recording: RunRecording, near_end
     said = []
     if at_end.any():
         said.append(
-            f"{int(at_end.sum())} readings at an end of the declared range say that the signal is there or beyond"
+            f"{_count_of_readings(at_end.sum())} at an end of the declared range: used only as the statement that the "
+            "signal is there or beyond"
         )
     if cut.any():
         said.append(
-            f"{int(cut.sum())} readings near an end of the declared range are left out: the end cuts off their noise"
+            f"{_count_of_readings(cut.sum())} left out near an end of the declared range, which cuts off the noise"
         )
     return replace(recording, readings=np.where(cut, np.nan, recording.readings), notes=(*recording.notes, *said))
 

@@ -1,4 +1,4 @@
-"""Samplers of effects outside the vocabulary, which a diagnosis can detect but not name."""
+"""Samplers of effects outside the vocabulary of a diagnosis."""
 
 from __future__ import annotations
 

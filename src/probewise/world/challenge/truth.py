@@ -39,7 +39,7 @@ class HiddenEffect:
 
     @property
     def in_vocabulary(self) -> bool:
-        """Whether the effect is one that a diagnosis can name."""
+        """Whether the effect is in the vocabulary of a diagnosis."""
         return self.name in INSIDE
 
     @property

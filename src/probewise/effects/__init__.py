@@ -101,7 +101,8 @@ RARE_EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
 )
 """Rare physics outside the vocabulary, by name.
 
-A diagnosis names it where it leaves hardly any other explanation; otherwise it suggests it as a form of the unknown.
+A diagnosis names it where hardly anything else out of vocabulary explains the readings; otherwise it suggests it as a
+form of the unknown.
 """
 
 UNNAMED = RARE_EFFECTS

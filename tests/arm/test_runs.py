@@ -11,8 +11,8 @@ import pytest
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.calibration import FittedSensor, write_sensor
-from probewise.cli import arm as verb
 from probewise.cli import main
+from probewise.cli._arm_tasks import opening
 from probewise.errors import LinkError
 from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan, write_recording
 from probewise.sensor import footprint_of, mean_ssf_field
@@ -45,7 +45,7 @@ def bricks(monkeypatch, make_paper_brick):
         machine = BrickMachine(Brick(Link(paper, clock=clock), clock=clock), geometry)
         return LegoArm(machine, geometry, clock=clock, start_s=start_s)
 
-    monkeypatch.setattr("probewise.cli.arm.open_nxt_arm", open_nxt_arm)
+    monkeypatch.setattr("probewise.cli._arm_tasks.opening.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("probewise.cli._explore_arm.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("probewise.cli._bench.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 100))
@@ -292,7 +292,7 @@ def test_a_stop_while_the_sensor_rises_is_raised_by_what_comes_next(n_poses, sto
     readings = []
 
     def measure():
-        with verb.open_nxt_arm("x", geometry) as arm:
+        with opening.open_nxt_arm("x", geometry) as arm:
             readings.extend(arm.measure(pose) for _ in range(n_poses))
 
     stop_as_it_rises(1)

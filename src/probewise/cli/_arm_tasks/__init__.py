@@ -1,0 +1,1 @@
+"""Tasks of `probewise arm`, at the bench with the arm."""

@@ -2,9 +2,9 @@
 A sensor model from a recording
 ===============================
 
-Shows how many Gaussians the shipped recording asks for, what the sensor sees, and how well the model
-predicts what was recorded. The sensor's spatial sensitivity function (SSF) is the weight of each point below it in a
-reading. The figures are the paper's: how the recording was taken, the data, the SSF, the predictions.
+Shows a sensor model of one Gaussian fitted to the shipped recording (simulated with the paper's plan), and how well it
+predicts the readings. The sensor's spatial sensitivity function (SSF) is the weight of each point below it in a
+reading. The figures follow the paper's: how the recording was taken, the data, the SSF, the predictions.
 """
 
 # %%
@@ -24,8 +24,8 @@ fig, ax = plt.subplots()
 plots.readings_by_orientation(recording, ax=ax)
 
 # %%
-# One Gaussian, with few live points so that it runs in seconds; `orders=(1, 2, 3, 4)` and
-# `n_live=300` are the paper's.
+# One Gaussian, with few live points so that it runs in seconds. The defaults, `orders=(1, 2, 3, 4)` and `n_live=300`,
+# compare one to four Gaussians by their evidence.
 calibration = calibrate(recording, orders=(1,), n_live=50, rng=np.random.default_rng(seed))
 print(calibration.summary())
 fig, ax = plt.subplots()

@@ -2,7 +2,7 @@
 What does the model leave out?
 ==============================
 
-Shows how a recording that a plain sensor model does not explain is diagnosed: which physics is missing,
+Shows how a recording that the sensor model without effects does not explain is diagnosed: which physics is missing,
 where it shows, and what the repaired model gains on held-out readings.
 """
 
@@ -21,7 +21,7 @@ diagnosis = diagnose(recording, rng=np.random.default_rng(seed))
 print(diagnosis.summary())
 
 # %%
-# Every hypothesis with its probability; they sum to one.
+# The hypotheses with a probability above 0.001; all together sum to one.
 fig, ax = plt.subplots(figsize=(8, 4))
 likely = [h for h in diagnosis.hypotheses if h.probability > 1e-3]
 plots.hypothesis_probabilities([h.label for h in likely], [h.probability for h in likely], ax=ax)

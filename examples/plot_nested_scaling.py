@@ -43,12 +43,12 @@ cost = {
 draw("dimension", "parameters", cost)
 
 # %%
-# One Gaussian of the sensor's sensitivity, from denser and denser scans. The posterior narrows as the readings
-# multiply, so the information grows by half a nat a parameter for each factor e; the rest is the likelihood's own cost.
+# The SSF as one Gaussian, from ever denser scans. The posterior narrows as the readings multiply: the information grows
+# by half a nat per parameter whenever their number grows by a factor of e; the rest is the cost of the likelihood.
 draw("readings", "readings", cost)
 
 # %%
-# The Gaussian in ten dimensions with more and more live points: the error falls with their root.
+# The Gaussian in ten dimensions with more and more live points: the error falls as one over the root of their number.
 draw("live points", "live points", {**cost, "log_z_error": "error of log Z / nats"})
 
 # %%

@@ -37,7 +37,7 @@ STEPS = 2  # of the integration, for each reading
 
 
 def two_tanks(parameters: Parameters, plan: Plan) -> np.ndarray:
-    """Level of the lower tank in volts, (n_samples, n_points); water runs out as the root of the level."""
+    """Level of the lower tank in volts, (n_samples, n_points); the outflow is as the root of the level."""
     p = {name: value[:, 0] for name, value in parameters.items()}
     brim, caught = p.get("brim_v", np.inf), p.get("caught", 0.0)
     upper, lower = p["upper_0_v"].copy(), p["lower_0_v"].copy()
@@ -106,8 +106,8 @@ class Overflow(NamedEffect[Parameters]):
 
 
 # %%
-# The recording: measured, where there is one, else simulated with both of what the model leaves out. Eight pieces
-# take the part of scans, so that one after the other can be kept back.
+# The recording: the measured one if it is given, else one simulated with both effects, the overflow and the meter's
+# limit. It is divided into eight pieces, which stand for scans, so that each in turn can be held out.
 
 
 def tanks(pump_v: np.ndarray, readings_v: np.ndarray, gap_s: float) -> Recording:

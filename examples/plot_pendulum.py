@@ -24,7 +24,7 @@ seed = 4
 print(f"seed {seed}")
 
 # %%
-# The recording: three releases, from 60, 35 and 50 degrees, an angle twenty times a second, to a tenth of a degree.
+# The recording: three releases, from 60, -35 and 50 degrees; the angle 20 times per second, with noise of 0.1 degrees.
 
 LENGTH_M, FRICTION_PER_S, DRAG_PER_RAD = 0.9, 0.05, 0.08
 TIME_S = np.arange(0.0, 4.0, 0.05)

@@ -17,7 +17,7 @@ from probewise.priors import Uniform
 seed = 5
 print(f"seed {seed}")
 rng = np.random.default_rng(seed)
-RANGE_MM = 4000.0  # beyond that the sensor says so
+RANGE_MM = 4000.0  # the greatest reading: a farther wall reads as this
 
 
 # %%
@@ -34,7 +34,7 @@ noise = ReadingNoise(30.0, outliers=0.1, between=(0.0, RANGE_MM))
 goal = {"distance_mm": 15.0, "normal_rad": np.radians(1.0)}
 
 # %%
-# Turning takes time: a second for each 60 degrees, and half a second for the reading. Worth is counted per second.
+# Turning takes time: a second for each 60 degrees, and half a second for the reading. The utility is per second.
 
 
 def seconds(last_rad):
@@ -59,8 +59,8 @@ print(f"{took_s:.0f} s of turning and reading")
 
 
 # %%
-# What is believed (blue: 50 walls drawn from the posterior), the readings, the next bearing (dotted), and what a
-# reading at each bearing promises (the ring; darker is more).
+# What is believed (blue: 50 walls drawn from the posterior), the readings, the next bearing (dotted), and the
+# utility of a reading at each bearing (the ring; darker is more).
 def ends(distance, normal):
     foot = distance * np.array([np.cos(normal), np.sin(normal)])
     along = 6000.0 * np.array([-np.sin(normal), np.cos(normal)])
@@ -75,7 +75,7 @@ for (readings, posterior, worth, chosen), ax in zip(views, axes, strict=True):
     at, read = (np.array(column) for column in zip(*readings, strict=True))
     ax.plot(read * np.cos(at), read * np.sin(at), "o", color="tab:orange", markeredgecolor="k", label="readings")
     ring = ax.scatter(3800 * np.cos(bearings_rad), 3800 * np.sin(bearings_rad), c=worth, cmap="copper_r", s=14)
-    fig.colorbar(ring, ax=ax, shrink=0.8, label="worth of a reading per second")
+    fig.colorbar(ring, ax=ax, shrink=0.8, label="utility of a reading per second")
     if chosen is not None:
         ax.plot([0, 3800 * np.cos(chosen)], [0, 3800 * np.sin(chosen)], ":", color="tab:brown", label="next")
     ax.plot(0, 0, "k^", markersize=8, label="range finder")

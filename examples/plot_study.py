@@ -32,7 +32,8 @@ for row in rows:
     print(f"{row['row']}: {row['runs']} runs, mean {estimate(row, 'mean')}, after white {estimate(row, 'after_white')}")
 
 # %%
-# Every row looks for the same circles and meets the same noise; each differs in one thing from the first.
+# Rows of one population ("inside", "anywhere") search for the same circles, and all have the same noise in units of its
+# sd. Each row differs from the first in one factor or two. In brackets: the number of runs.
 needed = {
     f"{row['row']} ({row['runs']})": SimpleNamespace(
         **{name: estimate(row, name) for name in ("mean", "median", "after_white")}

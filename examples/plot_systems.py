@@ -44,8 +44,8 @@ passes = {
 }
 
 # %%
-# Four that are recorded here. An oven loses heat to a room that it is not asked about; a stage has play; a thermometer
-# lags behind the bath; a photodiode's amplifier goes no further than 2.5 V.
+# Four are recorded here. The temperature of the oven's room varies, which its simulator does not use; the stage has
+# backlash; the thermometer lags behind the bath; the photodiode's amplifier saturates at 2.5 V.
 
 N = 120
 TIME_S = 10.0 * np.arange(N)
@@ -100,8 +100,8 @@ photodiode = Simulator(
 )
 
 # %%
-# The same call for each. A name with a target is what is left out; names that these readings cannot tell apart are told
-# together.
+# The same call for each. After a colon, a name says on which column or parameter the effect acts, as in
+# "sensitivity:room_c". Names that these readings cannot tell apart are given together.
 
 systems = {
     "load cell (NIST, Pontius)": (load_cell, passes, "load_lb", "load (lb)"),
@@ -115,7 +115,7 @@ for name, diagnosis in found.items():
     print(f"{name}: {diagnosis.verdict}\n  {diagnosis.reason}")
 
 # %%
-# What each simulator leaves, and what is left once the effect is in it.
+# The residuals of each simulator, and those of the repaired one.
 
 fig, axes = plt.subplots(len(systems), 1, figsize=(8, 11))
 for ax, (name, (own, table, column, label)) in zip(axes, systems.items(), strict=True):

@@ -80,6 +80,8 @@ def run_campaign(
         If a worker dies; finished results are kept.
     ParameterError
         If a result is not a JSON object of finite numbers.
+    Exception
+        Whatever `work` raises ends the campaign; finished results are kept, and the same call continues from there.
     """
     path = Path(path)
     wanted = json.loads(json.dumps(dict(settings)))

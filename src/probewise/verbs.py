@@ -1,6 +1,6 @@
-"""The commands of the command line as Python functions, with the same names and defaults.
+"""The main commands of the command line as Python functions, with the same names and defaults.
 
-The package of each offers the same with every option. Heavy imports happen inside the functions, so that
+Each function's See Also names the version with every option. Heavy imports happen inside the functions, so that
 `import probewise` and `probewise --help` are quick.
 """
 
@@ -74,7 +74,8 @@ def calibrate(
     orders
         Numbers of Gaussians to compare.
     n_live
-        Live points of a full nested sampling: fewer are faster, but make the evidences less precise.
+        Live points of a full nested sampling, at least two per parameter (six parameters per Gaussian, and two levels):
+        fewer are faster, but make the evidences less precise.
     method
         "quick" (the default): log-uniform priors of the widths; each number of Gaussians is fitted by sequential Monte
         Carlo, from the peak of its likelihood or from the posterior of one Gaussian less. Nested sampling of the whole
@@ -99,6 +100,11 @@ def calibrate(
     ------
     ParameterError
         If the recording, an order or the number of live points cannot be used.
+
+    Warns
+    -----
+    DoubtfulResultWarning
+        If there are fewer usable readings than parameters, or the sampler warns of a doubtful run.
 
     See Also
     --------
@@ -152,12 +158,18 @@ def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:
     Returns
     -------
     Prediction
-        Predictive mean and sd of a reading for each row; log density of each recorded reading, NaN for a plan.
+        Predictive mean and sd of a reading for each row, (n_points,), in the sensor's unit; natural log density of each
+        recorded reading, per unit of the reading, NaN where there is none or it is outside the declared range.
 
     Raises
     ------
     ParameterError
         If an argument has the wrong type, or a pattern is not described.
+
+    Warns
+    -----
+    DoubtfulResultWarning
+        If the plan's unit is not that of the calibration, or a column that an effect reads is missing.
 
     Examples
     --------
@@ -267,11 +279,21 @@ def explore(
     Raises
     ------
     ParameterError
-        If an argument has the wrong type, or a truth is given together with an arm.
+        If an argument has the wrong type, options do not go together, a truth is given together with an arm, no place
+        is more informative than others, or the arm does not declare that it turns or lifts its sensor as asked.
+    ReachError
+        If no place of the field is within reach.
+    LinkError
+        If the instrument fails, or returns a reading out of range.
     FileError
         If the journal cannot be read or written, or is of another run.
     NotConvergedError
         If no hypothesis could have given the readings.
+
+    Warns
+    -----
+    DoubtfulResultWarning
+        If the arm reads at another height than that of the calibration.
 
     See Also
     --------
@@ -452,8 +474,9 @@ def diagnose(
     sensor
         An earlier calibration, whose posterior becomes the prior.
     thorough
-        Recompute the evidence of the leading hypotheses by nested sampling, which overrides Laplace's approximation.
-        The progress bar estimates the minutes; they grow with the numbers of readings and of leading hypotheses.
+        Recompute the evidence of the leading hypotheses by nested sampling. It replaces Laplace's approximation if the
+        two differ by more than a nat plus the standard error, and no run gave a warning. The progress bar estimates the
+        minutes; they grow with the numbers of readings and of leading hypotheses.
     rng
         Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise diagnose --seed`.
     progress

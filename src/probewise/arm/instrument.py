@@ -30,7 +30,10 @@ class Pose:
 
 @dataclass(frozen=True)
 class Reading:
-    """A sensor reading with time, covariates by name, and pose: as measured by the arm, else as commanded."""
+    """A reading with its pose (as measured by the arm, else as commanded), time, and covariates by name.
+
+    `value` is in the sensor's unit, NaN where the reading is missing; `time_s` is since the start of the run.
+    """
 
     value: float
     pose: Pose

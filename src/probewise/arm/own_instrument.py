@@ -258,7 +258,8 @@ def as_instrument(
     own
         Its `measure(pose)` moves to `pose.x_mm`, `pose.y_mm`, orientation `pose.orientation_rad` and, if not None,
         height `pose.height_mm`, and returns a number, a Reading, or a dict with "value" and optionally the true pose
-        `x_mm`, `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates. Optional
+        `x_mm`, `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates.
+        For a missing reading return Reading(math.nan, pose, time_s); a number or "value" has to be finite. Optional
         methods: `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`,
         seconds from a pose to each place; `orientation_rad(places_mm)`, the sensor's own orientation at each place; a
         single value applies to all places. Attributes `turns = True` and `lifts = True` declare that the sensor is

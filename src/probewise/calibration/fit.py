@@ -143,7 +143,8 @@ def calibrate(
     orders
         Numbers of Gaussians to try.
     n_live
-        Live points of nested sampling, at least two per parameter; with `quick`, of orders searched in full alone.
+        Live points of nested sampling, at least two per parameter and ten. With `quick` only the orders whose whole
+        prior is searched use them.
     rng
         Source of randomness; spawned for each order.
     quick
@@ -176,8 +177,9 @@ def calibrate(
     Raises
     ------
     ParameterError
-        If `orders` is empty, the recording has no contrast (see `scan_geometry`), a name in it cannot be written to a
-        file, a value is out of its range, or `quick` is asked with `refined=False`.
+        If `orders` is empty, a pattern of the recording is not described, the recording has no contrast (see
+        `scan_geometry`), a name in it cannot be written to a file, a value is out of its range, or `quick` is asked
+        with `refined=False`.
     ShapeError
         If `data_sets` has not one number per row.
 

@@ -86,13 +86,14 @@ class FittedSensor(NamedSamples):
     names
         Parameter names, one per column of `samples`: a_1 ... C_N, I_min, I_max, then "<effect>.<parameter>".
     samples
-        Equally weighted posterior samples, (n_samples, n_params), at least 500.
+        Equally weighted posterior samples, (n_samples, n_params), at least 500. `calibrate` sorts the Gaussians of each
+        sample by mass, greatest first.
     n_gaussians
         Order N of the SSF.
     noise_sd
         Noise sd of a reading in a new scan for each sample, pooled over scans, (n_samples,).
     field
-        Posterior mean of the SSF fields, the discrete SSF that the robot uses (paper, eq. "discreteR").
+        Posterior mean of the SSF fields: the paper's discrete SSF (eq. "discreteR"). The robot uses `mean_mixture()`.
     instrumentation
         The instrument: unit, range and step of the readings, sensor, controls.
     effects

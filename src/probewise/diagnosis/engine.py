@@ -70,7 +70,8 @@ def diagnose(
         Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape, or `OwnModel` for any
         simulator.
     effects
-        The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; see `reported_hypotheses`.
+        The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; they are named where hardly anything
+        else out of vocabulary explains the readings.
     thorough
         Function that computes the evidence of the leading hypotheses a second time, such as
         `partial(weigh_thoroughly, rng=rng)`, by nested sampling.

@@ -18,7 +18,7 @@ from probewise.sensor.stages import Poses, Stage
 
 @dataclass(frozen=True)
 class Backlash(LinearEffect[Poses]):
-    """Play in the gears: position = commanded position - (width_mm / 2) d, d the sign of the last motion of each axis.
+    """Play in the gears: position = commanded position - (width_mm / 2) d, d the unit vector of the last motion.
 
     The width is positive: the arm lags behind the motion, never ahead.
     """

@@ -25,8 +25,8 @@ from probewise.sensor.stages import require_theta_columns
 class SensorChangeSds:
     """Prior sds of a sensor's changes since its calibration.
 
-    `log_size` of the footprint along each axis (0.3: a third wider or narrower), `shift_mm` of its
-    centre, `level` of dark and bright readings as a share of the difference between them.
+    `log_size`: of the log of the footprint's size along each axis (0.3: a factor of 1.35 either way); `shift_mm`: of
+    its centre; `level`: of dark and bright readings, as a share of the difference between them.
     """
 
     log_size: float = 0.3

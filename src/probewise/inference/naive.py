@@ -1,4 +1,4 @@
-"""The naive likelihood: the sensor reads one level over black, another over white (paper, eq. naive).
+"""The naive likelihood: the sensor reads one level over black, another over white (paper, "The Naive Likelihood").
 
 The paper prints (2 pi sigma)^(-1/2) and a positive exponent; a normal density has
 (2 pi sigma^2)^(-1/2) and a negative one.
@@ -21,7 +21,7 @@ from probewise.inference._residuals import residuals
 
 @dataclass(frozen=True)
 class Naive:
-    """Likelihood of a sensor with two levels, each with Gaussian noise of its own sd.
+    """Likelihood of a sensor with two levels, each with Gaussian noise of its own sd (paper, "The Naive Likelihood").
 
     Parameters
     ----------

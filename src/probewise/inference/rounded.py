@@ -81,11 +81,12 @@ class Rounded:
     sd
         Sd of the noise before rounding, in units of the reading.
     step
-        Rounding step: readings are whole multiples of it, or an end of the scale that rounds to one beyond.
+        Width of a reading's cell, in units of the reading; readings are whole multiples of it, or an end of the scale
+        that rounds to one beyond.
     low, high
-        Ends of the scale. The outermost reading that each allows covers everything beyond.
+        Ends of the scale, in units of the reading. The outermost reading that each allows covers everything beyond.
     whole_steps
-        Whether readings are rounded; if not, `step` is only the width of a reading's cell.
+        Whether readings lie on multiples of `step`; if not, the ends of the scale are not rounded to such multiples.
 
     Raises
     ------
@@ -109,7 +110,7 @@ class Rounded:
             raise ParameterError("(low, high)", (self.low, self.high), "low < high")
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log probability of readings, (n_points,), for each row of predictions, (n_samples, n_points)."""
+        """Return the log probability of readings, (n_points,), by predictions (n_samples, n_points): (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
         at_end = self.ends.end_mask(readings)

@@ -117,6 +117,9 @@ def _log_upper_gamma(a: FloatArray, t: FloatArray) -> FloatArray:
 class StudentT:
     """Student-t likelihood: Gaussian noise, the sd of each data set integrated out (paper, eq. studentT and product).
 
+    The paper gives S^(-(N-1)/2), from a prior uniform in an unbounded sigma. Here sigma's prior is 1/sigma between a
+    floor and a ceiling: it is proper, tends to S^(-N/2) for wide bounds, and keeps all constants.
+
     For a data set of N readings with sum of squares S, and L = ln(sd_ceiling / sd_floor): (2 pi)^(-N/2) / L times the
     integral of sigma^(-N-1) exp(-S / 2 sigma^2) from floor to ceiling.
 

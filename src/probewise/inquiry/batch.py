@@ -21,9 +21,10 @@ def choose_several(
 ) -> tuple[int, ...]:
     """Choose readings with large joint information, greedily one after another.
 
-    Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + ..., within 1 - 1/e of the best set
-    (Nemhauser, Wolsey & Fisher 1978). The conditional information is averaged over simulated outcomes: each is a draw
-    from the predictive distribution, with its own posterior.
+    Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + .... With exact terms it reaches at least
+    1 - 1/e (63 %) of the information of the best set (Nemhauser, Wolsey & Fisher 1978). Here each conditional
+    information is averaged over simulated outcomes: each is a draw from the predictive distribution, with its own
+    posterior.
 
     Parameters
     ----------

@@ -65,8 +65,8 @@ def fewest_readings(
         Differential entropy of the parameters: under the prior, at the first reading on the shape (on average), and at
         the target (`target_entropy`), in descending order; else ParameterError.
     most_covered
-        Probability, 0 to 1, that the best first place lies on the shape. A search reading answers yes or no, with at
-        most this probability of yes as long as no better place arises.
+        Probability that the best first place lies on the shape, above 0 and below 1, else ParameterError. A search
+        reading answers yes or no, with at most this probability of yes as long as no better place arises.
     capacity
         Capacity of the sensor, bits per reading (`capacity_bits`).
     """

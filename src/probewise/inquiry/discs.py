@@ -48,8 +48,9 @@ class DiscTable:
     bend_per_mm
         Least and greatest 1 / radius of the table.
     levels
-        Noise-free readings, (n_bends, n_directions + 1, n_distances): evenly spaced in 1 / radius, in the direction's
-        pseudo-angle (the last repeats the first), and in distance from -margin to margin.
+        Noise-free readings, (n_bends, n_directions + 1, n_distances): evenly spaced in 1 / radius, in a pseudo-angle of
+        the direction (0 to 4, rising with the angle; the last repeats the first), and in distance from -margin to
+        margin.
     """
 
     dark: float
@@ -62,9 +63,9 @@ class DiscTable:
     def of(cls, model: SensorModel) -> Self | None:
         """Tabulate a model, or return None if that is not possible.
 
-        Tabulated are a known mixture, or the naive sensor, over a single circle, with no effects but those of
-        `is_known_footprint_effect`, if the reading is constant farther than 80 mm from the edge. ParameterError if the
-        readings far outside and inside are equal.
+        Tabulated is a known mixture or the naive sensor, with known levels, over a single circle. Effects may only be
+        blur of edges and halo with known parameters. The reading must be constant farther than 80 mm from the edge.
+        ParameterError if the readings far outside and inside are equal.
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None

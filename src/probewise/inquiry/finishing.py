@@ -46,7 +46,10 @@ class Finishing:
         return f"{self.of.label}, or chance to finish"
 
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
-        """Return the utility of every available design, (n,), all by the same one of the two."""
+        """Return the utility of every available design, (n,), all by the same one of the two.
+
+        The probability is computed for the 250 designs best by the other utility; it is set to 0 for the rest.
+        """
         return self.utility_and_label(utility_input)[0]
 
     def utility_and_label(self, utility_input: UtilityInput) -> tuple[FloatArray, str]:

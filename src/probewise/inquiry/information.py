@@ -49,8 +49,8 @@ def neighbour_entropy(theta: FloatArray, *, neighbour: int = 4) -> float:
 
     Kozachenko and Leonenko's estimate (k, `neighbour`, as in Kraskov et al. 2004): psi(n) - psi(k) + ln V_d + d mean(ln
     r_k). The columns are scaled to unit sd first, and the scale is added back, since the estimate assumes a density
-    that is even over the distance r_k. ParameterError for repeated samples, which have distance zero, a constant
-    column, or a k that is not below the number of samples.
+    that is even over the distance r_k. ParameterError if more than k samples coincide, for a constant
+    column, or for a k that is not below the number of samples.
     """
     n_samples, n_params = theta.shape
     if not 1 <= neighbour < n_samples:

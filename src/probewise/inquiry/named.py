@@ -14,6 +14,10 @@ UTILITY_NAMES = ("finishing", "information", "entropy", "per-second", "about:PAR
 def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
     """Build a utility from its name, one of `UTILITY_NAMES`, such as "entropy" or "about:radius_mm".
 
+    "finishing": `Finishing`; "information": `InformationGain`; "entropy": `ReadingEntropy`; "per-second": `PerSecond`
+    of the information; "about:PARAMETER": `InformationAbout` that parameter; "which-shape": `InformationAbout` the
+    shape.
+
     Parameters
     ----------
     text
@@ -24,7 +28,7 @@ def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
     Raises
     ------
     ParameterError
-        If no utility has the name.
+        If no utility has the name, or `bin_width` is not above 0.
     """
     name, _, parameter = text.partition(":")
     if name == "about" and parameter:

@@ -21,7 +21,7 @@ _LEAST = np.float32(1e-30)
 
 @dataclass(frozen=True)
 class Readout:
-    """Noise of known sd, then rounding to whole steps, then clipping to the range.
+    """Gaussian noise of known sd, then clipping to the range, then rounding to whole steps within it.
 
     Parameters
     ----------

@@ -62,7 +62,9 @@ def diversify(
     Raises
     ------
     ParameterError
-        If a sample has zero posterior density, or `n_steps` is negative.
+        If a sample has zero posterior density, `n_steps` is negative, or the prior has no `log_prob`.
+    NotConvergedError
+        If the likelihood fails.
     ShapeError
         If `theta` has another shape, or no rows.
     """

@@ -191,7 +191,10 @@ def update(
     Raises
     ------
     ParameterError
-        If `previous` has other parameters, or `prior_share` is out of range.
+        If `previous` has other parameters, an option is out of range, or the prior has neither `to_unit_cube` nor
+        coordinates.
+    NotConvergedError
+        If the likelihood fails.
     """
     require_rng(rng)
     require_callable(

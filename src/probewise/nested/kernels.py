@@ -82,10 +82,10 @@ class Kernels:
 class KernelMove:
     """A move that draws above a bound by independent proposals from kernels about the live points.
 
-    Every chain starts at a live point and accepts or rejects its proposals in turn, so the uniform density above the
-    bound is left invariant; with `moves` accepted on average it forgets its start. Suited to few parameters, where many
-    proposals lie above the bound. Where fewer than one in `patience` is accepted, the chains of `otherwise` go on from
-    the ends.
+    Every chain starts at a live point and accepts or rejects its proposals in turn (independence Metropolis-Hastings;
+    Tierney 1994), so the prior above the bound is left invariant; with `moves` accepted on average it forgets its
+    start. Suited to few parameters, where many proposals lie above the bound. Where fewer than one in `patience` is
+    accepted, the chains of `otherwise` go on from the ends.
 
     Parameters
     ----------

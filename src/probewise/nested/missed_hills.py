@@ -92,9 +92,9 @@ def find_missed_hills(
 ) -> MissedHills:
     """Look for parts of the posterior that a run has missed; nothing is found for a prior without an inverse.
 
-    `max_calls`: limit of evaluations; about a third of the run's are used. `lost`: parts that are known already, from
-    the run that this one repeats; no others are then looked for. `executor` evaluates batches of the likelihood in
-    `n_workers` parts, as for `run`. NotConvergedError if the likelihood fails.
+    `max_calls`: limit of evaluations; at most about a quarter of the run's are used. `lost`: parts that are known
+    already, from the run that this one repeats; no others are then looked for. `executor` evaluates batches of the
+    likelihood in `n_workers` parts, as for `run`. NotConvergedError if the likelihood fails.
     """
     if not run.names or not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
         return MissedHills()

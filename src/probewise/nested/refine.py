@@ -60,12 +60,12 @@ def refine(
     rng
         Source of randomness.
     n_draws
-        Number of final draws, 100 or more; every pilot round takes a quarter of that in addition.
+        Number of final draws, 100 or more; every pilot round takes a quarter of that, at least 100, in addition.
     n_pilots
         Number of pilot rounds, 1 or more.
     look
         Whether to look for parts of the posterior that the run has missed, if the run has no check (it was made with
-        `max_cost=1`): about a quarter of its evaluations. A part that matters is added to the doubts.
+        `max_cost=1`): for at most about a quarter of the run's evaluations. A part that matters is added to the doubts.
 
     Returns
     -------
@@ -75,7 +75,10 @@ def refine(
     Raises
     ------
     ParameterError
-        If an option is out of range or the run has other parameters.
+        If an option is out of range, the run has other parameters, or the prior has neither `to_unit_cube` nor
+        coordinates.
+    NotConvergedError
+        If the likelihood fails.
     """
     require_rng(rng)
     n_draws = checked_whole("n_draws", n_draws, least=100)

@@ -59,7 +59,7 @@ def run(
     rng
         Source of randomness; its state is stored in the result.
     n_live
-        Number of live points: the error of log Z falls as its root, the cost rises in proportion.
+        Number of live points: the error of log Z falls as one over its root, the cost rises in proportion.
     stop
         Stopping rule; default `RemainingEvidence(0.05)`. The paper's rule is `EvidenceChange(1e-8)`.
     move

@@ -102,9 +102,10 @@ def run_in_few_calls(
 ) -> Weighted:
     """Compute evidence and posterior of a problem in few evaluations, for likelihoods that take seconds.
 
-    In up to ten dimensions it takes about as many evaluations for its error as the best peers, or fewer (measured on
-    six problems). In more than three the draws may miss a narrow part of the posterior, and carry a doubt that says so:
-    use `run` where there may be one, and for fast likelihoods.
+    In up to ten dimensions it takes about as many evaluations for its error as the best of other nested samplers, or
+    fewer (measured on six problems). With more than three parameters the draws may miss a narrow part of the posterior,
+    so the result always has a doubt, and `sound` is False. Use `run` where the posterior may have such a part, and for
+    fast likelihoods.
 
     Parameters
     ----------
@@ -117,8 +118,8 @@ def run_in_few_calls(
         Standard error of log Z at which the draws end; in more than three dimensions at least 0.1. The draws claim no
         smaller error.
     max_calls
-        Limit of likelihood evaluations, 5000 or more, and 700 or more beside 120 for each parameter; at the limit the
-        error may be larger than `error`. If half of it does not suffice for draws to reach the posterior, an ordinary
+        Limit of likelihood evaluations: at least 5000, and at least 700 + 120 n_params; at the limit the error may be
+        larger than `error`. If half of it does not suffice for draws to reach the posterior, an ordinary
         run with 100 live points or more follows.
     progress
         Called with the number of evaluations after every batch of draws.

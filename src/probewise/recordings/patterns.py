@@ -136,7 +136,11 @@ class Ramp(_CheckedPattern):
 
 @dataclass(frozen=True, eq=False)
 class Image(_CheckedPattern):
-    """An image: one albedo (0 to 1) per pixel, first row on top, 0 outside; `origin_mm` is its lower left corner."""
+    """An image: one albedo (0 to 1) per pixel, (n_rows, n_columns), first row on top; the albedo outside is 0.
+
+    `origin_mm` is its lower left corner. `file` is the name, without a path, of the PNG or .npy file in which
+    `write_recording` and `write_plan` store it.
+    """
 
     albedo: FloatArray
     pixel_mm: float

@@ -13,9 +13,9 @@ SHIPPED = ("paper", "concealed")
 def shipped(name: str) -> Path:
     """Return the path of a recording shipped with the package, with its JSON beside it.
 
-    `paper`: the paper's 404 readings over the black-and-white boundary and four over the quadrants.
-    `concealed`: 961 readings, scans out and back, with one effect that the plain sensor model leaves out,
-    drawn from a seed. Both are simulated (world/shipped.py).
+    Both are simulated (world/shipped.py). `paper`: readings of the paper's plan, 404 over the black-and-white boundary
+    and four over the quadrants. `concealed`: 961 readings of scans out and back, with one effect that the sensor model
+    leaves out, drawn from a seed.
 
     Raises
     ------

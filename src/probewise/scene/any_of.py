@@ -96,6 +96,9 @@ class AnyOf:
     it like any other: uniform over [k, k + 1) for shape k, which has prior probability `weights[k]`);
     x_mm, y_mm of the centre, shared where every shape has a `PlacedPrior` prior; then each shape's own
     parameters, as "rectangle.width_mm".
+
+    `weights` are relative prior probabilities, one per shape, normalised on construction; by default equal.
+    ParameterError if there is no shape, or the weights are not one positive number per shape.
     """
 
     shapes: Mapping[str, Shape]

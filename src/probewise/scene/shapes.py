@@ -126,9 +126,11 @@ def _half_extent_of_circle(own: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Circle:
-    """A disc of unknown place and radius (paper, eq. 1): x_mm, y_mm, radius_mm.
+    """A disc of unknown place and radius (paper, eq. 1). Parameters, in this order: x_mm, y_mm, radius_mm.
 
-    `inside=True` keeps the whole circle on the field.
+    The argument `radius_mm` is (low, high) of the radius' uniform prior. `inside=True` keeps the whole circle on the
+    field. ParameterError unless 0 < low < high, finite, and, with `inside`, the largest circle is smaller than the
+    field.
     """
 
     field: Field = Field()
@@ -190,7 +192,10 @@ def _half_extent_of_ellipse(own: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Ellipse:
-    """An ellipse: x_mm, y_mm, semi_major_mm, semi_minor_mm, angle_rad of the major axis, 0 to pi."""
+    """An ellipse: x_mm, y_mm, semi_major_mm, semi_minor_mm, angle_rad of the major axis, 0 to pi, anticlockwise from X.
+
+    The argument `semi_axes_mm` is (low, high) of its prior, as for `Circle`; `inside=True` keeps it on the field.
+    """
 
     field: Field = Field()
     semi_axes_mm: Bounds = (20.0, 150.0)
@@ -227,7 +232,8 @@ def _half_extent_of_rectangle(own: FloatArray) -> FloatArray:
 class Rectangle:
     """A rectangle: x_mm, y_mm of its centre, width_mm, height_mm, angle_rad of its width, 0 to pi/2.
 
-    Either side may be the longer, so that angles over a quarter turn describe every rectangle once.
+    Either side may be the longer, so that angles over a quarter turn describe every rectangle once. The argument
+    `sides_mm` is (low, high) of their prior, as for `Circle`; `inside=True` keeps it on the field.
     """
 
     field: Field = Field()
@@ -255,7 +261,10 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class RegularPolygon:
-    """A regular polygon of `n_sides`: x_mm, y_mm, radius_mm of its corners, angle_rad of the first."""
+    """A regular polygon of `n_sides`: x_mm, y_mm, radius_mm of its corners, angle_rad of the first.
+
+    The argument `radius_mm` is (low, high) of its prior, as for `Circle`; `inside=True` keeps it on the field.
+    """
 
     n_sides: int
     field: Field = Field()

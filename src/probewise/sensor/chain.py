@@ -116,8 +116,8 @@ class Chain:
     a stage, by name, whatever the order in which they are given. Columns of theta: the SSF's,
     the levels', the scene's, then the effects' as "effect.parameter".
 
-    On the footprint the order by name means that blur and halo are those at the commanded height, and that a sloping
-    table or another error of the height scales them too, as it does in the world's simulation. Blurred print does not
+    Blur and halo are those at the commanded height: by the order of names they come first, so a sloping table or
+    another error of the height scales them too, as in recordings simulated by `probewise.world`. Blurred print does not
     scale, strictly; at usual sizes another order changes readings by less than 0.3 % of I_max - I_min.
 
     `n_nodes` is the number of quadrature nodes over curved edges (the default is accurate to 1e-8 of
@@ -155,7 +155,7 @@ class Chain:
         return replace(self, effects=(*self.effects, *effects))
 
     def plan_at_calibrated_height(self, plan: Plan) -> Plan:
-        """Return the plan with the calibrated height as the declared one; the plan's own, if another, is commanded."""
+        """Return the plan with the calibrated height declared; where it declared another, that one is commanded."""
         return with_declared_height_commanded(plan, self.calibrated_height_mm)
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -397,7 +397,10 @@ class RegionsAndPoses:
 
 
 def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
-    """Integrate the footprint over each reading's pattern (paper, eq. R), by closed forms.
+    """Integrate the footprint over each reading's pattern (paper, eq. RwithSSF).
+
+    By closed forms, and quadrature at curved edges. A kind of region without a closed form is summed over pixels: error
+    about 1e-3, with a `SlowWarning`.
 
     Parameters
     ----------

@@ -157,7 +157,7 @@ class SSFField(ShowsItself):
     """A field of SSF values on square pixels (paper, the discrete SSF matrix).
 
     `values` (n_y, n_x) are the pixels' shares, of either sign, normalised to sum one on construction;
-    row 0 is the lowest v', column 0 the lowest u'. `origin_mm` is the centre (u', v') of pixel
+    row 0 is the lowest y', column 0 the lowest x'. `origin_mm` is the centre (x', y') of pixel
     [0, 0] in the sensor frame.
     """
 
@@ -178,12 +178,12 @@ class SSFField(ShowsItself):
 
     @property
     def u_mm(self) -> FloatArray:
-        """Pixel centres along u', (n_x,)."""
+        """Pixel centres along x', mm, (n_x,)."""
         return np.array(self.origin_mm[0] + self.pixel_mm * np.arange(self.values.shape[1]), dtype=np.float64)
 
     @property
     def v_mm(self) -> FloatArray:
-        """Pixel centres along v', (n_y,)."""
+        """Pixel centres along y', mm, (n_y,)."""
         return np.array(self.origin_mm[1] + self.pixel_mm * np.arange(self.values.shape[0]), dtype=np.float64)
 
     @cached_property

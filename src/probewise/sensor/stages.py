@@ -1,7 +1,7 @@
 """The stages of the sensor chain from pose to reading, and the value that each one transforms.
 
 In order: pose, scene, footprint, seen fraction, response curve, gain, offset, lag, saturation,
-noise (INPUT, PARAMETER, RATE and BEND are stages of systems, not of the light sensor). An effect is one
+noise. (INPUT, PARAMETER, RATE, HYSTERESIS and BEND are stages of systems, not of the light sensor.) An effect is one
 function at one stage; effects are applied in the order of their stages.
 """
 
@@ -23,7 +23,11 @@ from probewise.scene.albedo import Region
 
 
 class Stage(IntEnum):
-    """The stage of the chain at which an effect acts; effects act in the order of the stages."""
+    """The stage at which an effect acts; effects act in the order of the stages.
+
+    INPUT, PARAMETER, RATE, HYSTERESIS and BEND are stages of `probewise.systems` alone: a light sensor's `Chain`
+    ignores an effect at one of these.
+    """
 
     INPUT = 0
     PARAMETER = 1
@@ -128,9 +132,9 @@ V = TypeVar("V")
 class Effect(Protocol[V]):
     """Physics that a model may leave out: one function at one stage.
 
-    `apply` takes and returns that stage's value: Poses, SceneView, Footprint, View (SEEN), an
-    array (n_samples, n_points) of seen fraction u (RESPONSE), signal (GAIN), reading (OFFSET,
-    LAG, SATURATION), or NoiseParameters (NOISE).
+    `apply` takes and returns that stage's value. Of a light sensor: Poses, SceneView, Footprint, View (SEEN), an array
+    (n_samples, n_points) of white fraction R (RESPONSE), signal (GAIN), reading (OFFSET, LAG, SATURATION), or
+    NoiseParameters (NOISE). For the other stages see `probewise.systems`.
     """
 
     @property

@@ -1,7 +1,7 @@
 """Studies over many circles: how many readings the robot needs (paper, section 4, "Results").
 
-A study is a campaign of autonomous runs. The rows of its table have the same noise, rows of one population the same
-circles; each differs from a reference row in one factor or two.
+A study is a campaign of autonomous runs. The rows of its table have the same noise in units of its sd, rows of one
+population the same circles; each differs from a reference row in one factor or two.
 """
 
 from probewise.study.circles import POPULATIONS, Population, noise_of_run_in_sds

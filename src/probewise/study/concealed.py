@@ -269,10 +269,13 @@ def run_concealed(
 
 @dataclass(frozen=True)
 class ConcealedRow:
-    """Summary of a row: shares with Wilson's 95 % intervals, `readings` (median), `mean_readings`, processor time in s.
+    """Summary of a row: shares with Wilson's 95 % intervals, `readings` (median), `mean_readings`, processor time.
 
-    `size` is None where nothing is concealed. `sure_and_wrong`: ended by the robot's own rule with a length off by more
-    than 12 mm. `noticed`: an effect leads, or the fit is doubted. `names`: mean number of names in the credible set.
+    `size` is None where nothing is concealed. `reached`: runs that reached the target precision. `intervals_hold`: 95 %
+    intervals that hold the truth, over all parameters and runs. `sure_and_wrong`: ended by the robot's own rule with a
+    length off by more than 12 mm. `noticed`: an effect leads, or the fit is doubted. `in_credible_set`: the right
+    answer is in the credible set, which has `names` names on average. `cpu_s_median`, `cpu_s_95`: medians over runs of
+    each run's median and 95 % quantile of the processor time per decision, s.
     """
 
     concealed: str

@@ -77,8 +77,9 @@ class DetectableSize:
 class EffectAudit:
     """Detectability of one effect under a plan: fine, aliased or invisible.
 
-    Fine: the readings detect the effect and tell it from every other. Aliased: they detect it, but another effect can
-    imitate it. Invisible: they cannot detect it.
+    Fine: the readings detect the effect and tell it from every other. Aliased: another effect imitates it with a cosine
+    of 0.95 or more (at lambda 8 less than 3 nats apart). Invisible: it cannot act here, or the sensor's own parameters
+    absorb over 95 % of its change of the readings. An effect on the noise is fine from 24 readings on, else invisible.
 
     Attributes
     ----------
@@ -114,7 +115,10 @@ class EffectAudit:
 
 @dataclass(frozen=True, eq=False)
 class Cure:
-    """One scan to add: kind (of `Scan`), description, plan, duration in minutes, and the effects it makes fine."""
+    """One scan to add: description, plan, duration in minutes, and the effects that it makes fine.
+
+    `kind` is "repeat", "reverse", "respeed", "rotate", "relight", "raise", "across" or, with another sheet, "lay".
+    """
 
     kind: str
     description: str

@@ -35,7 +35,7 @@ _ON_READINGS = (Stage.OFFSET, Stage.LAG, Stage.SATURATION, Stage.NOISE)
 class OwnModel(Null):
     """A null model from a simulator and the prior of its parameters.
 
-    Effects from the stage OFFSET on act on its readings, so half of the vocabulary applies. A user's own effect acts at
+    Effects at the stages OFFSET, LAG, SATURATION and NOISE act on its readings. A user's own effect acts at
     `Stage.SCENE` on the parameters: it adds or changes some, which the simulator reads (with a default for missing
     ones, which is the model without the effect).
 

@@ -23,7 +23,7 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 
 ALARM = 0.01
-"""p-value below which the model is incomplete."""
+"""p-value of the global test, at or below which the model counts as incomplete."""
 
 _LARGEST_P = 0.05
 _LEAST_ROWS = 3

@@ -45,7 +45,9 @@ class ParameterFound:
 class EffectFound:
     """One effect: probability in any hypothesis, size, sentence, parameters, and the scans to which it is bound.
 
-    `size_lambda` is the norm of the effect's change of the readings in noise sds, after a refit of all else.
+    `size_lambda` is the norm of the effect's change of the readings in noise sds, after a refit of all else. Of a noise
+    effect it is that of an effect on the mean with equal evidence; of rounding that is certain, that of the rounding
+    error, step / sqrt(12), over all readings.
     """
 
     name: str

@@ -160,7 +160,7 @@ class Inquiry(ShowsItself):
 
     @property
     def doubt(self) -> str | None:
-        """A warning if even the best posterior sample does not explain the readings (p < 1e-6); otherwise None.
+        """A warning if even the best posterior sample does not explain the readings (chi-square, p < 1e-6); or None.
 
         It names the reading that fits worst.
         """
@@ -217,9 +217,10 @@ class Inquiry(ShowsItself):
     def several(self, n: int) -> list[Any]:
         """Choose the settings of `n` readings to be taken before any of them is known; best first.
 
-        Greedy on the joint information (Nemhauser, Wolsey & Fisher 1978): each setting is the best addition to those
-        before it in the list, averaged over simulated readings there. Costs count from the setting before it. Pass the
-        results one by one to `tell(reading, setting)`.
+        Greedy: each setting has the largest utility given those before it in the list, averaged over simulated readings
+        there. While the utility is information, this is greedy on the joint information (Nemhauser, Wolsey & Fisher
+        1978). Costs count from the setting before it. Pass the results one by one to `tell(reading, setting)`.
+        ParameterError if `n` is below 1.
         """
         checked_whole("n", n)
         everywhere = np.ones(len(self._settings), dtype=np.bool_)

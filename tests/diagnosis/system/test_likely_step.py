@@ -91,5 +91,5 @@ def test_a_law_that_is_said_to_be_stiff_is_searched_so():
 @pytest.mark.parametrize("sets_step", [True, False])
 def test_a_search_that_was_cut_short_advises_a_larger_step_only_where_one_was_set(sets_step):
     (note,) = _notes_on_integration(IntegrationTally(cut_short=True), 1000, sets_step=sets_step)
-    assert "in 1,000 evaluations" in note
+    assert "after 1,000 evaluations" in note
     assert ("max_step_s" in note) is sets_step

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import Diagnosis, Improvement, diagnose, diagnosis_json, diagnosis_schema
-from probewise.effects import VOCABULARY, Extent, Origin
+from probewise.effects import EFFECTS, VOCABULARY, Extent, Origin
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
 from probewise.sensor import N_FREE_FORM, Stage
@@ -61,7 +61,7 @@ def strict(diagnosis) -> dict:
     jsonschema.validate(json.loads(text), diagnosis_schema())
     assert sum(h["probability"] for h in document["hypotheses"]) == pytest.approx(1.0)
     for effect in document["effects"]:
-        assert effect["name"] in VOCABULARY
+        assert effect["name"] in EFFECTS
         holding = sum(h["probability"] for h in document["hypotheses"] if effect["name"] in h["effects"])
         if document["verdict"] == "unknown":  # beside which an effect may stand that no other hypothesis names
             assert holding - 1e-9 <= effect["probability"] <= 1.0

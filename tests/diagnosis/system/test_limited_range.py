@@ -102,7 +102,10 @@ def test_a_signal_that_rests_at_an_end_has_no_offset():
     covariance = np.linalg.inv(found.slopes.T @ found.slopes / found.sd**2 + np.eye(2))
     assert abs(offset) < 4 * 10 * np.sqrt(covariance[1, 1])
     assert abs(found.sd / 3.0 - 1) < 4 / np.sqrt(2 * 150)
-    assert any("left out near an end of the declared range, which cuts off the noise" in note for note in prepared.recording.notes)
+    assert any(
+        "left out near an end of the declared range, which cuts off the noise" in note
+        for note in prepared.recording.notes
+    )
 
 
 def test_readings_that_stand_below_the_declared_end_stay():

@@ -72,12 +72,18 @@ def searched(probabilities):
     )
 
 
+def of_probabilities(hypotheses, *, same=()):
+    return verdict_and_combination(
+        hypotheses, 1e-6, noise_names=NOISE, aliases=(), aliased_with=lambda _: frozenset(same)
+    )
+
+
 def test_a_decided_rare_effect_is_reported_by_name_on_an_alarm_only():
     found = searched({(("arm_knock",), ()): 0.9, (("bent_rails",), ()): 0.04, (("lag",), ()): 0.06})
-    hypotheses, rare = reported_hypotheses(found, 1e-6)
+    hypotheses, rare = reported_hypotheses(found, 1e-6, of_probabilities)
     assert rare == ("arm_knock",)
     assert [h.effects for h in hypotheses] == [("arm_knock",), ("lag",), ("unknown",)]
-    hypotheses, rare = reported_hypotheses(found, 0.02)
+    hypotheses, rare = reported_hypotheses(found, 0.02, of_probabilities)
     assert (rare, hypotheses[0].effects) == ((), ("unknown",))
 
 
@@ -91,9 +97,16 @@ def test_a_rare_effect_split_by_noise_behind_another_name_leaves_the_verdict_unk
             (("unknown",), ()): 0.02,
         }
     )
-    hypotheses, rare = reported_hypotheses(found, 1e-6)
+    hypotheses, rare = reported_hypotheses(found, 1e-6, of_probabilities)
     assert rare == ()
     assert (hypotheses[0].effects, hypotheses[0].probability) == (("unknown",), pytest.approx(0.57))
+
+
+def test_a_rare_effect_that_the_readings_cannot_tell_from_an_alias_stays_unknown():
+    found = searched({(("arm_knock",), ()): 0.7, (("lag",), ()): 0.3})
+    assert reported_hypotheses(found, 1e-6, of_probabilities)[1] == ("arm_knock",)
+    hypotheses, rare = reported_hypotheses(found, 1e-6, lambda each: of_probabilities(each, same=[("lag",)]))
+    assert (rare, hypotheses[0].effects) == ((), ("unknown",))
 
 
 def test_physics_is_named_on_an_alarm_only():

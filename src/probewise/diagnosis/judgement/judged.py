@@ -125,7 +125,6 @@ class Judged:
 def judge(searched: Searched, test: GlobalTest) -> Judged:
     """Return the verdict, with probabilities and aliases, from a search and the global test."""
     prepared, posterior = searched.prepared, searched.posterior
-    hypotheses, named_rare = reported_hypotheses(searched, test.p_value)
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
@@ -134,10 +133,10 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         others = searched.combinations_aliased_with(tuple(name for name in combination if name not in noise))
         return frozenset(tuple(sorted({*names, *noise})) for names in others)
 
-    verdict, combination = (
-        ("cannot_tell", ())
-        if prepared.has_too_little_data
-        else verdict_and_combination(
+    def verdict_on(hypotheses: tuple[Hypothesis, ...]) -> tuple[Verdict, Names]:
+        if prepared.has_too_little_data:
+            return "cannot_tell", ()
+        return verdict_and_combination(
             hypotheses,
             test.p_value,
             noise_names=prepared.pure_noise_effect_names,
@@ -146,7 +145,9 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
             certain=frozenset(searched.certain),
             named_needs_half=searched.prior.named_needs_half,
         )
-    )
+
+    hypotheses, rare = reported_hypotheses(searched, test.p_value, verdict_on)
+    verdict, combination = verdict_on(hypotheses)
     if (
         verdict == "unknown"
         and searched.prior.unknown_explains_most
@@ -164,7 +165,7 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         hypotheses,
         aliases=pairs,
         order_probabilities=dict(posterior.order_probabilities),
-        unknown_shares=searched.probabilities_of_unknown_forms(besides=named_rare),
+        unknown_shares=searched.probabilities_of_unknown_forms(besides=rare),
         too_little=prepared.has_too_little_data,
     )
     if searched.prior.shared_is_named and not judged.too_little:
@@ -172,11 +173,15 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
     return judged
 
 
-def reported_hypotheses(searched: Searched, p_value: float) -> tuple[tuple[Hypothesis, ...], Names]:
+def reported_hypotheses(
+    searched: Searched,
+    p_value: float,
+    verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]],
+) -> tuple[tuple[Hypothesis, ...], Names]:
     """Return the hypotheses, most probable first, and the rare effects that they name; () if there are none.
 
     A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided (see
-    `decided_rare_effects`), the p-value of the global test is .01 or less, and the first hypothesis has them.
+    `decided_rare_effects`), the p-value of the global test is .01 or less, and the verdict is then that they are named.
     """
     posterior, shares = searched.posterior, searched.evidences.reported_shares
     unknown = {mean: p * shares(mean).get(("unknown",), 0.0) for mean, p in posterior.marginal_over_noise.items()}
@@ -187,7 +192,8 @@ def reported_hypotheses(searched: Searched, p_value: float) -> tuple[tuple[Hypot
 
     if rare:
         hypotheses = ranked_hypotheses(posterior.probabilities, shares_with_rare_named)
-        if {*rare} <= {*hypotheses[0].effects}:
+        verdict, combination = verdict_on(hypotheses)
+        if verdict == "named" and {*rare} <= {*combination}:
             return hypotheses, rare
     return ranked_hypotheses(posterior.probabilities, shares), ()
 

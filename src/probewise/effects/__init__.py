@@ -1,7 +1,7 @@
 """Effects: physics that a sensor model may leave out, each one function at one stage of the chain.
 
 The paper's model, M = I_min + (I_max - I_min) R, holds the footprint (in its response R) and two levels; these are the
-named departures from it. A new effect is a class (a `NamedEffect`), passed as effects={**VOCABULARY, name: class}.
+named departures from it. A new effect is a class (a `NamedEffect`), passed as ``effects={**VOCABULARY, name: class}``.
 
 Drifts, gradients, scales and the phases of waves count from an `Origin`: time 0 and place (0, 0), or, where all of a
 recording lies farther from 0 than ten times its duration (or its size), its first time (or the middle of its places).

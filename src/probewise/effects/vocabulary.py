@@ -39,8 +39,8 @@ class VariantMasks:
 class NamedEffect(Effect[V], Protocol[V]):
     """An effect as the diagnosis needs it: formula, prior, template bank, and a sentence for the verdict.
 
-    A new effect is one class of this kind, passed as ``effects={**VOCABULARY, name: class}``. What its methods return is
-    said here.
+    A new effect is one class of this kind, passed as ``effects={**VOCABULARY, name: class}``. What its methods return
+    is said here.
     """
 
     words: ClassVar[str] = ""

@@ -9,8 +9,8 @@ from probewise.diagnosis.judgement.judged import (
     Hypothesis,
     Judged,
     decided_rare_effects,
+    hypotheses_with_verdict,
     ranked_hypotheses,
-    reported_hypotheses,
     verdict_and_combination,
     with_shared_effects,
 )
@@ -80,10 +80,10 @@ def of_probabilities(hypotheses, *, same=()):
 
 def test_a_decided_rare_effect_is_reported_by_name_on_an_alarm_only():
     found = searched({(("arm_knock",), ()): 0.9, (("bent_rails",), ()): 0.04, (("lag",), ()): 0.06})
-    hypotheses, rare = reported_hypotheses(found, 1e-6, of_probabilities)
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 1e-6, of_probabilities)
     assert rare == ("arm_knock",)
     assert [h.effects for h in hypotheses] == [("arm_knock",), ("lag",), ("unknown",)]
-    hypotheses, rare = reported_hypotheses(found, 0.02, of_probabilities)
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 0.02, of_probabilities)
     assert (rare, hypotheses[0].effects) == ((), ("unknown",))
 
 
@@ -97,15 +97,15 @@ def test_a_rare_effect_split_by_noise_behind_another_name_leaves_the_verdict_unk
             (("unknown",), ()): 0.02,
         }
     )
-    hypotheses, rare = reported_hypotheses(found, 1e-6, of_probabilities)
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 1e-6, of_probabilities)
     assert rare == ()
     assert (hypotheses[0].effects, hypotheses[0].probability) == (("unknown",), pytest.approx(0.57))
 
 
 def test_a_rare_effect_that_the_readings_cannot_tell_from_an_alias_stays_unknown():
     found = searched({(("arm_knock",), ()): 0.7, (("lag",), ()): 0.3})
-    assert reported_hypotheses(found, 1e-6, of_probabilities)[1] == ("arm_knock",)
-    hypotheses, rare = reported_hypotheses(found, 1e-6, lambda each: of_probabilities(each, same=[("lag",)]))
+    assert hypotheses_with_verdict(found, 1e-6, of_probabilities)[1] == ("arm_knock",)
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 1e-6, lambda each: of_probabilities(each, same=[("lag",)]))
     assert (rare, hypotheses[0].effects) == ((), ("unknown",))
 
 

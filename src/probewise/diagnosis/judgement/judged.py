@@ -146,8 +146,7 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
             named_needs_half=searched.prior.named_needs_half,
         )
 
-    hypotheses, rare = reported_hypotheses(searched, test.p_value, verdict_on)
-    verdict, combination = verdict_on(hypotheses)
+    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(searched, test.p_value, verdict_on)
     if (
         verdict == "unknown"
         and searched.prior.unknown_explains_most
@@ -173,12 +172,12 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
     return judged
 
 
-def reported_hypotheses(
+def hypotheses_with_verdict(
     searched: Searched,
     p_value: float,
     verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]],
-) -> tuple[tuple[Hypothesis, ...], Names]:
-    """Return the hypotheses, most probable first, and the rare effects that they name; () if there are none.
+) -> tuple[tuple[Hypothesis, ...], Names, tuple[Verdict, Names]]:
+    """Return the hypotheses, most probable first, the rare effects that they name (or ()), and the verdict on them.
 
     A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided (see
     `decided_rare_effects`), the p-value of the global test is .01 or less, and the verdict is then that they are named.
@@ -194,8 +193,9 @@ def reported_hypotheses(
         hypotheses = ranked_hypotheses(posterior.probabilities, shares_with_rare_named)
         verdict, combination = verdict_on(hypotheses)
         if verdict == "named" and {*rare} <= {*combination}:
-            return hypotheses, rare
-    return ranked_hypotheses(posterior.probabilities, shares), ()
+            return hypotheses, rare, (verdict, combination)
+    hypotheses = ranked_hypotheses(posterior.probabilities, shares)
+    return hypotheses, (), verdict_on(hypotheses)
 
 
 def decided_rare_effects(leader: Names, unknown: Mapping[Names, float]) -> Names:

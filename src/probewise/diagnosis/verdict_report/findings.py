@@ -18,9 +18,9 @@ from probewise.diagnosis.noise.law import n_rows_since_previous_usable, noise_st
 from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.verdict_report.words import substitute_reading_unit
-from probewise.effects import NamedEffect, NoiseEffect
+from probewise.effects import NamedEffect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples
 from probewise.recordings.plan import Plan
 
@@ -103,10 +103,8 @@ def effects_found(
     drawn: dict[tuple[WeighedFit, Names], ModelSamples] = {}
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)
-        if beside.get(name, 0.0) >= _STANDS_BESIDE:
+        if beside.get(name, 0.0) >= _STANDS_BESIDE and not is_out_of_vocabulary(name):
             p += unknown * beside[name]
-        if effects_out_of_vocabulary((name,)) and not any(name in h.effects for h in hypotheses):
-            continue  # it counts as unknown
         if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)):
             continue
         holder, noise = (best.fit, best.noise) if name in samples.effects else _likeliest_candidate_with(searched, name)

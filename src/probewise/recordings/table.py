@@ -102,12 +102,9 @@ class CSVTable:
         if values is None or not (np.abs(values) <= most).all():
             number = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
             allowed = allowed or number + (", or empty, nan or n/a where it is missing" if missing else "")
-            k, cell = next(
-                (k, cell)
-                for k, cell in enumerate(cells)
-                if there[k] and not (_is_number(cell) and abs(float(cell)) <= most)
-            )
-            raise FileError(self.path, _cell_in_words(cell), allowed, row=self.row_number(k), column=name)
+            k = first_cell_without_number(cells, missing=missing, largest=most)
+            assert k is not None
+            raise FileError(self.path, _cell_in_words(cells[k]), allowed, row=self.row_number(k), column=name)
         out = np.full(len(cells), math.nan)
         out[there] = values
         return out
@@ -127,11 +124,14 @@ def _is_number(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None
 
 
-def first_cell_without_number(cells: Sequence[object], *, missing: bool = True) -> int | None:
-    """Return the index of the first cell that is no finite number and, if `missing`, not missing; None without one."""
+def first_cell_without_number(
+    cells: Sequence[object], *, missing: bool = True, largest: float = math.inf
+) -> int | None:
+    """Return the index of the first cell that is no number up to `largest` and, if `missing`, not missing; or None."""
     for k, cell in enumerate(cells):
         text = str(cell).strip()
-        if not _is_number(text) and not (missing and text in MISSING):
+        is_number = _is_number(text) and abs(float(text)) <= largest
+        if not is_number and not (missing and text in MISSING):
             return k
     return None
 

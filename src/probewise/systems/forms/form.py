@@ -271,6 +271,11 @@ def flag_with_prior(on: bool) -> tuple[float, Uniform]:
     return value, Uniform(value - 0.5 * _FLAG_WIDTH, value + 0.5 * _FLAG_WIDTH)
 
 
+def period_with_sd(frequency: float, sd: float, time_unit: str) -> str:
+    """Return the period of a frequency, per `time_unit`, with its sd to first order, as `mean_with_sd` does."""
+    return mean_with_sd(1 / frequency, sd / frequency**2, time_unit)
+
+
 def mean_with_sd(mean: float, sd: float, unit: str) -> str:
     """Return "mean ± sd unit" to two significant digits of the sd; for an sd up to 1e-7, the mean to three digits."""
     digits = value_with_sd(mean, sd) if sd > 1e-7 else f"{mean:.3g} ± {sd:.1g}"

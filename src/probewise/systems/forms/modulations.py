@@ -13,7 +13,7 @@ from probewise.effects import HeavyTailedPrior
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import ActBetween, ChangePoints, mean_with_sd
+from probewise.systems.forms.form import ActBetween, ChangePoints, mean_with_sd, period_with_sd
 from probewise.systems.forms.frequencies import frequency_prior, residual_peaks, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.law_inputs import Jump
@@ -168,7 +168,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
             f"{what} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], unit)} and a period of "
-            f"{mean_with_sd(1 / mean[1], sd[1] / mean[1] ** 2, time_unit)}"
+            f"{period_with_sd(mean[1], sd[1], time_unit)}"
         ),
         covariates=("time",),
         counted_from=origin_in_words(table.time, origin, time_unit),

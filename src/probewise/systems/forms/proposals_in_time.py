@@ -11,7 +11,7 @@ from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_poi
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Form, mean_with_sd
+from probewise.systems.forms.form import Form, mean_with_sd, period_with_sd
 from probewise.systems.forms.frequencies import frequency_prior, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, text_rounded_to_spread, time_origin
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
@@ -71,7 +71,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
         says=lambda mean, sd: (
             f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} during "
             f"{mean_with_sd(mean[3], sd[3], '')} of every "
-            f"{mean_with_sd(1 / mean[1], sd[1] / mean[1] ** 2, about.time_unit)}: a proposal, not a known effect"
+            f"{period_with_sd(mean[1], sd[1], about.time_unit)}: a proposal, not a known effect"
         ),
         expression=f"a {text}",
         counted_from=origin_in_words(table.time, origin, about.time_unit),

@@ -15,7 +15,7 @@ from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
-from probewise.systems.forms.form import Form, mean_with_sd
+from probewise.systems.forms.form import Form, mean_with_sd, period_with_sd
 from probewise.systems.forms.frequencies import frequency_prior, max_n_trial_frequencies, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.motion import LawWithEffects, Limit
@@ -204,7 +204,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         amplitudes=(0,),
         says=lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "
-            f"per {about.time_unit} and a period of {mean_with_sd(1 / mean[1], sd[1] / mean[1] ** 2, about.time_unit)}"
+            f"per {about.time_unit} and a period of {period_with_sd(mean[1], sd[1], about.time_unit)}"
         ),
         joined=starting_point_of_wave,
         counted_from=origin_in_words(time, origin, about.time_unit),

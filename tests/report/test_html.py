@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from probewise._words import count_with_noun
 from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, slideshow, table
-from probewise.report.words import count_with_noun, number_text, number_unsigned_zero, probability_text
+from probewise.report.words import number_text, number_unsigned_zero, probability_text
 
 
 def png(size, dpi=None):

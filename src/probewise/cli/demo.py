@@ -190,10 +190,10 @@ def _search_from_empty_field(
     """Search for the circle without a first reading on it; return the run and a PNG of each step."""
     import numpy as np
 
+    from probewise._words import count_with_noun
     from probewise.experiment import arm_over, experiment_for, run, surface_of
     from probewise.report import exploration as report
     from probewise.report.plots import grid_of_axes, png
-    from probewise.report.words import count_with_noun
     from probewise.scene import Field, outlines
     from probewise.world.shipped import true_world as world_behind
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from probewise._words import count_with_noun
 from probewise.diagnosis import PlanAudit
 from probewise.diagnosis.audit.detectability import ALIAS, LAMBDA, LEAST_NATS
 from probewise.effects import spoken_name
@@ -11,7 +12,7 @@ from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import AxesGrid, audit_matrix, png
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
-from probewise.report.words import count_with_noun, number_text, typeset_numbers
+from probewise.report.words import number_text, typeset_numbers
 
 _CURED_BY = "The fewest extra readings that would help"
 

@@ -8,6 +8,7 @@ from pathlib import PurePath
 
 import numpy as np
 
+from probewise._words import count_with_noun
 from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
@@ -21,7 +22,6 @@ from probewise.report.plots import (
     standardised_residuals,
 )
 from probewise.report.words import (
-    count_with_noun,
     decimals_to_show,
     number_text,
     number_unsigned_zero,

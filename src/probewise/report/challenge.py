@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from probewise._words import count_with_noun
 from probewise.challenge import Estimate, ScoreRow, confusion_counts, detected_and_named_by_effect, reliability_bins
 from probewise.challenge.scoring import NOISE, are_names_right, leading_hypothesis
 from probewise.challenge.systems import name_without_target
@@ -14,7 +15,7 @@ from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
-from probewise.report.words import count_with_noun, typeset_numbers
+from probewise.report.words import typeset_numbers
 
 Results = Sequence[Mapping[str, Any]]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from probewise._words import count_with_noun
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import doubt_against_trust, png
 from probewise.report.plots.concealed import effect_and_size_in_words
-from probewise.report.words import count_with_noun
 from probewise.study import ConcealedRow
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from probewise._words import count_with_noun
 from probewise.arm import Geometry
 from probewise.calibration import Calibration
 from probewise.diagnosis import Diagnosis
@@ -42,7 +43,7 @@ from probewise.report.plots import (
 )
 from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import join_side_by_side
-from probewise.report.words import count_with_noun, number_text, typeset_numbers
+from probewise.report.words import number_text, typeset_numbers
 
 FIRST = 3  # as in the paper's figure
 HEADER = (

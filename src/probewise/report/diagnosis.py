@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
+from probewise._words import count_with_noun
 from probewise.diagnosis import (
     ALARM,
     MOST_READINGS,
@@ -43,7 +44,6 @@ from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
 from probewise.report.words import (
-    count_with_noun,
     duration_text,
     number_text,
     probability_text,

@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from probewise._words import count_with_noun
 from probewise.experiment import left_out_after_step
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Section, figure, paragraph, table
 from probewise.report.paper_view import window_around_runs_mm
 from probewise.report.plots import PAGE_IN, draw_field_legend, effect_probabilities_by_reading, grid_of_axes, png
 from probewise.report.robot_search import RobotSearch
-from probewise.report.words import count_with_noun, number_text
+from probewise.report.words import number_text
 
 SATURATION = 40.0
 """Reading at which the concealed effect of the demo, saturation, sets in; the model expects 60 over white."""

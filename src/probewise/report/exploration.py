@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
+from probewise._words import count_with_noun
 from probewise.effects import spoken_name
 from probewise.experiment import (
     CLEAN,
@@ -30,7 +31,6 @@ from probewise.report.plots import (
     posterior_widths,
 )
 from probewise.report.words import (
-    count_with_noun,
     interval_text,
     number_text,
     probability_text,

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from probewise._words import count_with_noun
 from probewise.diagnosis import ALARM, Diagnosis
 from probewise.diagnosis.residuals.bases import MEMORY, PRODUCTS, SCAN_ENDS
 from probewise.effects import PROPOSAL, RARE_EFFECTS
 from probewise.report.covariate import covariate_in_words_and_unit
 from probewise.report.effect_words import effect_in_words, effects_in_words, hypothesis_in_words, join_lists, join_names
-from probewise.report.words import count_with_noun
 
 MOST_WORDS = 20
 _SURE = 0.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from probewise._words import count_with_noun
 from probewise.diagnosis import p_in_words
 from probewise.effects import spoken_name
 from probewise.investigation import Investigation, Round
@@ -13,7 +14,7 @@ from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, probabilities_by_round
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
-from probewise.report.words import count_with_noun, probability_text, typeset_numbers
+from probewise.report.words import probability_text, typeset_numbers
 
 _MOST_TOLD = 4
 _LEAST_TOLD = 0.005

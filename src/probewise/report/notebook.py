@@ -7,6 +7,7 @@ import html
 import numpy as np
 
 from probewise._display import render_html
+from probewise._words import count_with_noun
 from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
 from probewise.experiment import Exploration, Step
@@ -31,7 +32,7 @@ from probewise.report.plots import (
     recorded_against_predicted,
     spatial_sensitivity,
 )
-from probewise.report.words import count_with_noun, unit_name, unit_of, value_with_error, words_without_unit
+from probewise.report.words import unit_name, unit_of, value_with_error, words_without_unit
 from probewise.sensor import SSFField
 from probewise.systems import SystemPrediction
 from probewise.systems.table import RunRecording

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from probewise._words import count_with_noun
 from probewise.experiment import least_readings
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, posterior_widths_of_runs, readings_needed
-from probewise.report.words import count_with_noun, number_text, value_with_error
+from probewise.report.words import number_text, value_with_error
 from probewise.study import LEAST_FOR_MEDIAN, REFERENCE, Estimate, SearchConfiguration, Study, Summary, experiment_of
 
 _COLUMNS: tuple[tuple[str, str], ...] = (

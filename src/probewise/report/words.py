@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 
+from probewise._words import count_with_noun
+
 _UNITS = {"mm": "mm", "rad": "rad", "deg": "°", "s": "s", "counts": "counts", "mv": "mV", "v": "V"}
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -94,11 +96,6 @@ def typeset_numbers(text: str) -> str:
 
     together = re.sub(r"\bp ([=<]) (?=\d)", "p\u00a0\\1\u00a0", text)
     return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power_of_ten, together))
-
-
-def count_with_noun(n: int, noun: str) -> str:
-    """Write a count with its noun, plus "s" unless the count is 1."""
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 _LONGER = (("minute", 1.0), ("hour", 60.0), ("day", 1440.0), ("month", 43_830.0), ("year", 525_960.0))

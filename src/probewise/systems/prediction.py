@@ -13,6 +13,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
+from probewise._words import count_with_noun
 from probewise.effects import (
     AGAIN,
     EFFECTS,
@@ -199,10 +200,9 @@ def predict_system(
     mean, sd, scores = mixture.mean_sd_and_log_density()
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
+        rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {int(np.argmax(lost)) + 2}"
         warnings.warn(
-            f"{int(lost.sum())} row{'' if lost.sum() == 1 else 's'} cannot be predicted, first row "
-            f"{int(np.argmax(lost)) + 2}: a number that they need is missing; where an effect looks back to it, it is "
-            "interpolated",
+            f"{rows}: a number that they need is missing; where an effect looks back to it, it is interpolated",
             DoubtfulResultWarning,
             stacklevel=2,
         )

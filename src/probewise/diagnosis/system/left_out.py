@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 
 from probewise._arrays import BoolArray, IntArray
+from probewise._words import count_with_noun
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.system.first_fit import fit_system, is_noise_sd_known_beside_misfit
 from probewise.diagnosis.thinning import MOST_READINGS, positions_in_stretches
@@ -97,11 +98,12 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
 
 def _note_on_gaps(system: System, n_lost: int, gaps: IntArray) -> str:
     """Say that readings are left out, since cells are missing in the rows `gaps`, counted from 0."""
+    lost = count_with_noun(n_lost, "reading")
     if system.simulator.law is None:
-        return f"{_count_of_readings(n_lost)} left out: a column that the simulator reads is missing there"
+        return f"{lost} left out: a column that the simulator reads is missing there"
     more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
     return (
-        f"{_count_of_readings(n_lost)} left out: a column that the law reads is missing in row {gaps[0] + 2}{more}, "
+        f"{lost} left out: a column that the law reads is missing in row {gaps[0] + 2}{more}, "
         "and a law ends at the first gap of its run; fill the gaps in to use them"
     )
 
@@ -142,7 +144,7 @@ def without_readings_at_scattered_stop(
 
 def _without_rows_at_stop(recording: RunRecording, stop: MeterStop, rows: BoolArray) -> RunRecording:
     level = f"{stop.level:.6g} {stop.unit}".rstrip()
-    note = f"{_count_of_readings(rows.sum())} left out, at {level}, where the meter stops"
+    note = f"{count_with_noun(int(rows.sum()), 'reading')} left out, at {level}, where the meter stops"
     return replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, note))
 
 
@@ -176,16 +178,11 @@ def without_readings_near_ends(system: System, recording: RunRecording, near_end
         cut = np.zeros_like(cut)
     said = []
     if at_end.any():
+        n_at_end = count_with_noun(int(at_end.sum()), "reading")
         said.append(
-            f"{_count_of_readings(at_end.sum())} at an end of the declared range: used only as the statement that the "
-            "signal is there or beyond"
+            f"{n_at_end} at an end of the declared range: used only as the statement that the signal is there or beyond"
         )
     if cut.any():
-        said.append(
-            f"{_count_of_readings(cut.sum())} left out near an end of the declared range, which cuts off the noise"
-        )
+        n_cut = count_with_noun(int(cut.sum()), "reading")
+        said.append(f"{n_cut} left out near an end of the declared range, which cuts off the noise")
     return replace(recording, readings=np.where(cut, np.nan, recording.readings), notes=(*recording.notes, *said))
-
-
-def _count_of_readings(n: int) -> str:
-    return f"{n} reading{'' if n == 1 else 's'}"

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from probewise._arrays import FloatArray
+from probewise._words import count_with_noun
 from probewise.report.plots.canvas import BLACK, CYCLE, SMALL_PT, axes_or_new, label_axes, legend_above
-from probewise.report.words import count_with_noun
 
 
 def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import count_with_noun
 from probewise.report.plots.canvas import (
     BLUE,
     GREY,
@@ -20,7 +21,6 @@ from probewise.report.plots.canvas import (
     legend_below,
 )
 from probewise.report.plots.progress import set_up_width_axes
-from probewise.report.words import count_with_noun
 from probewise.study import Summary
 
 _BAND = (0.16, 0.84)

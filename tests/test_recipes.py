@@ -102,7 +102,7 @@ def test_a_system(tmp_path):
     drawn = draw_system(spring, rng=np.random.default_rng(5))
     file = tmp_path / "spring.py"
     file.write_text(spring.text.replace("{noise}", ""), encoding="utf-8")
-    predicted = read_simulator(file).simulate(drawn.shared, drawn.rows.columns)
+    predicted = read_simulator(file).simulate(drawn.shared, drawn.table.columns)
     np.testing.assert_allclose(predicted, drawn.simulate_all_rows([]))
 
 

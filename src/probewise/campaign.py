@@ -21,7 +21,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
 from probewise.recordings.atomic import write_and_sync
 
-__all__ = ["FORMAT", "CampaignContents", "Finished", "read_campaign", "run_campaign"]
+__all__ = ["FORMAT", "CampaignContents", "read_campaign", "run_campaign"]
 
 FORMAT = "campaign/1"
 T = TypeVar("T")
@@ -34,9 +34,6 @@ class CampaignContents:
 
     settings: Mapping[str, Any]
     results: Mapping[str, Result]
-
-
-Finished = CampaignContents  # its earlier name
 
 
 def run_campaign(

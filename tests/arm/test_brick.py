@@ -8,8 +8,8 @@ import pytest
 from probewise.arm.nxt import (
     Brick,
     BrickError,
-    Light,
     LightReading,
+    LightSensor,
     Link,
     SensorError,
     SerialPort,
@@ -79,7 +79,7 @@ def test_a_sensor_that_a_program_has_reset_is_set_up_again(brick, paper_brick, c
 
 
 def test_a_sensor_that_never_becomes_valid_is_told_of(paper_brick, clock):
-    light = Light(Link(paper_brick, clock=clock), 1, clock=clock)
+    light = LightSensor(Link(paper_brick, clock=clock), 1, clock=clock)
     light.set_led()
     paper_brick.input[2] = 1e9
     with pytest.raises(SensorError, match=r"input 2 gave no valid reading for 1 s; is the light sensor plugged in\?"):

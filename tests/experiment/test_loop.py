@@ -121,7 +121,7 @@ def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
 def test_a_step_by_hand_is_a_step_of_the_loop(small):
     experiment, arm = small.experiment(), small.arm()
     first = next(iter(explore(arm, experiment, rng=rng())))
-    field = FieldOf.of(arm, experiment.grid)
+    field = FieldOf.from_instrument(arm, experiment.grid)
     # explore() takes the first child of the generator's seed, and of that a child for each reading.
     child = np.random.SeedSequence(2013).spawn(1)[0]
     start, then = (

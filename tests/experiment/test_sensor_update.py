@@ -7,7 +7,7 @@ import pytest
 
 from probewise.arm.instrument import Reading
 from probewise.errors import ParameterError
-from probewise.experiment import AdjustedMixture, Change, run
+from probewise.experiment import AdjustedMixture, SensorChangeSds, run
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.priors import Normal, Product
@@ -57,7 +57,7 @@ def test_an_adjustment_stretches_about_the_mean_and_shifts():
 
 def test_a_change_below_zero_is_refused():
     with pytest.raises(ParameterError, match="shift_mm"):
-        Change(shift_mm=-1.0)
+        SensorChangeSds(shift_mm=-1.0)
 
 
 class TrueArm:

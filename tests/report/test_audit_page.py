@@ -27,12 +27,6 @@ def test_the_matrix_marks_the_row_that_is_taken_for_the_column_and_leaves_out_wh
     assert matrix.get_xlabel() == "effect it may be mistaken for"
 
 
-def test_the_matrix_takes_its_statuses_by_their_old_name_with_a_warning():
-    with pytest.warns(DeprecationWarning, match="sights of audit_matrix is detectability now"):
-        bars, _ = audit_matrix(NAMES, sights=["aliased", "fine", "fine"], cosines=COSINES, alias=0.95)[0]
-    assert [text.get_text() for text in bars.figure.legends[0].get_texts()] == ["fine", "aliased"]
-
-
 @pytest.mark.parametrize(
     ("size", "said"),
     [

@@ -29,7 +29,7 @@ def drawn():
         "gain": plots.heldout_gain_by_scan([("edge_0", 0.5), ("edge_90", -0.1)], 0.2, 0.05),
         "neighbours": plots.residual_autocorrelation(noise, scan, rho=0.3),
         "spread": plots.spread_by_level(X, noise, unit="V", model_sd=np.ones(200)),
-        "tails": plots.tails(noise, 1.0),
+        "tails": plots.residual_histogram(noise, 1.0),
         "lost": plots.lost_readings_against_predicted(X, noise, X > 9.0, unit="V"),
         "lattice": plots.readings_modulo_step(np.round(noise, 1), 0.1, unit="V"),
     }

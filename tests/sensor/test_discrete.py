@@ -7,7 +7,7 @@ from probewise.errors import ShapeError
 from probewise.recordings import patterns as kinds
 from probewise.scene import HalfPlaneRegion, disc_region, region_of
 from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
-from probewise.sensor.gaussian import Spot, mean_albedo_under_one_gaussian
+from probewise.sensor.gaussian import LabGaussian, mean_albedo_under_one_gaussian
 
 MIXTURE = FixedMixture([1.0], [[0.7, 1.3]], [[[20.0, 6.0], [6.0, 30.0]]])
 PATTERNS = {
@@ -38,7 +38,8 @@ def closed(region, poses):
     (u, v), cov = MIXTURE.means_mm[0], MIXTURE.covs_mm2[0]
     turn = np.moveaxis(np.array([[c, -s], [s, c]]), (0, 1), (-2, -1))
     lab = turn @ cov @ np.swapaxes(turn, -1, -2)
-    spot = Spot(poses.x_mm, poses.y_mm, c * u - s * v, s * u + c * v, lab[..., 0, 0], lab[..., 1, 1], lab[..., 0, 1])
+    variances = lab[..., 0, 0], lab[..., 1, 1], lab[..., 0, 1]
+    spot = LabGaussian(poses.x_mm, poses.y_mm, c * u - s * v, s * u + c * v, *variances)
     return mean_albedo_under_one_gaussian(region, spot, 64)
 
 

@@ -41,33 +41,3 @@ __all__ = [
     "require_within_reach",
     "shipped_geometry_path",
 ]
-
-readings_of = readings_of_recording
-"""The old name of `readings_of_recording`."""
-
-Request = RequestToPerson
-"""The old name of `RequestToPerson`."""
-
-require_reach = require_within_reach
-"""The old name of `require_within_reach`."""
-
-shipped_geometry = shipped_geometry_path
-"""The old name of `shipped_geometry_path`."""
-
-recorded = recording_of_readings
-"""The old name of `recording_of_readings`."""
-
-Rehearsal = DryRun
-"""The old name of `DryRun`."""
-
-LegoScale = ReadingScale
-"""The old name of `ReadingScale`."""
-
-recording_of = recording_of_readings
-"""The old name of `recording_of_readings`."""
-
-instrument_of = as_instrument
-"""The old name of `as_instrument`."""
-
-in_lego_units = percent_to_lego_units
-"""The old name of `percent_to_lego_units`."""

@@ -280,16 +280,12 @@ class Geometry:
         rises = np.abs(self.height_slopes_mm_rad(self.angles_rad(self.reachable_grid_mm, self.read_height_mm)))
         return float(rises.sum(axis=-1).max(initial=0.0) * UNMEASURED_RAD)
 
-    height_doubt_mm = max_height_error_mm  # its old name
-
     @property
     def reachable_grid_mm(self) -> FloatArray:
         """Places, (n, 2), of a 12 by 12 grid over the field at which the sensor can read."""
         sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
         places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
         return places[self.contains(places)]
-
-    places_over_field_mm = reachable_grid_mm  # its old name
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
         """Compute x, y and height of the sensor's face, (n, 3), lab frame, from joint angles, (n, 3)."""
@@ -346,9 +342,6 @@ class Geometry:
         places = _checked_rows(places_mm, 2)
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
         return np.asarray(on_field & self._room_to_approach_mask(places))
-
-    holds = contains
-    """The old name of `contains`."""
 
     def are_within_joint_limits(self, angles_rad: FloatArray) -> BoolArray:
         """Return which rows of joint angles, (n, 3), are within all joints' limits, shape (n,); NaN is outside."""

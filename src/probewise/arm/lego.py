@@ -266,8 +266,6 @@ class LegoArm:
             self._move_joint_near(joint, goal)
         self._is_down = False
 
-    rise = raise_sensor  # its old name
-
     def home(self) -> None:
         """Move all joints home (counter 0); joints with a stop first turn to the stop, which sets their counters.
 
@@ -332,8 +330,6 @@ class LegoArm:
         angles = self.angles_rad
         angles[joint] += checked_finite_number("by_rad", by_rad)
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
-
-    turn = turn_joint  # its old name
 
     def _pose(self) -> Pose:
         """Return the sensor's pose by the motors' counters."""

@@ -31,15 +31,11 @@ class SoftLimits:
         """Record the present count of one joint's motor."""
         self._counts[joint] = count
 
-    record = stands = record_counts = record_present_count  # its old names
-
     @property
     def last_counts(self) -> tuple[int, int, int]:
         """Last recorded counts of the motors: base, shoulder, elbow; 0 at the start."""
         base, shoulder, elbow = self._counts
         return base, shoulder, elbow
-
-    counts = last_counts  # its old name
 
     def heights_along_move_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
         """Return the sensor's height at 33 points along a move of one joint, shape (33,).
@@ -59,8 +55,6 @@ class SoftLimits:
         start = joints[joint].angle_at(counts[joint] if here is None else here)
         way[:, joint] = np.linspace(start, joints[joint].angle_at(to), N_CHECKED)
         return np.asarray(self._geometry.position_mm(way)[:, 2])
-
-    heights_mm = heights_along_move_mm  # its old name
 
     def require_allowed_move(self, joint: int, here: int, to: int) -> None:
         """Raise ReachError if a move of one joint, the others at rest, leaves the allowed range.
@@ -90,5 +84,3 @@ class SoftLimits:
                 f"{heights.min():.0f} mm",
                 f"{geometry.lowest_mm:g} mm or more; is the arm where its counters say? home it",
             )
-
-    check = require_allowed_move  # its old name

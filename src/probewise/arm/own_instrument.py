@@ -167,9 +167,6 @@ class OwnInstrument:
     contains = reachable
     """Its name in `ReachablePlaces`."""
 
-    holds = contains
-    """The old name of `contains`."""
-
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's own orientation at places, (n_places, 2), by default 0: shape (n_places,)."""
         own = getattr(self._own, "orientation_rad", 0.0)

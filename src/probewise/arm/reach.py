@@ -137,8 +137,6 @@ class Reach:
         beyond = 60.0
         return cls(field_mm, beyond, 0.0, math.hypot(width / 2, height + beyond) + 1.0)
 
-    everywhere = over_whole_field  # its old name
-
     @property
     def axis_mm(self) -> tuple[float, float]:
         """Place (x, y) of the axis, lab frame."""
@@ -160,9 +158,6 @@ class Reach:
         away = np.hypot(x_mm - self.axis_mm[0], y_mm - self.axis_mm[1])
         on_field = (x_mm >= 0) & (x_mm <= self.field_mm[0]) & (y_mm >= 0) & (y_mm <= self.field_mm[1])
         return on_field & (away >= self.nearest_mm) & (away <= self.farthest_mm)
-
-    holds = contains
-    """The old name of `contains`."""
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""

@@ -34,5 +34,3 @@ class ReadingScale:
             value = round(value / self.step) * self.step
         # A step that does not divide the range may have rounded past its end.
         return min(max(value, self.low), self.high)
-
-    convert = clip_and_round  # its old name

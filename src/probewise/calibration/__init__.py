@@ -7,9 +7,9 @@ the weighted mean of sampled SSF fields.
 
 from probewise.calibration.fields import choose_pixel_mm, mixture_moments, posterior_mean_ssf_field
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
-from probewise.calibration.noise import ScanNoise, draw_pooled_sd, draw_sd, noise_by_scan, pooled_sd
+from probewise.calibration.noise import ScanNoise, draw_pooled_sd, draw_sd, noise_by_scan
 from probewise.calibration.order_problems import problem_for
-from probewise.calibration.order_search import Found, OrderPosterior
+from probewise.calibration.order_search import OrderPosterior
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (
     PriorRow,
@@ -21,21 +21,17 @@ from probewise.calibration.priors import (
     scan_geometry,
 )
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
-from probewise.calibration.smc import Climb, Rung, SMCResult, TemperatureSummary
-from probewise.calibration.ssf_summary import Quantity, QuantitySummary, ssf_quantities
+from probewise.calibration.smc import SMCResult, TemperatureSummary
+from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
 
 __all__ = [
     "Calibration",
-    "Climb",
     "FittedSensor",
-    "Found",
     "OrderEvidence",
     "OrderFit",
     "OrderPosterior",
     "PriorRow",
-    "Quantity",
     "QuantitySummary",
-    "Rung",
     "SMCResult",
     "SSFPrior",
     "ScanGeometry",
@@ -50,7 +46,6 @@ __all__ = [
     "mixture_moments",
     "noise_by_scan",
     "paper_prior",
-    "pooled_sd",
     "posterior_mean_ssf_field",
     "predict",
     "problem_for",
@@ -59,6 +54,3 @@ __all__ = [
     "ssf_quantities",
     "write_sensor",
 ]
-
-mean_field = posterior_mean_ssf_field
-"""The old name of `posterior_mean_ssf_field`."""

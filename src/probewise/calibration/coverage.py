@@ -101,9 +101,6 @@ def simulate_paper_recording(truth: TrueSensor, *, rng: np.random.Generator) -> 
     return world.simulate(paper_plan(), rng=rng)
 
 
-draw_truth, simulate_truth = draw_true_sensor, simulate_paper_recording  # their earlier names
-
-
 def simulate_coverage(
     n_recordings: int,
     *,
@@ -141,10 +138,6 @@ def simulate_coverage(
         if progress is not None:
             progress(Coverage(k + 1, held, n_live))
     return Coverage(n_recordings, held, n_live)
-
-
-coverage = simulate_coverage
-"""The old name of `simulate_coverage`."""
 
 
 def _simulate_and_check_intervals(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:

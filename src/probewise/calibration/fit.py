@@ -111,8 +111,6 @@ class Calibration(ShowsItself):
         weight = np.exp(log_z - log_z.max())
         return {fit.n_gaussians: float(w) for fit, w in zip(self.fits, weight / weight.sum(), strict=True)}
 
-    probabilities = order_probabilities  # its earlier name
-
     def summary(self) -> str:
         """Describe the calibration in plain text."""
         return self.sensor.summary()

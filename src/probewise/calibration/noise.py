@@ -85,9 +85,6 @@ def draw_pooled_sd(
     return draw_sd(total, residuals.shape[1], sd_floor=sd_floor, sd_ceiling=sd_ceiling, rng=rng)
 
 
-pooled_sd = draw_pooled_sd  # its earlier name
-
-
 def noise_by_scan(
     residuals: FloatArray,
     scan: IntArray,

@@ -36,11 +36,6 @@ class OrderPosterior:
         """The result whose log Z is used: `refined` if its error is reliable (`Weighted.sound`), else `result`."""
         return self.refined if self.refined is not None and self.refined.sound else self.result
 
-    evidence = evidence_result  # its earlier name
-
-
-Found = OrderPosterior  # its earlier name
-
 
 Search = Callable[[int, np.random.Generator], OrderPosterior]
 """Function that searches the whole prior of an order."""

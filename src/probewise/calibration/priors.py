@@ -184,8 +184,6 @@ class SSFPrior:
         )
         return tuple(PriorRow(*row) for row in rows)
 
-    describe = table_rows  # its earlier name
-
     def amplitude_at_unit_mass(self, determinant: FloatArray) -> FloatArray:
         """Return the amplitude a of a Gaussian of mass pi `unit_mass_mm2`, for its A B - C^2; any shape in and out.
 
@@ -194,8 +192,6 @@ class SSFPrior:
         if self.unit_mass_mm2 is None:
             return np.ones_like(determinant)
         return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, _TINY))
-
-    amplitude_scale = amplitude_at_unit_mass  # its earlier name
 
 
 @dataclass(frozen=True)

@@ -185,8 +185,6 @@ class FittedSensor(NamedSamples):
         """Samples of the parameters of SSF, levels and effects, (n_samples, n), without effects of single scans."""
         return self.samples[:, [self.names.index(name) for name in self.chain(KnownScene({})).names]]
 
-    carried_effects, carried_samples = effects_on_new_scans, samples_for_new_scans  # their earlier names
-
     def chain(self, scene: Scene) -> Chain:
         """Build the model that predicts new readings over a scene, with the effects that apply to new scans.
 
@@ -206,16 +204,12 @@ class FittedSensor(NamedSamples):
         """Whether its SSF is a free form (`probewise.sensor.free_form`) rather than a mixture of a few Gaussians."""
         return is_free_form(self.samples[:, : 6 * self.n_gaussians])
 
-    free_form = is_free_form  # its earlier name
-
     def mean_mixture(self) -> FixedMixture:
         """Return the mean SSF as a `FixedMixture` of `n_gaussians` positive Gaussians; of four for a free form."""
         if self.is_free_form:
             return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
         n = self.n_gaussians
         return merged_mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
-
-    mixture = mean_mixture  # its earlier name
 
     def with_leading_effects(self) -> FittedSensor:
         """Return the sensor with the most probable combination of effects, where a diagnosis left several possible.
@@ -243,13 +237,9 @@ class FittedSensor(NamedSamples):
             absent={},
         )
 
-    leading = with_leading_effects  # its earlier name
-
     def ssf_quantities(self) -> tuple[QuantitySummary, ...]:
         """Summarise the SSF by centre, widths and angle, and each Gaussian too, unless the SSF is a free form."""
         return ssf_quantities(self.samples, self.n_gaussians, each=not self.is_free_form)
-
-    ssf = ssf_quantities  # its earlier name
 
     def summary(self) -> str:
         """Describe the sensor in plain text."""
@@ -400,8 +390,6 @@ class FittedSensor(NamedSamples):
         if name in ("I_min", "I_max"):
             return self.instrumentation.unit
         return {"a": "1", "u": "mm", "v": "mm"}.get(name[0], "mm^-2")
-
-    unit = unit_of_parameter  # its earlier name
 
 
 def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:

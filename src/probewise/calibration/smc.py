@@ -143,9 +143,6 @@ class SMCResult(ShowsItself):
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.warnings)])
 
 
-Climb, Rung = SMCResult, TemperatureSummary  # their earlier names
-
-
 @dataclass(frozen=True, eq=False)
 class _Particles:
     """Particles: coordinates `x`, (n, d); logs of prior, likelihood, and reference over prior density, (n,) each."""

@@ -20,9 +20,6 @@ class QuantitySummary:
     interval95: tuple[float, float]
 
 
-Quantity = QuantitySummary  # its earlier name
-
-
 def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) -> tuple[QuantitySummary, ...]:
     """Summarise the whole SSF and, if there are several, each Gaussian: medians and 95 % intervals.
 

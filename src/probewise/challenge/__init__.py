@@ -30,18 +30,3 @@ __all__ = [
     "score",
     "score_rounds",
 ]
-
-confusion = confusion_counts
-"""The old name of `confusion_counts`."""
-
-by_effect = detected_and_named_by_effect
-"""The old name of `detected_and_named_by_effect`."""
-
-Investigated = RunCaseInRounds
-"""The old name of `RunCaseInRounds`."""
-
-reliability = reliability_bins
-"""The old name of `reliability_bins`."""
-
-Row = ScoreRow
-"""The old name of `ScoreRow`."""

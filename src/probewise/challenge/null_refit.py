@@ -56,8 +56,6 @@ class NullRefit:
             self._clean, self._null = clean, _fit_of_best_order(clean)
         return self._null
 
-    null = null_fit  # its old name
-
 
 def _fit_of_best_order(clean: Recording) -> Fit:
     extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)

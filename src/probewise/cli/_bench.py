@@ -22,7 +22,7 @@ from probewise.recordings import Disc, HalfPlane, Image, Pattern, Polygon, Quadr
 if TYPE_CHECKING:
     from probewise.arm import Geometry, Pose
     from probewise.cli._marks import MarkQuestion
-    from probewise.emulator import Stand
+    from probewise.emulator import SensorPose
     from probewise.recordings import Instrumentation
     from probewise.world import Surface, World
 
@@ -50,7 +50,7 @@ class SimulatedBench:
     def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
         self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
         self._table = Tabletop(parse_scene(scene))
-        self._stand: Callable[[], Stand] | None = None
+        self._stand: Callable[[], SensorPose] | None = None
 
     def open_simulated_arm(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
         """Return the simulated arm over the table; its sensor takes any orientation."""
@@ -71,7 +71,7 @@ class SimulatedBench:
         arm, bench = open_emulated_arm_and_bench(
             geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s
         )
-        self._table, self._stand = bench.table, bench.arm.stand
+        self._table, self._stand = bench.table, bench.arm.sensor_pose
         return arm
 
     def answer_at_mark(self, question: MarkQuestion) -> str:

@@ -99,12 +99,3 @@ __all__ = [
     "repaired_of",
     "weigh_thoroughly",
 ]
-
-Smallest = DetectableSize
-"""The old name of `DetectableSize`."""
-
-Predicted = PredictionAndResiduals
-"""The old name of `PredictionAndResiduals`."""
-
-audit_recorded = audit_plan_of_diagnosis
-"""The old name of `audit_plan_of_diagnosis`."""

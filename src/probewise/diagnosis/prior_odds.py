@@ -63,8 +63,6 @@ class PriorOdds:
         n_named = len(effects) - len(on_noise) - unnamed - len(twofold)
         return cls(n_named, unnamed, len(on_noise), twofold=twofold)
 
-    over = for_effects  # its old name
-
     def log_prior_on_mean(self, names: Names) -> float:
         """Return the log prior probability of a combination of effects on the mean."""
         named = [name for name in names if not is_out_of_vocabulary(name)]
@@ -132,9 +130,3 @@ class PriorOdds:
             return math.log1p(-not_white)
         share = self.noise_by_size[len(names) - 1] / (1 - self.white)
         return math.log(not_white * share / math.comb(self.n_noises, len(names)))
-
-    # Their old names.
-    log_mean = log_prior_on_mean
-    log_unknown = log_prior_with_unknown
-    alone = single_effect_priors
-    log_noise = log_prior_on_noise

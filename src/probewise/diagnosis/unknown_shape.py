@@ -149,9 +149,6 @@ class SensorAndShape:
         patterns = {name: plan.patterns.get(name, shape) for name in plan.pattern_names}
         return replace(diagnosis, next_measurement=replace(asked, plan=replace(plan, patterns=patterns)))
 
-    with_described_field = with_shape_in_next_plan
-    """The old name of `with_shape_in_next_plan`."""
-
 
 @dataclass(frozen=True, eq=False)
 class _ShapeAmongPatterns:

@@ -105,8 +105,6 @@ A diagnosis names it where hardly anything else out of vocabulary explains the r
 form of the unknown.
 """
 
-UNNAMED = RARE_EFFECTS
-"""The old name of `RARE_EFFECTS`."""
 
 EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
@@ -140,33 +138,6 @@ def name_of_first_copy(name: str) -> str | None:
     return name.removesuffix(AGAIN) if name.endswith(AGAIN) else None
 
 
-sign_of_move = sign_of_motion
-"""The old name of `sign_of_motion`."""
-
-first_of = name_of_first_copy
-"""The old name of `name_of_first_copy`."""
-
-public_name = name_without_copy_suffix
-"""The old name of `name_without_copy_suffix`."""
-
-in_scans = scan_indicator
-"""The old name of `scan_indicator`."""
-
-lattice_step_sd = sd_of_estimated_lattice_step
-"""The old name of `sd_of_estimated_lattice_step`."""
-
-variance = reading_variance
-"""The old name of `reading_variance`."""
-
-NoiseRows = FittedReadings
-"""The old name of `FittedReadings`."""
-
-HeavyTailed = HeavyTailedPrior
-"""The old name of `HeavyTailedPrior`."""
-
-LogHeavyTailed = LogHeavyTailedPrior
-"""The old name of `LogHeavyTailedPrior`."""
-
 NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
 """Departures of the noise that have no name in the vocabulary; they only keep the tests of the mean valid."""
 
@@ -176,7 +147,6 @@ __all__ = [
     "NUISANCES",
     "PROPOSAL",
     "RARE_EFFECTS",
-    "UNNAMED",
     "VOCABULARY",
     "AlbedoGradient",
     "AlbedoPatch",

@@ -55,8 +55,6 @@ class Extent:
         """Unit of a reading, as written after a number."""
         return self.plan.instrumentation.unit_after_number
 
-    unit = reading_unit  # its earlier name
-
     @property
     def span(self) -> float:
         """Largest minus least usable reading."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._renamed import renamed_arguments
 from probewise.effects.density import log_gaussian_density, log_rounding_cell_density
 from probewise.sensor.stages import NoiseParameters
 
@@ -24,7 +23,6 @@ class FittedReadings:
     readings: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
-@renamed_arguments(level="noise")
 def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return the natural log of the density of each reading alone, (n_samples, n_points), per unit of the reading.
 
@@ -49,7 +47,6 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
     return of_kept
 
 
-@renamed_arguments(level="noise")
 def reading_variance(noise: NoiseParameters) -> FloatArray:
     """Return the variance of a reading that is not lost, with outliers, random walk and rounding; arrays broadcast."""
     noise = noise_with_walk_variance(noise)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise._renamed import renamed_arguments
 from probewise.effects.limited_range import limited_mean, log_probability_at_end
 from probewise.effects.noise_distribution import log_density, reading_variance
 from probewise.recordings.ends import masks_of_readings_at_ends
@@ -45,7 +44,6 @@ class PredictiveMixture:
         self._limited_total = np.zeros(n_points)
         self._log_sum = np.full(int(self.scored.sum()), -np.inf)
 
-    @renamed_arguments(level="noise")
     def add(self, mean: FloatArray, noise: NoiseParameters, between: FloatArray | None = None) -> None:
         """Add noise-free predictions, (n_samples, n_points), and the noise about them.
 

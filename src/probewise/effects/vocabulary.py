@@ -287,10 +287,3 @@ def value_with_sd(mean: float, sd: float, unit: str = "", *, factor: float = 1.0
     else:
         written = f"{mean:.4g}"
     return f"{written} {unit}".rstrip()
-
-
-Gates = VariantMasks
-"""The old name of `VariantMasks`."""
-
-give_or_take = value_with_sd
-"""The old name of `value_with_sd`."""

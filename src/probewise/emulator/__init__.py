@@ -18,21 +18,6 @@ from probewise.emulator.scenes import parse_scene
 from probewise.emulator.sensors import AnalogSensor, DigitalSensor, EmptyPort, LightSensor, ultrasonic_sensor
 from probewise.emulator.table import Tabletop
 
-Sight = LightModel
-"""The old name of `LightModel`."""
-
-Stand = SensorPose
-"""The old name of `SensorPose`."""
-
-NothingAnalog = EmptyPort
-"""The old name of `EmptyPort`."""
-
-MotorNature = MotorParameters
-"""The old name of `MotorParameters`."""
-
-Light = LightSensor
-"""The old name of `LightSensor`."""
-
 __all__ = [
     "AnalogSensor",
     "Battery",
@@ -62,21 +47,3 @@ __all__ = [
     "shipped_geometry_path",
     "ultrasonic_sensor",
 ]
-
-shipped_geometry = shipped_geometry_path
-"""The old name of `shipped_geometry_path`."""
-
-set_up = set_up_bench
-"""The old name of `set_up_bench`."""
-
-sonar = ultrasonic_sensor
-"""The old name of `ultrasonic_sensor`."""
-
-Table = Tabletop
-"""The old name of `Tabletop`."""
-
-Bench = EmulatedBench
-"""The old name of `EmulatedBench`."""
-
-JointNumbers = JointParameters
-"""The old name of `JointParameters`."""

@@ -43,8 +43,6 @@ class Joint:
         stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)
         return cls(numbers, Motor(MotorParameters(stops_deg=stops_deg, play_deg=play_deg)))
 
-    at_home = create_at_home  # its old name
-
     @property
     def angle_rad(self) -> float:
         """Angle of the joint, which follows its motor with backlash."""
@@ -54,8 +52,6 @@ class Joint:
         """Set the joint to an angle, as by hand; the motor follows and rests in the middle of the backlash."""
         self.motor.angle_deg = self.motor.driven_deg = (angle_deg - self.numbers.home_deg) * self.numbers.gear_ratio
         self.motor.speed_deg_s = 0.0
-
-    bring_to = set_angle_by_hand  # its old name
 
 
 class EmulatedArm:
@@ -104,5 +100,3 @@ class EmulatedArm:
             height_mm=face_mm,
             orientation_rad=math.radians(g.mounting_deg - 90) + base,
         )
-
-    stand = sensor_pose  # its old name

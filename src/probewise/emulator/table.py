@@ -36,5 +36,3 @@ class Tabletop:
                 self.surface = parse_scene(line.strip())
         except ValueError as error:
             raise ParameterError("line", line, f"turn DEGREES; {'; '.join(FORMS)}; in mm and degrees") from error
-
-    carry_out = obey = carry_out_line  # its old names

@@ -54,9 +54,6 @@ class ArmReachAndTravel:
             instrument.travel_s,
         )
 
-    of = under = from_instrument
-    """The old names of `from_instrument`."""
-
 
 def predict_readings_and_utilities(
     experiment: Experiment,

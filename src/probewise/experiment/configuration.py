@@ -303,9 +303,6 @@ class Experiment:
         sure = self.trust == 1 or chance_off < MOST_OFF
         return largest_sd_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability and sure
 
-    is_known = may_stop
-    """The old name of `may_stop`."""
-
     def fit_is_doubtful(self, p_value: float | None) -> bool:
         """Return whether the p-value of the best hypothesis says that none explains the readings; None: not tested."""
         return p_value is not None and p_value < self.doubt_p

@@ -64,9 +64,6 @@ class FittedArm:
             calibrated_mm = (x_mm, y_mm)
         return cls(geometry, (means["I_min"], means["I_max"]), calibrated_mm)
 
-    of = from_geometry_and_sensor
-    """The old name of `from_geometry_and_sensor`."""
-
 
 def _middle_of_field(geometry: Geometry) -> tuple[float, float]:
     width_mm, height_mm = geometry.field_mm

@@ -85,9 +85,6 @@ class HiddenShape:
             raise ParameterError("truth", truth, f"one shape of {', '.join(known)} with its parameters")
         return cls.from_parameters(first, members[first], _theta_in_prior_order(members[first].prior.names, truth))
 
-    of = given_or_drawn
-    """The old name of `given_or_drawn`."""
-
     @property
     def journal_entry(self) -> dict[str, str | float]:
         """The shape's name and parameters for the journal's first line, since a resumed run needs the same shape."""
@@ -115,9 +112,6 @@ class HiddenShape:
         """
         known, prefix = self.parameters, f"{self.name}."
         return {name: known[name.removeprefix(prefix)] for name in names if name.removeprefix(prefix) in known}
-
-    parameters_by_names = parameters_by_hypothesis_name
-    """The old name of `parameters_by_hypothesis_name`."""
 
 
 def possible_shapes_by_name(shape: Shape) -> dict[str, Shape]:

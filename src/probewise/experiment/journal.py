@@ -376,9 +376,6 @@ class JournalWriter:
         }
         write_and_sync(self._file, self.path, (_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n").encode())
 
-    # Old names.
-    reading, summary = write_reading, write_summary
-
     def close(self) -> None:
         """Close the file and let other processes write to it."""
         self._open.close()

@@ -72,11 +72,6 @@ class RandomStreams(NamedTuple):
         run, truth, shadow, noise, levels = rng.spawn(5)
         return cls(run, truth, shadow, int(noise.integers(2**63)), levels)
 
-    @classmethod
-    def of(cls, rng: np.random.Generator) -> RandomStreams:
-        """Spawn the streams: the old name of `spawned_from`."""
-        return cls.spawned_from(rng)
-
 
 def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
     """Return a journal's entries for the sensor: the sha256 of its JSON, and the path of its file if given."""

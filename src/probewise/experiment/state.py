@@ -108,11 +108,6 @@ class Step(ShowsItself):
     arm_error: ArmError | None = None
 
     @property
-    def arm(self) -> ArmError | None:
-        """The old name of `arm_error`."""
-        return self.arm_error
-
-    @property
     def log_z(self) -> float:
         """Natural log of the evidence of all readings so far."""
         return self.posterior.log_z
@@ -121,9 +116,6 @@ class Step(ShowsItself):
     def largest_sd_mm(self) -> float:
         """Largest posterior sd among the parameters in mm."""
         return largest_sd_mm(self.names, self.sd)
-
-    widest_mm = largest_sd_mm
-    """The old name of `largest_sd_mm`."""
 
     @property
     def likely_shape(self) -> str:
@@ -137,9 +129,6 @@ class Step(ShowsItself):
         turned = f", turned {math.degrees(pose.orientation_rad):.0f}°" if len(designs.orientations_rad) > 1 else ""
         raised = "" if pose.height_mm is None else f", {pose.height_mm:g} mm up"
         return turned + raised
-
-    orientation_and_height = orientation_and_height_text
-    """The old name of `orientation_and_height_text`."""
 
     def summary(self) -> str:
         """Return a one-line summary of the reading and the posterior."""
@@ -198,9 +187,6 @@ class Exploration(ShowsItself):
     def arm_error(self) -> ArmError | None:
         """Effect of the arm's own error after the last reading; None if that error is not known."""
         return self.last.arm_error
-
-    arm = arm_error
-    """The old name of `arm_error`."""
 
     @property
     def last(self) -> Step:

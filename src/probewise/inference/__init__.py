@@ -25,6 +25,3 @@ __all__ = [
     "sd_floor",
     "student_t_of",
 ]
-
-student_t = student_t_of
-"""The old name of `student_t_of`."""

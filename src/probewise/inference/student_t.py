@@ -165,11 +165,6 @@ class StudentT:
         """Number of readings of each data set, in the order of their labels, (n_groups,)."""
         return np.asarray(self._group_indicator.sum(axis=0))
 
-    @property
-    def sizes(self) -> FloatArray:
-        """The old name of `group_sizes`."""
-        return self.group_sizes
-
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
 
@@ -197,8 +192,6 @@ class StudentT:
         variance = self.sums_by_group(np.square(residual)) / self.group_sizes
         per_set = 1.0 / variance.clip(self.sd_floor**2, self.sd_ceiling**2)
         return np.asarray(per_set[:, np.unique(self.groups, return_inverse=True)[1]])
-
-    weights = inverse_noise_variance  # its earlier name
 
 
 def _require_ordered_bounds(sd_floor: float, sd_ceiling: float) -> None:

@@ -84,21 +84,3 @@ __all__ = [
     "utility_map",
     "utility_named",
 ]
-
-SilhouetteForecast = TabulatedForecast
-"""The old name of `TabulatedForecast`."""
-
-AskedForecast = DirectForecast
-"""The old name of `DirectForecast`."""
-
-Outlook = PredictiveDistributions
-"""The old name of `PredictiveDistributions`."""
-
-TabledChain = TabulatedChain
-"""The old name of `TabulatedChain`."""
-
-Prospect = UtilityInput
-"""The old name of `UtilityInput`."""
-
-best_places = best_places_mask
-"""The old name of `best_places_mask`."""

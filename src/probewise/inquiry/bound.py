@@ -50,9 +50,6 @@ class Bound:
         """Total number of readings."""
         return self.readings_of_search + self.readings_of_refinement
 
-    # Old names.
-    search, refinement = readings_of_search, readings_of_refinement
-
 
 def fewest_readings(
     prior_bits: float, met_bits: float, target_bits: float, *, most_covered: float, capacity: float

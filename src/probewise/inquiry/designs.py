@@ -73,11 +73,6 @@ class Designs:
             for n in self.repeats
         )
 
-    @property
-    def combinations(self) -> tuple[Design, ...]:
-        """The old name of `setting_combinations`."""
-        return self.setting_combinations
-
     def __getitem__(self, row: int) -> Design:
         """Return one design by its row."""
         which, place = divmod(row, self.grid.n_places)

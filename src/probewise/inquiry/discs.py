@@ -178,8 +178,6 @@ class DiscTable:
             mass[rows] = intervals.level_histogram(weight, ring, level, (dark, bright), n_levels)
         return mass
 
-    mass = level_histogram  # its old name
-
     def _distance_to_constant_level_mm(self, nearest: IntArray, ends: tuple[int, int]) -> float:
         """Return the distance from an edge beyond which the nearest level is constant.
 

@@ -65,9 +65,6 @@ class Finishing:
         out[best] = chance
         return out, "probability that a reading there ends the run"
 
-    measure = utility_and_label
-    """The old name of `utility_and_label`."""
-
 
 def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
     """Return whether one more reading may end the run: the largest sd is 1 to 15 times the goal."""

@@ -60,8 +60,6 @@ class Readout:
                 f"{self.low:g} to {self.high:g}, the range of the sensor; is it the sensor that was calibrated?",
             )
 
-    require = require_in_range  # its old name
-
     def cell_edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
         """Return the edges of the cells for readings of these levels, (n_cells - 1,); the end cells are open.
 
@@ -94,8 +92,6 @@ class Readout:
         below = ndtr((each.cell_edges(levels, fine=fine, most=most) - levels[:, None]) / sd)
         ends = np.zeros((len(levels), 1)), np.ones((len(levels), 1))
         return np.diff(np.concatenate([ends[0], below, ends[1]], axis=1), axis=1)
-
-    edges, probability = cell_edges, cell_probability  # their old names
 
 
 def _probability_of_sum(probability: FloatArray, n: int) -> FloatArray:

@@ -56,8 +56,6 @@ class UtilityMap:
         """The largest utility."""
         return float(self.values[self.reachable].max())
 
-    highest = highest_utility  # its old name
-
     @property
     def is_flat(self) -> bool:
         """Whether there is no choice: all available designs have equal utility (to 1e-5), or the only one has none."""
@@ -73,9 +71,6 @@ class UtilityMap:
         """Draw the next place, x and y, at random among the best."""
         design = self.designs[choose(self.values, self.reachable, rng=rng)]
         return design.x_mm, design.y_mm
-
-    # Old names.
-    flat, best, choose = is_flat, best_mask, draw_place_mm
 
 
 def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:

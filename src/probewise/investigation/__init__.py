@@ -24,6 +24,3 @@ __all__ = [
     "parse_concealed",
     "reason_if_settled",
 ]
-
-settled_by = reason_if_settled
-"""The old name of `reason_if_settled`."""

@@ -48,9 +48,6 @@ class Budget:
         first = next((rows for rows in plan.rows_by_scan() if rows.size), ())
         return "readings" if len(first) > self.readings else "minutes"
 
-    affordable = affordable_scans
-    """The old name of `affordable_scans`."""
-
 
 def _minutes_of_plan(plan: Plan, after_s: float) -> float:
     return (float(plan.time_s.max()) - after_s) / 60.0

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from probewise.arm import Reading, readings_of_recording, recorded
+from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.errors import FileError
 from probewise.progress import Progress, silent
 from probewise.recordings import (
@@ -89,14 +89,12 @@ class RoundsFolder:
                 readings.append(reading)
                 progress(f"round {number}, readings", len(readings), len(plan))
                 if time.monotonic() - kept_s > _KEPT_AGAIN_S:
-                    write_recording(recorded(plan, readings), readings_file)
+                    write_recording(recording_of_readings(plan, readings), readings_file)
                     kept_s = time.monotonic()
         finally:  # an error or an interruption loses none of them
             if readings:
-                write_recording(recorded(plan, readings), readings_file)
+                write_recording(recording_of_readings(plan, readings), readings_file)
         return read_recording(readings_file)
-
-    record = record_round  # its old name
 
     @property
     def n_readings(self) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from operator import attrgetter
 
 from probewise._display import ShowsItself
 from probewise.diagnosis import Diagnosis
@@ -43,10 +42,6 @@ class Round:
     def hypothesis_probabilities(self) -> tuple[tuple[str, float], ...]:
         """Labels of the hypotheses after this round with their probabilities, most probable first."""
         return tuple((h.label, h.probability) for h in self.diagnosis.hypotheses)
-
-    # Old names.
-    believed = hypothesis_probabilities
-    asked = property(attrgetter("reason_for_readings"))
 
 
 @dataclass(frozen=True, eq=False)

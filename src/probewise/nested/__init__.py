@@ -9,25 +9,24 @@ from probewise.nested.dead_points import DeadPoints
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.dynamic import Goal, intensified
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
-from probewise.nested.function_problem import FunctionProblem, Posed, make_problem, pose
-from probewise.nested.genealogy import chain_memory, relative_lineage_variance
+from probewise.nested.function_problem import FunctionProblem, make_problem
+from probewise.nested.genealogy import relative_lineage_variance
 from probewise.nested.importance import Weighted, pareto_k, update
 from probewise.nested.kernels import KernelMove
-from probewise.nested.merging import agreement_of, alive_at_death, merge, n_alive_at_death
+from probewise.nested.merging import agreement_of, merge, n_alive_at_death
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.refine import refine
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
 from probewise.nested.run_in_few_calls import run_in_few_calls
-from probewise.nested.sampler import LIVE_PER_PARAM, least_live, replace_worst_live_points, step
+from probewise.nested.sampler import LIVE_PER_PARAM, least_live, replace_worst_live_points
 from probewise.nested.stop import (
     NESTED_STOP,
     EvidenceChange,
     NestedStop,
     RemainingEvidence,
     RoundSummary,
-    State,
     StopRule,
 )
 from probewise.nested.weighted_samples import WeightedSamples
@@ -49,21 +48,17 @@ __all__ = [
     "NestedResult",
     "NestedStop",
     "Points",
-    "Posed",
     "PriorRejection",
     "RemainingEvidence",
     "Repartitioned",
     "RoundSummary",
     "Samplable",
     "SliceMove",
-    "State",
     "StopRule",
     "Tally",
     "Weighted",
     "WeightedSamples",
     "agreement_of",
-    "alive_at_death",
-    "chain_memory",
     "diversify",
     "intensified",
     "least_live",
@@ -71,16 +66,11 @@ __all__ = [
     "merge",
     "n_alive_at_death",
     "pareto_k",
-    "pose",
     "refine",
     "relative_lineage_variance",
     "repartitioned",
     "replace_worst_live_points",
     "run",
     "run_in_few_calls",
-    "step",
     "update",
 ]
-
-run_slow = run_in_few_calls
-"""The old name of `run_in_few_calls`."""

@@ -120,5 +120,3 @@ class DeadPoints(WeightedSamples):
     def maximum_likelihood_theta(self) -> FloatArray:
         """Return the parameters of the sample with the greatest likelihood, (n_params,)."""
         return np.asarray(self.theta[int(np.argmax(self.log_likelihood))])
-
-    best = maximum_likelihood_theta  # its earlier name

@@ -54,8 +54,6 @@ class Points:
             self.u[rows], self.theta[rows], self.log_density[rows], self.log_likelihood[rows], self.label[rows]
         )
 
-    take = take_rows  # its earlier name
-
     def copy(self) -> Points:
         """Return the points with a copy of every array."""
         return Points(
@@ -72,13 +70,9 @@ class Points:
         self.log_density[rows], self.label[rows] = points.log_density[which], points.label[which]
         self.log_likelihood[rows] = points.log_likelihood[which]
 
-    put = overwrite_rows  # its earlier name
-
     def rows_by_rising_likelihood(self) -> IntArray:
         """Return the row numbers from the least to the greatest log likelihood, ties by label, (n,)."""
         return np.lexsort((self.label, self.log_likelihood))
-
-    order = rows_by_rising_likelihood  # its earlier name
 
     @staticmethod
     def join(*parts: Points) -> Points:
@@ -107,8 +101,6 @@ class Bound:
         """Return a mask of the points above the bound; all arrays are (n,)."""
         tie = (log_likelihood == self.log_likelihood) & (label > self.label)
         return np.asarray((log_likelihood > self.log_likelihood) | tie)
-
-    admits = mask_above  # its earlier name
 
 
 class OutOfCallsError(Exception):
@@ -145,14 +137,10 @@ class Evaluator:
         """Draw `n` points from the prior and return them evaluated; NotConvergedError as for `log_likelihood`."""
         return self(self.space.draw(n, rng=rng), rng)
 
-    from_prior = draw_from_prior  # its earlier name
-
     def points_from_known_values(self, theta: FloatArray, log_likelihood: FloatArray, label: FloatArray) -> Points:
         """Make points of hypotheses (n, n_params) whose log likelihood and label, (n,), are known; evaluate nothing."""
         u = self.space.enter(theta)
         return Points(u, theta, self.space.leave(u)[1], log_likelihood, label)
-
-    known = points_from_known_values  # its earlier name
 
     def __call__(self, u: FloatArray, rng: np.random.Generator) -> Points:
         """Evaluate `u`, (n, n_params), inside the space, and give every point a new label.
@@ -179,8 +167,6 @@ class Evaluator:
         if possible.any():
             log_likelihood[possible] = self.log_likelihood(theta[possible])
         return Points(u, theta, log_density, log_likelihood, rng.random(len(u)))
-
-    weigh = evaluate_mapped  # its earlier name
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Evaluate the log likelihood of hypotheses, (n, n_params) -> (n,), and count the calls.

@@ -153,9 +153,6 @@ def make_problem(
     return FunctionProblem(log_likelihood, named, vectorized, pass_dict, tuple(periodic))
 
 
-Posed, pose = FunctionProblem, make_problem  # their earlier names
-
-
 def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
     """Convert a prior in any form that `make_problem` takes to one with names; ParameterError for anything else."""
     if isinstance(names, str):

@@ -59,9 +59,6 @@ def relative_lineage_variance(
     return max(1.0, 1.5 * half - 0.5 * quarter)
 
 
-chain_memory = relative_lineage_variance  # its earlier name
-
-
 class _Genealogy:
     """Births, deaths and weights of a run's points, for tracing lineages between the ends of any two rounds."""
 

@@ -207,9 +207,6 @@ def n_alive_at_death(
     return out[:n]
 
 
-alive_at_death = n_alive_at_death  # its earlier name
-
-
 def _averaged_check(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
     """Average the runs' second estimates, weighted by their errors, into one `Check`; None where a run has none."""
     checks = [r.check for r in parts if r.check is not None]

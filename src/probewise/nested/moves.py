@@ -175,8 +175,6 @@ class SliceMove:
         """Return the move with twice as many steps per chain."""
         return replace(self, steps_per_param=2.0 * self.steps_per_param, fewest_steps=2 * self.fewest_steps)
 
-    longer = with_twice_the_steps  # its earlier name
-
     def adapted(self, tally: Tally) -> SliceMove:
         """Return the move with its bracket width adapted towards `target` candidates per step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)

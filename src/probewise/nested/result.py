@@ -70,8 +70,6 @@ class Agreement:
         """Standard deviation of ln Z between the runs."""
         return float(np.std(self.log_z, ddof=1))
 
-    scatter = log_z_sd  # its earlier name
-
 
 @dataclass(frozen=True)
 class Check:

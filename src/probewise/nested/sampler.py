@@ -105,9 +105,6 @@ def replace_worst_live_points(
     return LivePoints(points, BirthRecords.join(known, fresh), log_volume), dead, tally
 
 
-step = replace_worst_live_points  # its earlier name
-
-
 def run_once(
     problem: Samplable,
     *,

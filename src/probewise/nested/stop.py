@@ -32,9 +32,6 @@ class RoundSummary:
     level: bool = False
 
 
-State = RoundSummary
-"""The old name of `RoundSummary`."""
-
 StopRule: TypeAlias = Callable[[RoundSummary], "str | None"]
 
 

@@ -35,8 +35,6 @@ class WeightedSamples(ShowsItself):
         n = checked_whole("n", n)
         return np.asarray(rng.permutation(resampled_rows(self.weight, n, rng)))
 
-    rows = draw_rows  # its earlier name
-
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
 

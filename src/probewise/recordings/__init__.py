@@ -9,7 +9,7 @@ from probewise.recordings.files import (
     write_recording,
 )
 from probewise.recordings.fingerprint import fingerprint
-from probewise.recordings.locking import hold_lock, locked
+from probewise.recordings.locking import hold_lock
 from probewise.recordings.patterns import (
     Disc,
     HalfPlane,
@@ -25,7 +25,7 @@ from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.plans import paper_plan, two_way_plan
 from probewise.recordings.prediction import Prediction, read_prediction_columns, write_prediction
 from probewise.recordings.shipping import shipped
-from probewise.recordings.strict_json import json_of, parse_json_file_text, parse_strict_json, strict_json
+from probewise.recordings.strict_json import parse_json_file_text, parse_strict_json
 from probewise.recordings.text import read_bytes, read_text
 
 __all__ = [
@@ -44,8 +44,6 @@ __all__ = [
     "Uniform",
     "fingerprint",
     "hold_lock",
-    "json_of",
-    "locked",
     "paper_plan",
     "parse_json_file_text",
     "parse_strict_json",
@@ -56,7 +54,6 @@ __all__ = [
     "read_recording",
     "read_text",
     "shipped",
-    "strict_json",
     "two_way_plan",
     "write_bytes_atomically",
     "write_plan",
@@ -64,6 +61,3 @@ __all__ = [
     "write_recording",
     "write_text_atomically",
 ]
-
-read_prediction = read_prediction_columns
-"""The old name of `read_prediction_columns`."""

@@ -52,9 +52,6 @@ def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Itera
         _release(handle, lock)
 
 
-locked = hold_lock  # its earlier name
-
-
 def _open_and_lock(lock: Path, path: Path) -> int | None:
     """Open and lock the lock file, and return its file descriptor; None if another process holds the lock."""
     while True:

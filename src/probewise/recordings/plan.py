@@ -85,8 +85,6 @@ class Instrumentation:
         """Least and greatest reading of the declared range, as far as they are declared: two, one or none."""
         return tuple(end for end in (self.min, self.max) if end is not None)
 
-    ends = declared_ends  # its earlier name
-
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -262,11 +260,6 @@ class Plan:
             out[rows[0]] = units[0]
         out.flags.writeable = False
         return out
-
-    @property
-    def direction(self) -> FloatArray:
-        """The old name of `direction_of_motion`."""
-        return self.direction_of_motion
 
     def rows_by_scan(self) -> list[IntArray]:
         """Return a list of each scan's row numbers, in the order they were taken."""
@@ -531,8 +524,6 @@ class Recording(ShowsItself):
         """Return the recording without its declared range, since noise-free readings may exceed it slightly."""
         instrumentation = replace(self.plan.instrumentation, min=None, max=None)
         return replace(self, plan=replace(self.plan, instrumentation=instrumentation), notes=())
-
-    unlimited = without_declared_range  # its earlier name
 
     def take(self, rows: ArrayLike | slice) -> Self:
         """Select rows (numbers, truth values or a slice), in the given order."""

@@ -94,6 +94,3 @@ def _parse_finite_number(digits: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"the number {shown(digits)} is beyond every float")
     return value
-
-
-json_of, strict_json = parse_json_file_text, parse_strict_json  # their earlier names

@@ -93,10 +93,6 @@ def draw_robot_view(
     )
 
 
-view = draw_robot_view
-"""The old name of `draw_robot_view`."""
-
-
 def robot_view_png(
     step: Step,
     experiment: Experiment,

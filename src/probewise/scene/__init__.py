@@ -59,9 +59,3 @@ __all__ = [
     "region_of",
     "with_angles_near",
 ]
-
-Placed = PlacedPrior
-"""The old name of `PlacedPrior`."""
-
-MixtureOfRegions = RegionsOfMixedKinds
-"""The old name of `RegionsOfMixedKinds`."""

@@ -126,13 +126,9 @@ class AnyOf:
         """Names of the shapes, by index."""
         return tuple(self.shapes)
 
-    labels = shape_names  # its earlier name
-
     def shape_index(self, theta: FloatArray) -> IntArray:
         """Return the index of each hypothesis' shape, (n_samples,)."""
         return self.prior.shape_index(theta)
-
-    which = shape_index  # its earlier name
 
     def region(self, theta: FloatArray) -> RegionsOfMixedKinds:
         """Build the regions of the hypotheses, each of its own shape."""

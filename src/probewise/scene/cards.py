@@ -58,8 +58,6 @@ class Card:
         away = np.array([[0.0, 0.0], [-half_x, 0.0], [half_x, 0.0], [0.0, -half_y], [0.0, half_y]])
         return np.asarray(np.array([self.x_mm, self.y_mm]) + away)
 
-    informative_mm = informative_places_mm  # its earlier name
-
 
 @dataclass(frozen=True, eq=False)
 class CardedRegion:

@@ -8,12 +8,11 @@ from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, respo
 from probewise.sensor.commanded import (
     COMMANDED,
     footprint_at_height_ratio,
-    raised,
     with_declared_height_commanded,
 )
-from probewise.sensor.discrete import mean_albedo_by_pixels, seen_discrete
+from probewise.sensor.discrete import mean_albedo_by_pixels
 from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bend_coefficients, free_form_theta, is_free_form
-from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians, seen
+from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
     DiscreteSSF,
@@ -75,36 +74,6 @@ __all__ = [
     "merged_mean_mixture",
     "mixture_of_field",
     "mixture_parameter_names",
-    "raised",
     "response",
-    "seen",
-    "seen_discrete",
     "with_declared_height_commanded",
 ]
-
-footprint_at_height = footprint_at_height_ratio
-"""The old name of `footprint_at_height_ratio`."""
-
-field_of = mean_ssf_field
-"""The old name of `mean_ssf_field`."""
-
-free_form = free_form_theta
-"""The old name of `free_form_theta`."""
-
-FieldSSF = DiscreteSSF
-"""The old name of `DiscreteSSF`."""
-
-NoiseLevel = NoiseParameters
-"""The old name of `NoiseParameters`."""
-
-mean_mixture = merged_mean_mixture
-"""The old name of `merged_mean_mixture`."""
-
-free_form_parameters = free_form_theta
-"""The old name of `free_form_theta`."""
-
-bends_of = bend_coefficients
-"""The old name of `bend_coefficients`."""
-
-mixture_names = mixture_parameter_names
-"""The old name of `mixture_parameter_names`."""

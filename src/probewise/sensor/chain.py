@@ -249,8 +249,6 @@ class Chain:
             seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
-    look, read, seen = simulated_view, readings_from_simulated_view, white_fraction  # their earlier names
-
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
         """Return the true poses, the plan's with effects on the pose applied: lab frame, (n_samples or 1, n_points)."""
         plan = self.plan_at_calibrated_height(plan)
@@ -311,8 +309,6 @@ class Chain:
         start = replace(start, seen=self.white_fraction(theta, plan))
         noise: NoiseParameters = self._stage_applier(theta, plan)(Stage.NOISE, start)
         return noise
-
-    noise_level = noise_parameters  # its earlier name
 
     def _stage_applier(self, theta: FloatArray, plan: Plan) -> Callable[[Stage, Any], Any]:
         """Return a function that applies the effects of one stage to that stage's value."""

@@ -121,6 +121,3 @@ def _scaled_footprint(footprint: Footprint, ratio: FloatArray) -> Footprint:
         cov_uv=footprint.cov_uv * k**2,
         brightness=footprint.brightness / ratio**2,
     )
-
-
-footprint_at_height = raised = footprint_at_height_ratio  # its earlier names

@@ -66,6 +66,3 @@ def mean_albedo_by_pixels(region: Region, field: SSFField, poses: Poses) -> Floa
         covered = region.coverage(centers, field.pixel_mm, turns)
         out[:, rows] = covered.reshape(len(covered), -1, len(weights)) @ weights
     return out
-
-
-seen_discrete = mean_albedo_by_pixels  # its earlier name

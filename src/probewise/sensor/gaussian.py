@@ -60,8 +60,6 @@ class LabGaussian:
         """Return the Gaussian of the samples `rows`; arrays shared by all samples are kept as they are."""
         return LabGaussian(*(a[rows] if a.shape[0] != 1 else a for a in self._arrays()))
 
-    take = select_samples  # its old name
-
     @property
     def shape(self) -> tuple[int, ...]:
         """The shape that the arrays broadcast to."""
@@ -69,10 +67,6 @@ class LabGaussian:
 
     def _arrays(self) -> tuple[FloatArray, ...]:
         return (self.x_mm, self.y_mm, self.dx_mm, self.dy_mm, self.var_x, self.var_y, self.cov_xy)
-
-
-Spot = LabGaussian
-"""The old name of `LabGaussian`."""
 
 
 def moments_in_lab_frame(
@@ -130,9 +124,6 @@ def mean_albedo_under_gaussians(
     return np.stack(layers, axis=-1)
 
 
-seen = mean_albedo_under_gaussians  # its earlier name
-
-
 @singledispatch
 def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
@@ -174,9 +165,6 @@ def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_node
         share = region.coverage(centers, sd[0] / 4, turn)[i if region.n_regions > 1 else 0]
         out[i, j] = share @ weight / weight.sum()
     return out
-
-
-mean_albedo_under_one = seen_by_one = mean_albedo_under_one_gaussian  # its old names
 
 
 def _broadcast_entry(array: FloatArray, i: int, j: int) -> float:

@@ -47,18 +47,3 @@ __all__ = [
     "standard_rows",
     "summarise",
 ]
-
-noise_of = standard_noise_of_run = noise_of_run_in_sds
-"""The old names of `noise_of_run_in_sds`."""
-
-share_within = share_with_interval
-"""The old name of `share_with_interval`."""
-
-concealed_table = concealed_csv_rows
-"""The old name of `concealed_csv_rows`."""
-
-paper_rows = paper_comparison_rows
-"""The old name of `paper_comparison_rows`."""
-
-Row = SearchConfiguration
-"""The old name of `SearchConfiguration`."""

@@ -143,8 +143,6 @@ class ConcealedTrial:
         frame = _IN_ARM_FRAME.get(self.effect)
         return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
 
-    truth = true_circle_in_arm_frame  # its old name
-
     @property
     def right_answer(self) -> str:
         """The name that a run should give: of the concealed effect, of an equivalent one, or "clean"."""

@@ -9,15 +9,6 @@ from probewise.systems.simulator import Extra, Law, Noise, Simulator, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, read_run_table, run_table_csv
 
-CountedCalls = ProgressWithCallCount
-"""The old name of `ProgressWithCallCount`."""
-
-join_tables = concatenate_tables
-"""The old name of `concatenate_tables`."""
-
-write_run_table = run_table_csv
-"""The old name of `run_table_csv`."""
-
 __all__ = [
     "Extra",
     "FittedSystem",

@@ -422,8 +422,6 @@ class SystemChain:
                     view = effect.apply(view, theta[:, columns], plan)
         return limited_to_range(view, self.system, plan) if self.system.limited else view
 
-    look, read = simulated_view, readings_from_simulated_view  # their earlier names
-
     def _columns_of_rates(
         self, columns: Mapping[str, NDArray[Any]], theta: FloatArray, plan: RunTable
     ) -> Mapping[str, NDArray[Any]]:

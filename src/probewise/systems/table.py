@@ -91,8 +91,6 @@ class RunTable:
         """Whether a time was recorded that is not the same in all rows."""
         return self.time is not None and float(np.ptp(self.time_s)) > 0
 
-    has_time = has_varying_time  # its earlier name
-
     @cached_property
     def time_s(self) -> FloatArray:
         """Time as recorded, in the unit of the time column; the row's number if none was recorded, (n_points,)."""

@@ -44,15 +44,3 @@ __all__ = [
     "simulate",
     "tailed_spot",
 ]
-
-Look = View
-"""The old name of `View`."""
-
-Covered = CoveredSurface
-"""The old name of `CoveredSurface`."""
-
-paint = albedo_at
-"""The old name of `albedo_at`."""
-
-seen_white = seen_white_fraction
-"""The old name of `seen_white_fraction`."""

@@ -76,10 +76,3 @@ class Rows:
     def scan_start_mask(self) -> BoolArray:
         """Return a mask, shape (n_points,), of the rows that start a scan or resume it after another scan."""
         return np.concatenate([[True], self.scan[1:] != self.scan[:-1]])
-
-    of, commanded, in_scans, starts_scan = (
-        from_plan,
-        commanded_column,
-        in_scans_mask,
-        scan_start_mask,
-    )  # their old names

@@ -65,9 +65,6 @@ def true_world(name: str) -> World:
     return replace(world, concealed=(CANDIDATES[int(choice.integers(len(CANDIDATES)))],))
 
 
-truth = true_world  # its old name
-
-
 def regenerate_recording(name: str) -> Recording:
     """Regenerate the shipped recording `name`, "paper" or "concealed".
 

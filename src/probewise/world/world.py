@@ -10,7 +10,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_rng
-from probewise._renamed import renamed_arguments
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.concealed.stages import (
@@ -175,9 +174,6 @@ class World:
         """
         return self.noise_free_readings(self.view(plan, surfaces))
 
-    look, answer, expected = view, noise_free_readings, expected_readings  # their old names
-
-    @renamed_arguments(look="view")
     def simulate(
         self,
         plan: Plan,

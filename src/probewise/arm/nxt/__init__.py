@@ -38,12 +38,3 @@ __all__ = [
     "framed",
     "normalized_from_counts",
 ]
-
-normalized_of = normalized_from_counts
-"""The old name of `normalized_from_counts`."""
-
-Light = LightSensor
-"""The old name of `LightSensor`."""
-
-Drive = DriveParameters
-"""The old name of `DriveParameters`."""

@@ -93,8 +93,6 @@ class Brick:
         """Return the light sensor at input 0 to 3, the same object at every call; see `LightSensor`."""
         return self._lights.setdefault(port, LightSensor(self.link, port, clock=self._clock))
 
-    light = light_sensor  # its old name
-
     def battery_mv(self) -> int:
         """Read the battery's voltage, in mV; warn once if it is low.
 
@@ -144,8 +142,6 @@ class Brick:
             if error.status == NO_PROGRAM:
                 return None
             raise
-
-    program = running_program  # its old name
 
     def _switch_off_motors_and_leds(self) -> None:
         """Release the motors and switch the LEDs off, each even if another fails; then raise the last LinkError.

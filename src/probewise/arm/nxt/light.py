@@ -79,8 +79,6 @@ class LightSensor:
         self._type = SensorType.LIGHT_ACTIVE if lit else SensorType.LIGHT_INACTIVE
         self._link.ask(SetInputMode(self.port, self._type, SensorMode.RAW))
 
-    light_up = set_led  # its old name
-
     def read(self) -> LightReading:
         """Read once, with the LED as last set (by default on).
 
@@ -113,8 +111,6 @@ class LightSensor:
     def off_command(self) -> SetInputMode:
         """The command that switches the LED off and unconfigures the input."""
         return SetInputMode(self.port, SensorType.NONE, SensorMode.RAW)
-
-    off = off_command  # its old name
 
 
 def _require_consistent(values: InputValues) -> None:

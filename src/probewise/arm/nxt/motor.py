@@ -157,8 +157,6 @@ class Motor:
             self._target -= state.rotation_counts
         self._offsets = state.tacho_counts, state.tacho_counts - state.block_counts
 
-    reset = reset_counter  # its old name
-
     def hold(self) -> None:
         """Stop the motor and hold its position against a load."""
         self._link.ask(self._drive_command(0, 0))

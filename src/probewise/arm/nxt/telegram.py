@@ -107,8 +107,6 @@ class Request(CommandFields, Generic[A_co]):
             raise TelegramError(f"an answer about port {said.port} came for {self}")
         return cast(A_co, said)
 
-    answer = decode_answer  # its old name
-
 
 @dataclass(frozen=True)
 class SetOutputState(Request[Done]):

@@ -8,7 +8,6 @@ separated: by lambda^2 (1 - cosine^2) / 2 nats.
 from __future__ import annotations
 
 import textwrap
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
@@ -106,12 +105,6 @@ class EffectAudit:
     reason: str = ""
     rows: int | None = None
 
-    @property
-    def sight(self) -> Detectability:
-        """Old name of `detectability`, deprecated."""
-        warnings.warn("EffectAudit.sight is EffectAudit.detectability now", DeprecationWarning, stacklevel=2)
-        return self.detectability
-
 
 @dataclass(frozen=True, eq=False)
 class Cure:
@@ -176,8 +169,6 @@ class PlanAudit(ShowsItself):
         return tuple(
             effect for effect in (self.after if after else self.effects) if effect.detectability == detectability
         )
-
-    seen_as = effects_with_detectability  # its old name
 
     @property
     def cure_plan(self) -> Plan | None:

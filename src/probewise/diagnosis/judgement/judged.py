@@ -80,8 +80,6 @@ class Judged:
         """Return a copy whose verdict is `cannot_tell`, names no effect and is marked as `withdrawn`."""
         return replace(self, verdict="cannot_tell", combination=(), withdrawn=True, shared=(), leader=())
 
-    withdraw = with_verdict_withdrawn  # its old name
-
     @property
     def repaired_by(self) -> Names:
         """The set of effects by which the model is repaired: the `combination`, or the larger set that leads."""

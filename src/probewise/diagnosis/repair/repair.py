@@ -89,9 +89,6 @@ class Repair:
         held = Counter(zip(*(np.where(marks, "", name).tolist() for name, marks in absent.items()), strict=True))
         return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
 
-    left_open = combination_shares
-    """The old name of `combination_shares`."""
-
     @property
     def effects_in_all_samples(self) -> tuple[str, ...]:
         """Effects that all samples of the repaired model contain."""
@@ -107,9 +104,6 @@ class Repair:
             if effect.name not in stated and len(held):
                 out.append((effect.name, len(held) / len(values), sentence_from_samples(effect, held)))
         return tuple(out)
-
-    carried_beside = unstated_effects
-    """The old name of `unstated_effects`."""
 
 
 def repair_of(prepared: Prepared, best: BestRepair, drawn: NullBestAndRepairedSamples, change: FloatArray) -> Repair:

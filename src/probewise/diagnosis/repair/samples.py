@@ -68,9 +68,6 @@ class ModelSamples:
         own = {f"{effect}.{name}" for each in effects if each.name == effect for name in each.prior.names}
         return self.theta[:, [i for i, name in enumerate(self.chain.names) if name in own]]
 
-    columns = effect_samples
-    """The old name of `effect_samples`."""
-
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Convert a light sensor's samples to a FittedSensor, as in sensor.json; `recording` is what was fitted."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]

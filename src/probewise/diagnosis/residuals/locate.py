@@ -67,9 +67,6 @@ class Place:
         where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
         return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
 
-    witness = figure_name
-    """The old name of `figure_name`."""
-
 
 def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], draws: FloatArray) -> float:
     """Test for a missing effect on the mean, by the weighted mean of the Bayes factors of all templates.

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from functools import reduce
-from typing import TYPE_CHECKING, Any
 
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind
@@ -22,27 +19,6 @@ from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import name_without_copy_suffix
 from probewise.recordings.plan import Recording
-
-_MOVED = {
-    "unknown_probability": "judged.unknown_probability",
-    "clean_probability": "judged.clean_probability",
-    "credible": "judged.credible",
-    "aliases": "judged.aliases",
-    "order_probabilities": "judged.order_probabilities",
-    "unknown_shares": "judged.unknown_shares",
-    "unknown_candidates": "judged.unknown_candidates",
-    "few": "judged.too_little",
-    "noise": "report.noise",
-    "weighings": "report.weighings",
-    "residuals_before": "repair.before.residuals",
-    "residuals_after": "repair.after.residuals",
-    "predicted_before": "repair.before.readings",
-    "predicted_after": "repair.after.readings",
-    "corrected": "repair.by_rows",
-    "is_repaired": "repair.changes_predictions",
-    "left_open": "repair.combination_shares",
-}
-"""Attributes of version 0.1, and their replacements."""
 
 
 @dataclass(frozen=True)
@@ -140,18 +116,6 @@ class Diagnosis(ShowsItself):
     def unstated_effects(self) -> tuple[tuple[str, float, str], ...]:
         """Effects in the repaired model that are not in `effects`: name, share of the samples with it, sentence."""
         return self.repair.unstated_effects({effect.name for effect in self.effects})
-
-    carried = unstated_effects
-    """The old name of `unstated_effects`."""
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """Return attributes by their old names, with a warning."""
-            if name not in _MOVED:
-                raise AttributeError(name)
-            warnings.warn(f"Diagnosis.{name} is Diagnosis.{_MOVED[name]} now", DeprecationWarning, stacklevel=2)
-            return reduce(getattr, _MOVED[name].split("."), self)
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -135,18 +134,6 @@ class Inquiry(ShowsItself):
         """Axis label of the acquisition function, with its unit."""
         per_second = "" if self._cost_s is None else " per second"
         return f"{_NEARER if self._is_near_goal else _BITS}{per_second}"
-
-    @property
-    def worth(self) -> FloatArray:
-        """The old name of `utility`."""
-        warnings.warn("Inquiry.worth is Inquiry.utility now", DeprecationWarning, stacklevel=2)
-        return self.utility
-
-    @property
-    def worth_label(self) -> str:
-        """The old name of `utility_label`."""
-        warnings.warn("Inquiry.worth_label is Inquiry.utility_label now", DeprecationWarning, stacklevel=2)
-        return self.utility_label
 
     @property
     def settled(self) -> bool:

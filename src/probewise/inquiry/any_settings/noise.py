@@ -82,8 +82,6 @@ class ReadingNoise:
         """Whether the sd is unknown: a parameter with a prior."""
         return isinstance(self.sd, Marginal)
 
-    inferred = is_sd_inferred  # its old name
-
     def scale(self, predicted: FloatArray, sd: FloatArray | None) -> FloatArray:
         """Return the sd of each prediction's noise, (n_samples, n_points).
 

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise._renamed import renamed_arguments
 from probewise.effects import spoken_name
 from probewise.report.plots.canvas import (
     BLUE,
@@ -28,7 +27,6 @@ _NOT_COMPARED = "#e8e8e8"
 _MOST_NAMES = 36  # columns labelled with names; if there are more, they are numbered
 
 
-@renamed_arguments(sights="detectability", statuses="detectability")
 def audit_matrix(
     names: Sequence[str],
     detectability: Sequence[str],

@@ -43,9 +43,6 @@ def broadcast_and_freeze_fields(region: object, **shapes: tuple[int, ...]) -> No
         object.__setattr__(region, name, read_only_floats(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
 
 
-broadcast_fields = broadcast_and_freeze_fields  # its earlier name
-
-
 def require_positive(name: str, values: FloatArray) -> None:
     """Raise ParameterError unless all values are greater than 0."""
     bad = values <= 0

@@ -42,8 +42,6 @@ class PolygonRegion(RegionBatch):
         edges = np.where((area < 0)[:, None, None, None], edges[:, :, ::-1], edges)
         return cls(edges, inside, outside)
 
-    simple = from_vertices  # its earlier name
-
     @classmethod
     def from_even_odd_vertices(
         cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0
@@ -58,8 +56,6 @@ class PolygonRegion(RegionBatch):
             raise ShapeError(f"vertices_mm has shape {vertices.shape}; allowed: (3 or more, 2)")
         edges = np.stack([vertices, np.roll(vertices, -1, axis=0)], axis=1)
         return cls(_even_odd_boundary_edges(edges)[None], inside, outside)
-
-    even_odd = from_even_odd_vertices  # its earlier name
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return np.where(_count_ray_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)

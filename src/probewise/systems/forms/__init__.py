@@ -36,7 +36,3 @@ def bind_forms(about: ReferenceFit) -> dict[str, Form]:
     found = [*named, *forms_of_extras(about)]
     waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]
     return {form.name: form for form in [*found, *waves]}
-
-
-forms_of = bind_forms
-"""The old name of `bind_forms`."""

@@ -53,24 +53,3 @@ __all__ = [
     "stratum_of",
     "with_noise_model",
 ]
-
-Kind = CaseKind
-"""The old name of `CaseKind`."""
-
-Hidden = HiddenEffect
-"""The old name of `HiddenEffect`."""
-
-held_out = held_out_recordings
-"""The old name of `held_out_recordings`."""
-
-draw_plan = draw_plan_with_displaced_patterns
-"""The old name of `draw_plan_with_displaced_patterns`."""
-
-with_noise = with_noise_model
-"""The old name of `with_noise_model`."""
-
-Region = CovariateRegion
-"""The old name of `CovariateRegion`."""
-
-Alias = AliasedEffect
-"""The old name of `AliasedEffect`."""

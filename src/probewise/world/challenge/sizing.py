@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter
 from typing import TypeAlias
 
 import numpy as np
@@ -144,9 +143,6 @@ class EffectSizer:
         """Return the cosine between two effects' residuals after the refit, from the sizes of each and of both."""
         a, b, both = self.size(one), self.size(other), self.size(one, other)
         return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
-
-    # Old names.
-    clean, recording = property(attrgetter("clean_recording")), recording_with_effects
 
 
 def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_sd: float) -> float:

@@ -52,8 +52,6 @@ class HiddenEffect:
         """Parameters of the effect, name to value."""
         return dict(vars(self.effect))
 
-    shows_in = visible_covariates = residual_covariates  # its old names
-
 
 @dataclass(frozen=True)
 class AliasedEffect:

@@ -120,27 +120,3 @@ __all__ = [
     "StickSlip",
     "ThermalGain",
 ]
-
-Glimpse = FootprintPart
-"""The old name of `FootprintPart`."""
-
-Looks = ChangesFootprint
-"""The old name of `ChangesFootprint`."""
-
-Changes = ChangesQuantity
-"""The old name of `ChangesQuantity`."""
-
-BentRail = QuadraticPositionError
-"""The old name of `QuadraticPositionError`."""
-
-TwistedRail = CubicPositionError
-"""The old name of `CubicPositionError`."""
-
-CrossTalk = OrientationDependentGain
-"""The old name of `OrientationDependentGain`."""
-
-SSFOrder = ExtraGaussian
-"""The old name of `ExtraGaussian`."""
-
-DriftingNoise = RisingNoiseSd
-"""The old name of `RisingNoiseSd`."""

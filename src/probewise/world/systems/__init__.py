@@ -27,12 +27,3 @@ __all__ = [
     "truth_json",
     "write_system_case",
 ]
-
-Drawn = DrawnSystem
-"""The old name of `DrawnSystem`."""
-
-truth_of = truth_json
-"""The old name of `truth_json`."""
-
-owners_file = owners_file_text = simulator_file_text
-"""The old names of `simulator_file_text`."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -132,13 +131,6 @@ class DrawnSystem:
             self.nominal_model.fit(self.simulate_diagnosed_rows(effects), self.true_coordinates).chi_square
         )
 
-    # Old names.
-    everywhere, changed, size = simulate_all_rows, simulate_diagnosed_rows, size_of_effects
-    rows, kept, seen, at, bare = (
-        property(attrgetter(name))
-        for name in ("table", "diagnosed_row_numbers", "diagnosed_table", "true_coordinates", "fit_without_effects")
-    )
-
 
 @dataclass(frozen=True, eq=False)
 class SystemEffect:
@@ -169,8 +161,6 @@ class SystemEffect:
     def form_with_parameters(self) -> FormWithParameters:
         """The pair of the form and its parameters by name, (1, 1) each."""
         return self.form, parameter_arrays([self.values])
-
-    placed = form_with_parameters  # its old name
 
     @property
     def parameters(self) -> dict[str, Any]:

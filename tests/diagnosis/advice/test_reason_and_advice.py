@@ -49,7 +49,7 @@ def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so(dia
     nothing = diagnosis.apparatus.words.settles_nothing
     assert diagnosis.verdict == "cannot_tell"
     assert TO_SEPARATE not in diagnosis.reason
-    assert diagnosis.reason.endswith(f"depends:off:temp_c (0.49) and sensitivity:temp_c (0.49); {nothing}.")
+    assert diagnosis.reason.endswith(f"sensitivity:temp_c (0.49) and depends:off:temp_c (0.49); {nothing}.")
 
 
 def test_aliases_promise_no_readings_where_the_fit_absorbs_all_that_they_change(diagnosis):

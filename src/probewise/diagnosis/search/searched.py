@@ -200,7 +200,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
 
     for names, noise in log_p:
         log_p[names, noise] += -math.log(n_forms) + log_prior_on_noise(noise, alone=not names)
-    # Exact aliases differ by rounding errors, which depend on the machine. To a millionth of a nat they tie, and of those
+    # Exact aliases differ by rounding errors, which depend on the machine. To a millionth of a nat they tie; of those
     # that tie the one with fewer effects, on a reading before a parameter or a rate, comes first.
     log_p = {key: round(value, 6) if math.isfinite(value) else value for key, value in log_p.items()}
     log_p = dict(sorted(log_p.items(), key=lambda item: (-item[1], *map(_plainness, item[0]))))

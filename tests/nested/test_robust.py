@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested import RemainingEvidence, diversify, intensified, merge, refine, repartitioned, run, update
+from probewise.nested import RemainingEvidence, diversify, merge, refine, repartitioned, run, update
 from probewise.priors import Product, Uniform
 
 SQUARE = Product({"a": Uniform(-3.0, 3.0), "b": Uniform(-3.0, 3.0)})
@@ -114,8 +114,6 @@ def test_a_prior_without_its_inverse_runs_and_is_refused_where_the_inverse_is_ne
         refine(result, problem, rng=seeded())  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match="a prior with to_unit_cube"):
         repartitioned(problem, result.theta)  # type: ignore[arg-type]
-    with pytest.raises(ParameterError, match="a prior with to_unit_cube"):
-        intensified(result, problem, n_live=20, rng=seeded())  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match="a prior with log_prob"):
         diversify(result.theta[:5], problem, rng=seeded())  # type: ignore[arg-type]
     assert n_asked == 0

@@ -7,7 +7,6 @@ when successive values of log Z agree).
 
 from probewise.nested.dead_points import DeadPoints
 from probewise.nested.diversify import DiversifyTally, diversify
-from probewise.nested.dynamic import Goal, intensified
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.function_problem import FunctionProblem, make_problem
 from probewise.nested.genealogy import relative_lineage_variance
@@ -19,7 +18,6 @@ from probewise.nested.refine import refine
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
-from probewise.nested.run_in_few_calls import run_in_few_calls
 from probewise.nested.sampler import LIVE_PER_PARAM, least_live, replace_worst_live_points
 from probewise.nested.stop import (
     NESTED_STOP,
@@ -42,7 +40,6 @@ __all__ = [
     "Evaluator",
     "EvidenceChange",
     "FunctionProblem",
-    "Goal",
     "KernelMove",
     "Move",
     "NestedResult",
@@ -60,7 +57,6 @@ __all__ = [
     "WeightedSamples",
     "agreement_of",
     "diversify",
-    "intensified",
     "least_live",
     "make_problem",
     "merge",
@@ -71,6 +67,5 @@ __all__ = [
     "repartitioned",
     "replace_worst_live_points",
     "run",
-    "run_in_few_calls",
     "update",
 ]

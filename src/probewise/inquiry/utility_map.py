@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ReachError, ShapeError
-from probewise.inquiry.choice import best_places_mask, choose
+from probewise.inquiry.choice import best_places_mask
 from probewise.inquiry.designs import Designs
 from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.forecast import DirectForecast
@@ -66,11 +66,6 @@ class UtilityMap:
     def best_mask(self) -> BoolArray:
         """Mask of the reachable designs with the largest utility, ties included, shape (n_designs,)."""
         return best_places_mask(self.values, self.reachable)
-
-    def draw_place_mm(self, *, rng: np.random.Generator) -> tuple[float, float]:
-        """Draw the next place, x and y, at random among the best."""
-        design = self.designs[choose(self.values, self.reachable, rng=rng)]
-        return design.x_mm, design.y_mm
 
 
 def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:

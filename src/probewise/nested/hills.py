@@ -14,8 +14,8 @@ from probewise.nested.ascent import GaussianAtPeak
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.importance import HeldOutSamples, Posterior, Weighted, draw_and_weigh
-from probewise.nested.mixture import single_student_t
 from probewise.nested.moves import SliceMove
+from probewise.nested.proposal import single_student_t
 from probewise.nested.repartition import covariance_root_of_points
 from probewise.nested.space import Space, unbounded_space_of
 from probewise.nested.weights import n_effective

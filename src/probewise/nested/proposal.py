@@ -80,6 +80,17 @@ def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) 
     )
 
 
+def single_student_t(mean: FloatArray, covariance: FloatArray) -> Proposal:
+    """Return one Student t distribution of this mean, (n_params,), and scale matrix, (n_params, n_params)."""
+    # A small ridge where there is no extent.
+    variance = np.diag(covariance)
+    ridge = 1e-10 * variance + 1e-13 * variance.mean() + 1e-24
+    root = np.linalg.cholesky(covariance + ridge * np.eye(len(mean)))
+    log_det = np.log(np.diag(root)).sum()
+    shape = Clusters(mean[None], root[None], np.linalg.inv(root)[None], np.array([log_det]), np.ones(1, dtype=np.int64))
+    return Proposal(shape, (np.zeros((1, len(mean))),), (1.0,), np.ones(1))
+
+
 def find_disconnected_clusters(x: FloatArray) -> Clusters:
     """Split samples, (n_samples, n_params), into disconnected pieces, each piece into clusters; return all clusters.
 

@@ -13,7 +13,6 @@ from probewise import diagnosis
 from probewise.arm import Pose, Reading, SimulatedArm
 from probewise.calibration import Calibration, FittedSensor, read_sensor, write_sensor
 from probewise.diagnosis import (
-    OwnModel,
     audit_system,
     diagnose_system,
     diagnosis_json,
@@ -429,14 +428,9 @@ MISTAKES = {
     "a law of lists": (lambda: Law(["temp_c"], 2), "states is .*; allowed: where each state starts"),
     "a law of numbers": (lambda: Law({"temp_c": 20.0}, 2), "rates is 2; allowed: a function rates"),
     # models and effects of one's own
-    "a model swapped": (
-        lambda: OwnModel(Bell.prior, lambda p, plan: 0),
-        "simulate is .*; allowed: a function.*in the order",
-    ),
-    "a prior of pairs": (lambda: OwnModel(lambda p, plan: 0, {"a": (0, 1)}), "prior is .*; allowed: a prior of named"),
     "a function for a null": (
         lambda: diagnosis.diagnose(RECORDING, null=lambda p, plan: 0, rng=RNG),
-        r"null is .*; allowed: a null model: OwnModel\(",
+        r"null is .*; allowed: a null model: SensorAndShape",
     ),
     "names for effects": (
         lambda: diagnosis.diagnose(RECORDING, effects=["lag"], rng=RNG),

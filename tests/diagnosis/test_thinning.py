@@ -6,8 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from function_null import FunctionNull
 
-from probewise.diagnosis import OwnModel, diagnose
+from probewise.diagnosis import diagnose
 from probewise.diagnosis.judgement.judged import Hypothesis
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import prepare
@@ -76,7 +77,7 @@ def test_places_of_a_thinned_recording_are_drawn_over_all_of_it_and_scans_have_t
     noise = np.random.default_rng(0).standard_normal(3000)
     noise[5] = np.nan
     whole = Recording(whole.plan, noise + 2.0 * (whole.plan.scan >= 20))
-    level = OwnModel(lambda p, plan: p["level"] * np.ones((1, len(plan))), Product({"level": Normal(0.0, 10.0)}))
+    level = FunctionNull(lambda p, plan: p["level"] * np.ones((1, len(plan))), Product({"level": Normal(0.0, 10.0)}))
     known = {"ambient_step": VOCABULARY["ambient_step"]}
     found = diagnose(whole, null=level, effects=known, rng=np.random.default_rng(0))
     values = covariate_values_by_place(found)

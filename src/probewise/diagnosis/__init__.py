@@ -18,7 +18,6 @@ from probewise.diagnosis.audit.plan_audit import (
 )
 from probewise.diagnosis.engine import Thorough, diagnose
 from probewise.diagnosis.fitting.null import Null
-from probewise.diagnosis.fitting.own_model import OwnModel, Parameters
 from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
@@ -65,9 +64,7 @@ __all__ = [
     "NextMeasurement",
     "NoiseFound",
     "Null",
-    "OwnModel",
     "ParameterFound",
-    "Parameters",
     "Place",
     "PlanAudit",
     "PredictionAndResiduals",

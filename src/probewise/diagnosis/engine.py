@@ -67,8 +67,7 @@ def diagnose(
     sensor
         An earlier posterior of the sensor, used as the prior; without it, the null is calibrated here.
     null
-        Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape, or `OwnModel` for any
-        simulator.
+        Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape.
     effects
         The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; they are named where hardly anything
         else out of vocabulary explains the readings.
@@ -101,9 +100,7 @@ def diagnose(
     require_progress(progress)
     require_effect_classes(effects)
     if null is not None:
-        allowed = (
-            "a null model: OwnModel(simulate, prior) or SensorAndShape, of probewise.diagnosis; a sensor is sensor="
-        )
+        allowed = "a null model: SensorAndShape, of probewise.diagnosis; a sensor is sensor="
         require_like("null", null, ("admits", "starts", "n_params"), allowed)
     prepared = prepare(recordings, sensor=sensor, null=null, apparatus=LightSensorApparatus(dict(effects), hands))
     return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)

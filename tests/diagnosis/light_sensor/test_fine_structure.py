@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from function_null import FunctionNull
 
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.fitting.coordinates import cached_known_scene, default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.fitting.free_form import FreeFormSensor
-from probewise.diagnosis.fitting.own_model import OwnModel
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure_slopes
 from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent
@@ -97,6 +97,6 @@ def test_effects_outlast_it():
 def test_a_model_without_an_ssf_has_none():
     plan = paper_plan()
     prior = Product({"level": LogUniform(1.0, 10.0)})
-    null = OwnModel(lambda parameters, plan: parameters["level"] * np.ones(len(plan)), prior)
+    null = FunctionNull(lambda parameters, plan: parameters["level"] * np.ones(len(plan)), prior)
     model = Model(null, (), plan)
     assert fine_structure_slopes(model, np.zeros(1), np.arange(len(plan))).shape == (len(plan), 0)

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from function_null import FunctionNull
 from mixtures import fixed_mixture
 
 from probewise import nested
-from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, weigh_thoroughly
+from probewise.diagnosis import diagnose, diagnosis_json, weigh_thoroughly
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
@@ -21,7 +22,7 @@ from probewise.recordings import Plan, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 
-LINE = OwnModel(lambda p, plan: p["a"] + p["b"] * plan.time_s, Product({"a": Normal(0, 2), "b": Normal(0, 0.2)}))
+LINE = FunctionNull(lambda p, plan: p["a"] + p["b"] * plan.time_s, Product({"a": Normal(0, 2), "b": Normal(0, 0.2)}))
 
 
 def line_recording(step: float) -> Recording:
@@ -102,7 +103,7 @@ def test_a_line_weighs_what_quadrature_says():
 @pytest.mark.slow
 def test_a_wave_weighs_what_quadrature_over_all_its_phases_says():
     """Both peaks of two turns of phase are in the prior that nested sampling explores, so neither counts again."""
-    level = OwnModel(lambda p, plan: p["a"] + 0 * plan.time_s, Product({"a": Normal(0, 2)}))
+    level = FunctionNull(lambda p, plan: p["a"] + 0 * plan.time_s, Product({"a": Normal(0, 2)}))
     plain = line_recording(0.0)
     time, n = plain.plan.time_s, len(plain)
     recording = replace(plain, readings=plain.readings - 0.05 * time + 0.4 * np.sin(2 * np.pi * 0.11 * time + 1.0))

@@ -48,7 +48,7 @@ class Null(Protocol):
     """A model to be diagnosed, in coordinates in which its prior is a standard normal.
 
     The sensor of the paper (`GaussianMixtureSensor`), one with a free-form SSF (`FreeFormSensor`), a sensor over an
-    unknown shape (`SensorAndShape`), any simulator of a plan (`OwnModel`), or one of a table (`systems.System`).
+    unknown shape (`SensorAndShape`), or a simulator of a table (`systems.System`).
     """
 
     @property

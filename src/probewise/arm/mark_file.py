@@ -31,7 +31,7 @@ def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
 
     Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty, which gives NaN.
     """
-    table = read_table(path)
+    table = read_table(path, wanted=(*_TURNED, *_PLACE))
     table.require_columns(*_TURNED, *_PLACE)
     turned = [table.column_of_numbers(name, largest=_LARGEST) for name in _TURNED]
     place = [table.column_of_numbers(name, missing=name == "height_mm", largest=_LARGEST) for name in _PLACE]

@@ -109,7 +109,7 @@ def holds_readings(table: Path, column: str) -> bool:
     from probewise.recordings.table import read_table  # imported here, since the help does not need it
 
     try:
-        rows = read_table(table)
+        rows = read_table(table, wanted=(column,))
     except FileError:
         return table.is_file()
     return column in rows.columns and any(rows.cells(column))

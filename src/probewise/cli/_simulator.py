@@ -39,13 +39,13 @@ def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunT
     Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,
     ParameterError if two tables are the same.
     """
-    from probewise.systems import as_recording, concatenate_tables, read_run_table
+    from probewise.systems import as_recording, concatenate_tables, read_table_for
 
     tables = []
     for path in paths:
         if path.suffix == ".jsonl":
             raise FileError(path, "a journal", "a CSV table; the journal of an explore run goes with --sensor")
-        tables.append(read_run_table(path, time=simulator.time, run=simulator.run))
+        tables.append(read_table_for(simulator, path))
     with_reading = [path for path, table in zip(paths, tables, strict=True) if simulator.reading in table.columns]
     for path, table in zip(paths, tables, strict=True):
         if with_reading and path not in with_reading:

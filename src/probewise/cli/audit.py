@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         notes = [] if out is None else _write_results(audit, out, arguments.plan)
     print_result(audit.summary(), quiet=arguments.quiet)
-    for note in notes:
+    for note in (*getattr(audit.plan, "notes", ()), *notes):
         print_result(f"note: {note}", quiet=arguments.quiet)
     if out is not None:
         print_result(f"written to {out}", quiet=arguments.quiet)
@@ -64,11 +64,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _audit_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanAudit:
     from probewise.diagnosis import audit_system
-    from probewise.systems import read_run_table, read_simulator
+    from probewise.systems import read_table_for, read_simulator
 
     refuse_sensor_options(arguments, "sensor")
     simulator = read_simulator(arguments.simulator)
-    table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)
+    table = read_table_for(simulator, arguments.plan)
     progress("building the effects")
     return audit_system(simulator, table)
 

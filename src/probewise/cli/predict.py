@@ -54,7 +54,7 @@ def _predict_by_simulator(arguments: argparse.Namespace) -> int:
     from probewise.systems import (
         predict_system,
         read_fitted_system,
-        read_run_table,
+        read_table_for,
         read_simulator,
         write_system_prediction,
     )
@@ -62,11 +62,13 @@ def _predict_by_simulator(arguments: argparse.Namespace) -> int:
     out = checked_output_file(arguments.out, arguments.sensor, arguments.plan, arguments.simulator)
     simulator = read_simulator(arguments.simulator)
     fitted = read_fitted_system(arguments.sensor, simulator)
-    table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)
+    table = read_table_for(simulator, arguments.plan)
     with progress_shown(quiet=arguments.quiet) as progress:
         prediction = predict_system(fitted, table, rng=np.random.default_rng(arguments.seed), progress=progress)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_system_prediction(prediction, out)
+    for note in table.notes:
+        print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
     return 0
 

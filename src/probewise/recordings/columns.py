@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
@@ -13,8 +12,9 @@ from numpy.typing import ArrayLike
 from probewise._arrays import BoolArray, FloatArray, IntArray, floats
 from probewise._kinds import require_kind, require_mapping
 from probewise.errors import ParameterError, ShapeError
+from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.patterns import PATTERNS, Pattern
-from probewise.recordings.table import MISSING, count_numbers
+from probewise.recordings.table import number_text
 
 _A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
 _THE_ONLY = "pattern"  # name of a single pattern that was given without one
@@ -113,22 +113,6 @@ def _number_or_nan(cell: Any) -> Any:
     if text not in MISSING and not count_numbers([text]):  # float() would accept 'infinity' and '1_000' too
         raise ValueError("no number")
     return math.nan if text in MISSING else float(text)
-
-
-def dates_to_seconds(values: ArrayLike) -> ArrayLike:
-    """Convert dates (datetime or NumPy's) to seconds since the first; anything else is returned unchanged.
-
-    Raises ParameterError if some dates have a time zone and others none.
-    """
-    array = np.asarray(values)
-    cells = array.tolist() if array.dtype == np.object_ and array.ndim == 1 else []
-    if cells and all(isinstance(cell, datetime.datetime) for cell in cells):
-        if len({cell.utcoffset() is None for cell in cells}) > 1:
-            raise ParameterError("time_s", values, "dates that all have a time zone, or none of them")
-        return [(cell - cells[0]).total_seconds() for cell in cells]
-    if array.dtype.kind == "M" and array.ndim == 1 and not np.isnat(array).any():
-        return np.asarray((array - array[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
-    return values
 
 
 def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
@@ -293,7 +277,16 @@ def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> li
     for k, cell in enumerate(cells):
         if _is_missing(cell):
             raise ParameterError(f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
-    return [_checked_name(name, str(cell)) for cell in cells]
+    return [_checked_name(name, text_of_name(cell)) for cell in cells]
+
+
+def text_of_name(value: object) -> str:
+    """Return the name of a run, scan or pattern as text: numbers in full precision, 1.0 as "1", a missing one as ""."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if _is_missing(value):
+        return ""
+    return number_text(value) if isinstance(value, float) else str(value)
 
 
 def _checked_name(what: str, text: str) -> str:

@@ -16,6 +16,7 @@ from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
+from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.columns import (
     A_SCAN,
     A_SESSION,
@@ -30,7 +31,7 @@ from probewise.recordings.description import Description, description_text, read
 from probewise.recordings.images import image_bytes, is_file_name_without_path
 from probewise.recordings.patterns import Image, Pattern
 from probewise.recordings.plan import Plan, Recording, range_in_words, require_plan, require_recording
-from probewise.recordings.table import LARGEST, MISSING, CSVTable, count_numbers, csv_text, number_text, read_table
+from probewise.recordings.table import LARGEST, CSVTable, csv_text, number_text, read_table
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
@@ -218,12 +219,13 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     """Read a table and its description: the plan, the readings or None, and notes."""
     if path.suffix.lower() == ".json":
         raise FileError(path, "this is a description", "the name of the CSV beside it")
-    table = read_table(path, progress=progress)
+    known = ("x_mm", "y_mm", "reading")
+    table = read_table(path, wanted=known, names=("scan", "pattern"), time="time_s", progress=progress)
     table.require_columns("x_mm", "y_mm")
     if not len(table):
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
     description = read_description(path.with_suffix(".json"))
-    notes = list(description.notes)
+    notes = [*table.notes, *description.notes]
     scan, scan_names = _scan_codes_and_names_in_file(table)
     time_s = table.column_of_numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     for k, name in enumerate(scan_names):
@@ -332,9 +334,7 @@ def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str
         if name in _KNOWN:
             continue
         filled = [cell for cell in table.cells(name) if cell not in MISSING]
-        if not name:
-            notes.append("a column without a name, ignored")
-        elif not name.isprintable():
+        if not name.isprintable():
             raise FileError(table.path, shown(name), f"{_A_NAME} for each column", row=1)
         elif not filled:
             notes.append(f"column {name} is empty, ignored")

@@ -28,7 +28,6 @@ from probewise.recordings.columns import (
     TableLike,
     checked_covariates,
     columns_by_name,
-    dates_to_seconds,
     how_to_describe_pattern,
     no_session_mask,
     numbers_per_reading,
@@ -42,6 +41,7 @@ from probewise.recordings.columns import (
     texts_to_numbers,
 )
 from probewise.recordings.patterns import Pattern
+from probewise.recordings.times import times_to_numbers
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ class Plan:
             orientation_rad=turns,
             time_s=np.arange(n_points, dtype=np.float64)
             if time_s is None
-            else numbers_per_reading("time_s", dates_to_seconds(time_s), n_points),
+            else numbers_per_reading("time_s", times_to_numbers("time_s", time_s)[0], n_points),
             scan=code,
             scan_names=scan_names,
             pattern=pattern_codes(pattern, described, n_points),

@@ -100,7 +100,7 @@ def read_prediction_columns(path: str | os.PathLike[str]) -> tuple[FloatArray, F
     FileError
         If the file is missing, a cell is not a valid number, or an sd is not above 0.
     """
-    table = read_table(checked_path("path", path))
+    table = read_table(checked_path("path", path), wanted=("mean", "sd", "log_density"))
     table.require_columns("mean", "sd", "log_density")
     mean, sd = table.column_of_numbers("mean"), table.column_of_numbers("sd")
     if np.any(sd <= 0):

@@ -1,7 +1,8 @@
-"""A CSV file as a checked table of texts and numbers; rows are numbered from 1, the header."""
+"""A file of rows as a checked table of texts and numbers; how it is laid out is found from the file."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import itertools
@@ -15,9 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._words import count_with_noun
 from probewise.errors import FileError, shown
 from probewise.progress import Progress, silent
+from probewise.recordings.cells import (
+    MISSING,
+    UnclearCellError,
+    first_cell_without_number,
+    looks_like_number,
+    parsed_numbers,
+    plain_cells,
+)
 from probewise.recordings.text import read_text
+from probewise.recordings.times import looks_like_time, texts_to_times
 
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
@@ -30,13 +41,19 @@ MISSING = frozenset(itertools.chain([""], *_SPELT))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 # On texts of these characters float() accepts exactly what _NUMBER does ('infinity' and '1_000' have others).
 _OF_NUMBERS = re.compile(r"[-+.0-9eE]*", re.ASCII)
-_OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
+_SAMPLE = 100_000  # characters from which the layout is found
+_N_LAST = 10  # rows at the end of these that show how many cells a row has
+_SEPARATORS = (("\t", ""), (";", ""), (",", ""), ("\t", r"[ \t]{2,}"), ("\t", r"[ \t]+"))  # and the blanks that do
+_DECLARED = re.compile(r'"?sep=(.)"?\r?\n')  # a spreadsheet's own line
+_MAY_LACK = frozenset({"", "Comment", "comment"})  # the last column of LabVIEW's files, empty in most rows
+_X_VALUE = "X_Value"  # LabVIEW's column of times, in seconds, where X_Dimension is Time
+_SUMMARY = re.compile(r"(mean|average|avg|median|total|sum|min|max|minimum|maximum|sd|std|stdev|count|end)\b", re.I)
 
 
 @dataclass(frozen=True, eq=False)
 class CSVTable:
-    """Cells by column, stripped of blanks; `rows` holds the row number of each record (header = 1), (n_rows,).
+    """Cells by column, stripped of blanks; `rows` holds the row number of each record in the file, (n_rows,).
 
     Each column is one text, its cells joined by a character that does not occur in the file: a million separate texts
     would take ten times the memory.
@@ -46,6 +63,9 @@ class CSVTable:
     columns: dict[str, str]
     separator: str
     rows: IntArray
+    header_row: int = 1
+    notes: tuple[str, ...] = ()
+    """How the file was read, one line, where it is not plain CSV."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -59,7 +79,7 @@ class CSVTable:
         return replace(self, columns={**self.columns, name: self.separator.join(cells)})
 
     def row_number(self, k: int) -> int:
-        """Return the row number of a record, the header being row 1."""
+        """Return the row number of a record in the file."""
         return int(self.rows[k])
 
     def require_columns(self, *names: str) -> None:
@@ -68,8 +88,8 @@ class CSVTable:
             if name not in self.columns:
                 present = ", ".join(repr(c) for c in self.columns)
                 raise FileError(
-                    self.path, f"no such column; the header has {present}", "a comma-separated header row with it",
-                    row=1, column=name,
+                    self.path, f"no such column; the header has {present}", "a header row with it",
+                    row=self.header_row, column=name,
                 )  # fmt: skip
 
     def column_of_numbers(
@@ -98,7 +118,7 @@ class CSVTable:
         there = np.ones(len(cells), dtype=np.bool_)
         if missing:
             there = np.fromiter((cell not in MISSING for cell in cells), dtype=np.bool_, count=len(cells))
-        values = _parsed_numbers(list(itertools.compress(cells, there)))
+        values = parsed_numbers(list(itertools.compress(cells, there)))
         if values is None or not (np.abs(values) <= most).all():
             number = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
             allowed = allowed or number + (", or empty, nan or n/a where it is missing" if missing else "")
@@ -110,7 +130,7 @@ class CSVTable:
         return out
 
 
-def _parsed_numbers(cells: Sequence[str]) -> FloatArray | None:
+def parsed_numbers(cells: Sequence[str]) -> FloatArray | None:
     """Convert cells to numbers in one pass; None if one of them is not a plain decimal number."""
     if _OF_NUMBERS.fullmatch("".join(cells)) is None:
         return None
@@ -138,7 +158,7 @@ def first_cell_without_number(
 
 def count_numbers(cells: Sequence[str]) -> int:
     """Count the cells that hold a plain decimal number (float() would accept 'infinity' and '1_000' too)."""
-    if _parsed_numbers(cells) is not None:
+    if parsed_numbers(cells) is not None:
         return len(cells)
     return sum(n for cell, n in Counter(cells).items() if _is_number(cell))
 
@@ -147,34 +167,194 @@ def _cell_in_words(cell: str) -> str:
     return shown(cell) if cell else "the cell is empty"
 
 
-def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
-    """Read a CSV file with one header row; blank lines are skipped.
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Where the header of a file is and how its cells are separated; rows are indices of records.
 
-    Raises FileError if it cannot be read, has no header or a repeated column, a row is too short or too long, or quotes
-    do not close.
+    `declared` says whether the file itself names its separator. `numeric` are the numbers of the columns that hold numbers or times, `width` the cells of a row below the header,
+    `above` and `units` the rows above the header and those between it and the first reading.
+    """
+
+    mark: str
+    blanks: str = ""
+    declared: bool = False
+    header: Sequence[str] = ()
+    at: int = -1
+    first: int = 0
+    width: int = 0
+    numeric: frozenset[int] = frozenset()
+    above: Sequence[Sequence[str]] = ()
+    units: Sequence[Sequence[str]] = ()
+
+    @classmethod
+    def of_text(cls, text: str, wanted: Sequence[str]) -> _Layout:
+        """Find the layout of a file by its first rows; where several would do, by the columns that are wanted."""
+        sample = text if len(text) <= _SAMPLE else text[: text.rfind("\n", 0, _SAMPLE) + 1]
+        declared = _DECLARED.match(sample)
+        candidates = [cls(declared[1], declared=True)] if declared else [cls(m, blanks) for m, blanks in _SEPARATORS]
+        found = [layout._fitted_to(sample, wanted) for layout in candidates if layout.mark in layout.separated(sample)]
+        fitting = [layout for layout in found if min(layout.width, len(layout.header)) > 1]
+        known = [layout for layout in fitting if set(wanted) <= set(layout.header)]
+        return next(iter((*known, *fitting)), None) or cls(",")._fitted_to(sample, wanted)
+
+    def separated(self, text: str) -> str:
+        """Return a text with its cells separated by `mark`."""
+        return re.sub(self.blanks, "\t", re.sub(r"(?m)^[ \t]+|[ \t]+$", "", text)) if self.blanks else text
+
+    def _fitted_to(self, sample: str, wanted: Sequence[str]) -> _Layout:
+        rows: list[list[str]] = []
+        with contextlib.suppress(csv.Error):
+            for row in csv.reader(io.StringIO(self.separated(sample), newline=""), delimiter=self.mark, strict=True):
+                rows.append([cell.strip() for cell in row])
+        full = [k for k, row in enumerate(rows) if any(row) and not _DECLARED.match(self.mark.join(row) + "\n")]
+        if not full:
+            return self
+        last = [rows[k] for k in full[-_N_LAST:]]
+        counts = Counter(map(len, last))
+        width = max(counts, key=lambda n: (counts[n], n))
+        columns = zip(*(row for row in last if len(row) == width), strict=True)
+        numeric = frozenset(j for j, cells in enumerate(columns) if _are_numbers(cells))
+        readings = [k for k in full if len(rows[k]) == width and _holds_numbers(rows[k], numeric)]
+        at = full[0]
+        if numeric and readings and (heads := [k for k in full if k < readings[0]]):
+            at = heads[-1]
+            if len(heads) > 1 and len(rows[heads[-2]]) == len(rows[at]) > 1 and all(rows[heads[-2]]):
+                at = heads[-2]  # below it the units
+        n_wanted = {k: len(set(wanted) & set(_names(rows[k], wanted))) for k in full}
+        if max(n_wanted.values()) > n_wanted[at]:
+            at = max(full, key=lambda k: n_wanted[k])
+        header = _names(rows[at], wanted)
+        below = [k for k in full if k > at]
+        first = next((k for k in below if not _holds_units(rows[k], numeric)), at + 1)
+        if self.mark != "," and len(header) + 1 == width and _count_up([row[0] for row in last if len(row) == width]):
+            header = ["", *header]
+        above, units = [rows[k] for k in full if k < at], [rows[k] for k in below if k < first]
+        return replace(self, header=header, at=at, first=first, width=width, numeric=numeric, above=above, units=units)
+
+    def row(self, path: Path, row: list[str], number: int) -> list[str]:
+        """Return a row with as many cells as the header: less empty ones, or more where comments may stand."""
+        n = len(self.header)
+        if not any(cell.strip() for cell in row[n:]) and all(name in _MAY_LACK for name in self.header[len(row) :]):
+            return (row + [""] * n)[:n]
+        commas = self.mark == "," and len(row) > n and all(looks_like_number(cell.strip()) for cell in row)
+        cure = "; a decimal comma cannot be told from one between cells: write 1.5, or separate cells by semicolons"
+        found = f"the row has {len(row)} cells; row {self.at + 1} is taken for the header: {_in_words(self.header)}"
+        raise FileError(path, found, f"{n} cells as in the header{cure * commas}", row=number)
+
+    def is_comment(self, row: Sequence[str]) -> bool:
+        """Return whether a row is a comment among readings."""
+        return len(row) != len(self.header) and 0 in self.numeric and row[0].lstrip().startswith("#")
+
+    def ends_table(self, row: Sequence[str]) -> bool:
+        """Return whether a row after all others is no reading: empty, or a text or a summary below the table."""
+        first = next((cell.strip() for cell in row if cell.strip()), "")
+        if not first or 0 not in self.numeric or _is_value(first):
+            return not first
+        return len(row) not in (len(self.header), self.width) or _SUMMARY.match(first) is not None
+
+    def notes(self) -> list[str]:
+        """Say how the file is laid out, where it is not plain CSV."""
+        separators = {";": "semicolons", "\t": "tabs", ",": "commas"}
+        separator = "blanks" if self.blanks else separators.get(self.mark, repr(self.mark))
+        out = [f"cells separated by {separator}"] * (self.mark != "," or self.declared)
+        out += [f"header in row {self.at + 1}, rows above it left out"] * bool(self.above)
+        return out + [f"row {_in_words(row)} below the header left out" for row in self.units]
+
+
+def _is_value(cell: str) -> bool:
+    return looks_like_number(cell) or looks_like_time(cell)
+
+
+def _are_numbers(cells: Sequence[str]) -> bool:
+    filled = [cell for cell in cells if cell not in MISSING]
+    return 0 < len(filled) <= 2 * sum(_is_value(cell) for cell in filled)
+
+
+def _holds_numbers(row: Sequence[str], numeric: frozenset[int]) -> bool:
+    """Return whether a row has numbers, times or missing cells in all columns of numbers."""
+    cells = [row[j] for j in numeric]
+    return _are_numbers(cells) and all(cell in MISSING or _is_value(cell) for cell in cells)
+
+
+def _holds_units(row: Sequence[str], numeric: frozenset[int]) -> bool:
+    """Return whether a row has a text but no number in the columns of numbers, as a row of units."""
+    filled = [row[j] for j in numeric if j < len(row) and row[j] not in MISSING]
+    return bool(filled) and not any(_is_value(cell) for cell in filled)
+
+
+def _count_up(cells: Sequence[str]) -> bool:
+    numbers = parsed_numbers(cells)
+    return numbers is not None and len(numbers) > 1 and bool((np.diff(numbers) == 1).all())
+
+
+def _names(row: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """Return the names of a header: on one line, without the # of a comment if such a column is wanted."""
+    names = [re.sub(r"\s*[\r\n]\s*", " ", cell) for cell in row]
+    bare = names[0].lstrip("#% ") if names else ""
+    return [bare, *names[1:]] if bare in wanted else names
+
+
+def _in_words(row: Sequence[str]) -> str:
+    return ", ".join(map(repr, row))
+
+
+def read_table(
+    path: Path,
+    *,
+    wanted: Sequence[str] = (),
+    names: Sequence[str] = (),
+    time: str | None = None,
+    time_unit: str = "s",
+    progress: Progress = silent,
+) -> CSVTable:
+    """Read a table with one header row, as loggers and spreadsheets write it; blank lines are skipped.
+
+    Cells may be separated by commas, semicolons, tabs or blanks. The header is the row above the numbers, or the one
+    with more of the `wanted` columns. Numbers and times are rewritten as plain numbers; `notes` says how.
+
+    Parameters
+    ----------
+    path
+        The file.
+    wanted
+        Columns by which the header is known.
+    names
+        Columns that are texts, whatever they look like.
+    time, time_unit
+        Name of a column of numbers, or of dates or clocks, which count from the first row in this unit.
+    progress
+        Called as rows are read.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read, has no header or a repeated column, a row is too short or too long, quotes do not close,
+        or a cell can be read in several ways.
     """
     text = read_text(path, "a CSV file")
+    layout = _Layout.of_text(text, wanted)
+    text, header = layout.separated(text), layout.header
+    _require_distinct_columns(path, header, layout.at + 1)
     n_lines = text.count("\n")
     separator = next(c for c in itertools.chain("\x1f\x1e", map(chr, range(0xE000, 0x110000))) if c not in text)
-    header: list[str] | None = None
-    columns: list[list[str]] = []
+    columns: list[list[str]] = [[] for _ in header]
     rows: list[IntArray] = []
+    left_out: list[int] = []
     n_read = 0
-    for records, failed in _read_in_chunks(text):
+    for records, failed, is_last in _read_in_chunks(text, layout.mark):
         lengths = np.fromiter(map(len, records), dtype=np.int64, count=len(records))
         blank = [k for k in np.flatnonzero(lengths <= 1) if not any(cell.strip() for cell in records[k])]
         kept = np.delete(np.arange(len(records)), blank)
-        if header is None and len(kept):
-            header = [cell.strip() for cell in records[kept[0]]]
-            _require_commas(path, header, n_read + int(kept[0]) + 1)
-            _require_distinct_columns(path, header, n_read + int(kept[0]) + 1)
-            columns = [[] for _ in header]
-            kept = kept[1:]
-        wrong = kept[lengths[kept] != len(columns)]
-        if wrong.size:
-            k = int(wrong[0])
-            found = f"the row has {len(records[k])} cells"
-            raise FileError(path, found, f"{len(columns)} cells as in the header", row=n_read + k + 1)
+        kept = kept[n_read + kept >= layout.first]
+        while is_last and failed is None and kept.size and layout.ends_table(records[kept[-1]]):
+            left_out += [n_read + int(kept[-1]) + 1] * any(records[kept[-1]])
+            kept = kept[:-1]
+        wrong = kept[lengths[kept] != len(header)]
+        comments = [k for k in wrong if layout.is_comment(records[k])]
+        left_out += [n_read + int(k) + 1 for k in comments]
+        for k in np.setdiff1d(wrong, comments):
+            records[k] = layout.row(path, records[k], n_read + int(k) + 1)
+        kept = np.setdiff1d(kept, comments) if comments else kept
         for column, cells in zip(columns, zip(*(records[k] for k in kept), strict=True), strict=False):
             column.append(separator.join(map(str.strip, cells)))
         rows.append(n_read + kept + 1)
@@ -183,48 +363,85 @@ def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
             found = f"not readable as CSV ({failed})"
             raise FileError(path, found, "comma-separated cells, quotes closed", row=n_read + 1) from failed
         progress(f"reading {path.name}", n_read, max(n_lines, n_read))
-    if header is None:
+    if not header:
         raise FileError(path, "the file is empty", "a header row and one row per reading")
-    joined = {name: separator.join(column) for name, column in zip(header, columns, strict=True)}
-    return CSVTable(path, joined, separator, np.concatenate(rows))
+    notes = layout.notes()
+    if left_out:
+        notes.append(f"left out, as no readings: {count_with_noun(len(left_out), 'row')}, first row {min(left_out)}")
+    joined = [separator.join(column) for column in columns]
+    unnamed = [cells for name, cells in zip(header, joined, strict=True) if not name]
+    if n_filled := sum(bool(cells.strip(separator)) for cells in unnamed):
+        if n_filled > 1:
+            found = "two columns without a name in the header"
+            raise FileError(path, found, "a name for each column, or one without a name", row=layout.at + 1)
+        notes.append("a column without a name, ignored")
+    if len(unnamed) > n_filled or layout.width > len(header):
+        notes.append("empty cells at the ends of rows ignored")
+    named = {name: cells for name, cells in zip(header, joined, strict=True) if name}
+    if (
+        time not in named
+        and _X_VALUE in named
+        and time
+        and ["X_Dimension", "Time"] in [row[:2] for row in layout.above]
+    ):
+        named = {time if name == _X_VALUE else name: cells for name, cells in named.items()}
+        notes.append(f"{_X_VALUE}, in s, is {time}")
+    table = CSVTable(path, named, separator, np.concatenate(rows), layout.at + 1)
+    return _with_plain_numbers(table, notes, names, time, time_unit)
 
 
-def _read_in_chunks(text: str) -> Iterator[tuple[list[list[str]], csv.Error | None]]:
-    """Yield lists of up to 2,000 records, each list with the error that ended it, if any."""
+def _with_plain_numbers(
+    table: CSVTable, notes: list[str], names: Sequence[str], time: str | None, time_unit: str
+) -> CSVTable:
+    """Rewrite the numbers and times of a table as plain numbers, and join the notes to one."""
+    plain = re.compile(f"[-+.0-9eE{re.escape(table.separator)}]*")
+    odd = {
+        name: table.cells(name)
+        for name, cells in table.columns.items()
+        if name not in names and not plain.fullmatch(cells) and len(table)
+    }
+    try:
+        if time in odd and (times := texts_to_times(time, odd[time], time_unit)) is not None:
+            table = table.with_cells(time, map(number_text, times[0].tolist()))
+            del odd[time]
+            notes.append(times[1])
+        usual = (name for name in table.columns if name not in odd and name not in names and name != time)
+        rewritten, said = plain_cells(odd, lambda: {name: table.cells(name) for name in usual})
+    except UnclearCellError as error:
+        cell = _cell_in_words(table.cells(error.name)[error.index])
+        row = table.row_number(error.index)
+        raise FileError(table.path, cell, error.allowed, row=row, column=error.name) from error
+    for name, cells in rewritten.items():
+        table = table.with_cells(name, cells)
+    notes += said
+    return replace(table, notes=(f"{table.path.name}: {'; '.join(notes)}",) if notes else ())
+
+
+def _read_in_chunks(text: str, mark: str) -> Iterator[tuple[list[list[str]], csv.Error | None, bool]]:
+    """Yield lists of up to 2,000 records, each with the error that ended it, if any, and whether it is the last."""
     # Not StringIO, which takes four bytes per character.
     lines = io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8", newline="")
-    reader = csv.reader(lines, strict=True)
-    failed = None
+    reader = csv.reader(lines, delimiter=mark, strict=True)
+    failed, before = None, list[list[str]]()
     while failed is None:
         records: list[list[str]] = []
         try:
             records.extend(itertools.islice(reader, _CHUNK))
         except csv.Error as error:
             failed = error
+        if before:
+            yield before, None, not records and failed is None
         if not records and failed is None:
             return
-        yield records, failed
-
-
-def _require_commas(path: Path, header: Sequence[str], row: int) -> None:
-    """Raise FileError if a header of one cell has another separator, as spreadsheets of many countries write."""
-    other = next((name for mark, name in _OTHER_SEPARATORS.items() if mark in header[0]), None)
-    if len(header) == 1 and other is not None:
-        allowed = (
-            "cells separated by commas, numbers with a decimal point (1.5, not 1,5): in a spreadsheet, save as CSV "
-            "with these"
-        )
-        raise FileError(path, f"the header is separated by {other}", allowed, row=row)
+        before = records
+    yield before, failed, True
 
 
 def _require_distinct_columns(path: Path, header: Sequence[str], row: int) -> None:
-    seen: set[str] = set()
-    for name in header:
-        if name in seen:
-            raise FileError(
-                path, "the column comes twice in the header", "each column once", row=row, column=name or "''"
-            )
-        seen.add(name)
+    for name, n in Counter(name for name in header if name).items():
+        if n > 1:
+            found = "the column comes twice in the header"
+            raise FileError(path, found, "each column once: rename or delete one of them", row=row, column=name)
 
 
 def number_text(value: float) -> str:

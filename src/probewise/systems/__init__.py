@@ -5,7 +5,7 @@ from probewise.systems.file import read_simulator
 from probewise.systems.fitted import FittedSystem, read_fitted_system, samples_csv, write_fitted_system
 from probewise.systems.joining import concatenate_tables
 from probewise.systems.prediction import SystemPrediction, as_recording, predict_system, write_system_prediction
-from probewise.systems.simulator import Extra, Law, Noise, Simulator, table_for
+from probewise.systems.simulator import Extra, Law, Noise, Simulator, read_table_for, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, read_run_table, run_table_csv
 
@@ -27,6 +27,7 @@ __all__ = [
     "read_fitted_system",
     "read_run_table",
     "read_simulator",
+    "read_table_for",
     "run_table_csv",
     "samples_csv",
     "table_for",

@@ -66,7 +66,8 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
         else _concatenated_column(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
         for name in dict.fromkeys((*first.columns, run))
     }
-    return replace(first, columns=columns, run=run), tuple(notes)
+    how = tuple(dict.fromkeys(note for table in tables for note in table.notes))
+    return replace(first, columns=columns, run=run, notes=how), tuple(notes)
 
 
 def append_tables(table: RunTable, more: Sequence[RunTable]) -> RunTable:

@@ -94,7 +94,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
         readings = np.full(len(table), np.nan)
     elif readings.dtype != np.float64:
         allowed = "a number in each row, or nothing where it is missing"
-        raise column_error(f"reading {simulator.reading!r}", readings, allowed)
+        raise column_error(f"reading {simulator.reading!r}", readings, allowed, first=table.first_line)
     sd = simulator.noise.sd
     recording = RunRecording(
         cast(Plan, own), np.array(readings), simulator.source, sd_column=sd if isinstance(sd, str) else ""
@@ -103,7 +103,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
         values = table.covariates[recording.sd_column]
         wrong = np.flatnonzero(recording.usable & ~(np.isfinite(values) & (values > 0)))
         if wrong.size:
-            name = f'noise["sd"], column {sd!r} in row {wrong[0] + 2}'
+            name = f'noise["sd"], column {sd!r} in row {wrong[0] + table.first_line}'
             raise ParameterError(name, float(values[wrong[0]]), "greater than 0 wherever there is a reading")
     return recording
 
@@ -182,7 +182,7 @@ def predict_system(
             mixture.add(mean[there], _noise_parameters(fitted, chain, block[there], mean[there], sd, own), between)
     if n_failed == n_samples:
         rows = (
-            f" in {int(never.sum())} of {len(own)} rows, first in row {int(np.argmax(never)) + 2}"
+            f" in {int(never.sum())} of {len(own)} rows, first in row {int(np.argmax(never)) + own.first_line}"
             if never.any()
             else ""
         )
@@ -200,7 +200,7 @@ def predict_system(
     mean, sd, scores = mixture.mean_sd_and_log_density()
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
-        rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {int(np.argmax(lost)) + 2}"
+        rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {int(np.argmax(lost)) + own.first_line}"
         warnings.warn(
             f"{rows}: a number that they need is missing; where an effect looks back to it, it is interpolated",
             DoubtfulResultWarning,
@@ -292,7 +292,7 @@ def _filled_table_and_unpredictable_mask(
         lost |= ~np.isfinite(values)
         lost |= ~np.isfinite(bare.predict(few[:, : chain.system.n_params], alone)).any(axis=0)
     if lost.all():
-        row = int(np.argmax(~np.isfinite(lacking[needed[0]]))) + 2
+        row = int(np.argmax(~np.isfinite(lacking[needed[0]]))) + table.first_line
         raise ParameterError(f"column {needed[0]!r}", f"no number in row {row}", "a number where a prediction needs it")
     return table.with_columns({name: whole.covariates[name] for name in needed}), lost
 

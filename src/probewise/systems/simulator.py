@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
@@ -15,7 +16,7 @@ from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, read_run_table
 
 Values: TypeAlias = Mapping[str, Any]
 """Parameters by name: floats, or arrays that broadcast against the rows."""
@@ -303,7 +304,15 @@ class Simulator:
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
     """Build a simulator's table from columns by name (a dict of arrays, a DataFrame); return a RunTable as it is."""
     require_simulator(simulator)
-    return data if isinstance(data, RunTable) else RunTable(data, simulator.time, simulator.run)
+    if isinstance(data, RunTable):
+        return data
+    return RunTable(data, simulator.time, simulator.run, time_unit=simulator.time_unit)
+
+
+def read_table_for(simulator: Simulator, path: str | os.PathLike[str]) -> RunTable:
+    """Read a simulator's table from a file, as `read_run_table` does."""
+    own = simulator
+    return read_run_table(path, time=own.time, run=own.run, reading=own.reading, time_unit=own.time_unit)
 
 
 def require_simulator(simulator: object) -> None:

@@ -278,7 +278,7 @@ def _n_filled_cells(table: RunTable, rows: IntArray) -> int:
 
 def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
     """Return the columns passed to `simulate` and `rates`: all except the reading, which they predict."""
-    return {name: values for name, values in table.columns.items() if name != simulator.reading}
+    return {name: values for name, values in table.columns_as_given.items() if name != simulator.reading}
 
 
 def limited_to_range(predicted: FloatArray, system: System, table: RunTable) -> FloatArray:

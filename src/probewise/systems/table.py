@@ -17,8 +17,11 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
+from probewise.recordings.cells import first_cell_without_number, parsed_numbers
+from probewise.recordings.columns import text_of_name
 from probewise.recordings.ends import masks_of_readings_at_ends
-from probewise.recordings.table import LARGEST, csv_text, first_cell_without_number, number_text, read_table
+from probewise.recordings.table import csv_text, number_text, read_table
+from probewise.recordings.times import times_to_numbers
 
 _ONE_RUN = "all"
 _OF_COLUMN = "column:"
@@ -36,9 +39,11 @@ class RunTable:
     columns
         Every column by name: numbers (NaN where missing) or texts.
     time
-        Name of the time column; None if no time was recorded.
+        Name of the time column; None if no time was recorded. Dates, clocks and time differences in it count from the
+        first row, in `time_unit`.
     run
-        Name of the column that assigns rows to runs; None for a single run.
+        Name of the column that assigns rows to runs; None for a single run. Names are texts; a number is its shortest
+        text, 1.0 as "1".
     instrumentation
         Unit, range and step of a reading.
     like
@@ -46,6 +51,12 @@ class RunTable:
     first_row
         Number of the first row, counted from the first row of the recording to which effects are bound: 0 for that
         recording, its length for a table that follows it.
+    time_unit
+        Unit of the time column.
+    notes
+        How columns were read that are not plain numbers.
+    first_line
+        Row of the file, the first being 1, in which the first row stands.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -54,6 +65,9 @@ class RunTable:
     instrumentation: Instrumentation = field(default_factory=Instrumentation)
     like: Mapping[str, str] = field(default_factory=dict)
     first_row: int = 0
+    time_unit: str = "s"
+    notes: tuple[str, ...] = ()
+    first_line: int = 2
 
     def __post_init__(self) -> None:
         if not hasattr(self.columns, "items"):
@@ -63,7 +77,11 @@ class RunTable:
         for name, values in self.columns.items():
             if name in columns:  # a data frame may have two of one name
                 raise ParameterError("columns", f"{name} twice", "each column once")
-            columns[name] = _checked_column(name, values)
+            if name == self.time and name != self.run:
+                values, note = times_to_numbers(name, values, self.time_unit)
+                if note:
+                    object.__setattr__(self, "notes", (*self.notes, note))
+            columns[name] = _column_of_names(name, values) if name == self.run else _checked_column(name, values)
         if not columns:
             raise ParameterError("columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -79,9 +97,8 @@ class RunTable:
         if self.time is not None:
             values = columns[self.time]
             if values.dtype != np.float64 or not np.isfinite(values).all():
-                raise column_error(
-                    f"column {self.time!r}", values, "a time, a finite number, in each row", missing=False
-                )
+                allowed = "a time, a finite number, in each row"
+                raise column_error(f"column {self.time!r}", values, allowed, missing=False, first=self.first_line)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -105,7 +122,7 @@ class RunTable:
     def _run_numbers_and_names(self) -> tuple[IntArray, tuple[str, ...]]:
         if self.run is None:
             return np.zeros(len(self), dtype=np.int64), (_ONE_RUN,)
-        texts = [number_text(v) if isinstance(v, float) else str(v) for v in self.columns[self.run].tolist()]
+        texts = self.columns[self.run].tolist()
         names = tuple(dict.fromkeys(texts))
         number = {name: k for k, name in enumerate(names)}
         return np.array([number[text] for text in texts], dtype=np.int64), names
@@ -119,6 +136,14 @@ class RunTable:
     def scan_names(self) -> tuple[str, ...]:
         """Names of the runs, in the order in which they begin; "all" for a table without a run column."""
         return self._run_numbers_and_names[1]
+
+    @cached_property
+    def columns_as_given(self) -> Mapping[str, NDArray[Any]]:
+        """The columns as a user's functions get them: names of runs as numbers, if they are numbers that differ."""
+        numbers = None if self.run is None else parsed_numbers(self.scan_names)
+        if numbers is None or len(set(numbers.tolist())) < len(numbers):  # 1.1 and 1.10 are two runs, but one number
+            return self.columns
+        return {**self.columns, cast(str, self.run): read_only_floats(numbers[self.scan])}
 
     @cached_property
     def covariates(self) -> dict[str, FloatArray]:
@@ -149,7 +174,7 @@ class RunTable:
             falls = np.flatnonzero(np.diff(self.time_s[rows]) < 0)
             if falls.size:
                 before, at = rows[falls[0]], rows[falls[0] + 1]
-                where = f"column {self.time!r} in row {at + 2}"
+                where = f"column {self.time!r} in row {at + self.first_line}"
                 own = "its run" if self.run is None else f"run {name}"
                 allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
                 cure = "" if self.run is not None else '; where it begins anew name the runs: run = "..."'
@@ -241,19 +266,27 @@ def relative_sds_of_column(table: RunTable, column: str, typical: float | None =
     return np.where(there, values, 1.0) / np.where(there, median if typical is None else typical, 1.0)
 
 
-def column_error(column: str, cells: NDArray[Any], allowed: str, *, missing: bool = True) -> ParameterError:
-    """Return the error of a column of texts that should be numbers: its first wrong cell, with the row (header = 1)."""
+def column_error(
+    column: str, cells: NDArray[Any], allowed: str, *, missing: bool = True, first: int = 2
+) -> ParameterError:
+    """Return the error of a column of texts that should be numbers: its first wrong cell, with the row in the file."""
     k = first_cell_without_number(cells.tolist(), missing=missing)
     if k is None:
         return ParameterError(column, "texts, all of them numbers", f"numbers: {allowed}")
-    return ParameterError(f"{column} in row {k + 2}", str(cells[k]), allowed)
+    return ParameterError(f"{column} in row {k + first}", str(cells[k]), allowed)
+
+
+def _column_of_names(name: str, values: Any) -> NDArray[Any]:
+    array = np.asarray(_with_missing(values))
+    if array.ndim != 1:
+        raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one name for each row")
+    texts = np.array([text_of_name(value) for value in array.tolist()], dtype=np.str_)
+    texts.flags.writeable = False
+    return texts
 
 
 def _checked_column(name: str, values: Any) -> NDArray[Any]:
-    if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
-        missing = np.nan if values.dtype.kind in "biufO" else ""
-        values = np.ma.filled(values.astype(np.object_), missing)
-    array = np.asarray(values)
+    array = np.asarray(_with_missing(values))
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
     if array.dtype == object and all(value is None or isinstance(value, Real | Decimal) for value in array.tolist()):
@@ -265,30 +298,48 @@ def _checked_column(name: str, values: Any) -> NDArray[Any]:
     return texts
 
 
-def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str | None) -> RunTable:
-    """Read a CSV file with one header row; a column is numeric if every cell is a number, empty or nan, else text.
+def _with_missing(values: Any) -> Any:
+    """Return a column with the masked values of a masked array missing, NaN or ""."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    return np.ma.filled(values.astype(np.object_), np.nan if values.dtype.kind in "biufO" else "")
+
+
+def read_run_table(
+    path: str | os.PathLike[str], *, time: str | None, run: str | None, reading: str = "", time_unit: str = "s"
+) -> RunTable:
+    """Read a table with a header row; a column is numeric if every cell is a number, empty or nan, else text.
+
+    Loggers and spreadsheets write tables in many ways; `notes` of the result says how one was read that is not plain
+    CSV. The names `time`, `run` and `reading` show which row is the header. Names of runs are texts. Dates and clocks
+    in the time column count from the first row, in `time_unit`.
 
     Raises
     ------
     FileError
-        If the file is unusable, lacks the column `time` or `run`, or a time is no number; the message says where.
+        If the file is unusable, lacks the column `time` or `run`, a time is no number, or a cell can be read in several
+        ways; the message says where.
     """
-    table = read_table(checked_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)"))
+    path = checked_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)")
+    own = [name for name in (time, run) if name is not None]
+    table = read_table(
+        path, wanted=(*own, reading), names=() if run is None else (run,), time=time, time_unit=time_unit
+    )
     if not len(table):
         raise FileError(path, "there is no row below the header", "one row for each reading")
-    table.require_columns(*(name for name in (time, run) if name is not None))
+    table.require_columns(*own)
     columns: dict[str, NDArray[Any]] = {}
     for name in table.columns:
-        if name == time:
-            columns[name] = table.column_of_numbers(name)
-            continue
-        try:
-            # Names of runs beyond 1e15 stay texts: as numbers some would be equal.
-            of_runs = name == run
-            columns[name] = table.column_of_numbers(name, missing=not of_runs, largest=LARGEST if of_runs else None)
-        except FileError:
+        if name == run:
             columns[name] = np.array(table.cells(name))
-    return RunTable(columns, time, run)
+        elif name == time:
+            columns[name] = table.column_of_numbers(name)
+        else:
+            try:
+                columns[name] = table.column_of_numbers(name, missing=True, largest=None)
+            except FileError:
+                columns[name] = np.array(table.cells(name))
+    return RunTable(columns, time, run, time_unit=time_unit, notes=table.notes, first_line=table.row_number(0))
 
 
 def run_table_csv(table: RunTable) -> str:

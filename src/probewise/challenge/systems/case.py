@@ -17,7 +17,7 @@ from probewise.challenge.systems.held_out import log_densities_of_runs
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
-from probewise.systems import read_run_table, read_simulator
+from probewise.systems import read_table_for, read_simulator
 from probewise.world.systems import (
     SystemCase,
     SystemEffect,
@@ -100,7 +100,7 @@ def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as directory:
         file, table, test, _ = write_system_case(case, directory)
         simulator = read_simulator(file)
-        seen, kept_back = (read_run_table(path, time=simulator.time, run=simulator.run) for path in (table, test))
+        seen, kept_back = (read_table_for(simulator, path) for path in (table, test))
         begun_s = time.process_time()
         diagnosis = diagnose_system(simulator, seen, rng=blind)
         cpu_s = time.process_time() - begun_s

@@ -120,7 +120,7 @@ def prepare_system(
     recording = replace(
         recording_from_table(simulator, table),
         source=source or simulator.source,
-        notes=(*notes, *note_on_row_order(simulator, table)),
+        notes=(*table.notes, *notes, *note_on_row_order(simulator, table)),
     )
     system = System.of(simulator, table, stiff=stiff)
     if with_effects and len(table) < 2:  # nothing can change along it

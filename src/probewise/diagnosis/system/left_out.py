@@ -84,7 +84,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     wrong = np.flatnonzero((unpredictable if every_row else lost) & ~missing)
     if wrong.size:
         what = "simulate" if system.simulator.law is None else "rates"
-        where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + 2}"
+        where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + table.first_line}"
         allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
         raise ParameterError(what, where, allowed)
     filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
@@ -92,18 +92,20 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         recording,
         plan=cast(Plan, filled),
         readings=np.where(lost, np.nan, recording.readings),
-        notes=(*recording.notes, _note_on_gaps(system, int(lost.sum()), gaps)) if lost.any() else recording.notes,
+        notes=(*recording.notes, _note_on_gaps(system, int(lost.sum()), gaps + table.first_line))
+        if lost.any()
+        else recording.notes,
     )
 
 
 def _note_on_gaps(system: System, n_lost: int, gaps: IntArray) -> str:
-    """Say that readings are left out, since cells are missing in the rows `gaps`, counted from 0."""
+    """Say that readings are left out, since cells are missing in the rows `gaps` of the file."""
     lost = count_with_noun(n_lost, "reading")
     if system.simulator.law is None:
         return f"{lost} left out: a column that the simulator reads is missing there"
     more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
     return (
-        f"{lost} left out: a column that the law reads is missing in row {gaps[0] + 2}{more}, "
+        f"{lost} left out: a column that the law reads is missing in row {gaps[0]}{more}, "
         "and a law ends at the first gap of its run; fill the gaps in to use them"
     )
 

@@ -1,5 +1,6 @@
 """A person's table from memory: what its columns are."""
 
+import datetime
 from collections.abc import Iterator
 from decimal import Decimal
 
@@ -50,3 +51,58 @@ def test_large_numbers_in_a_file_are_numbers(tmp_path):
     table = read_run_table(path, time=None, run="run")
     assert table.scan_names == ("9007199254740992", "9007199254740993")
     np.testing.assert_array_equal(table.covariates["doping_per_m3"], [1e22, 3e23])
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        (["1.1", "1.2", "1.10"], ("1.1", "1.2", "1.10")),
+        (["0E8", "0E9", "0"], ("0E8", "0E9", "0")),
+        (["01", "1"], ("01", "1")),
+        ([2, 1, 2], ("2", "1")),
+        (np.array([9007199254740992, 9007199254740993]), ("9007199254740992", "9007199254740993")),
+        ([1.0, 1.5, 1e22], ("1", "1.5", "1e+22")),
+        (np.array([1, "a", 1.0, np.int64(1)], dtype=object), ("1", "a")),
+        ([True, False], ("True", "False")),
+        (np.ma.masked_equal([1, 2], 2), ("1", "")),
+    ],
+)
+def test_names_of_runs_are_texts(given, names):
+    table = RunTable({"run": given, "x": np.zeros(len(given))}, run="run")
+    assert table.scan_names == names
+    assert table.columns["run"].tolist() == [names[k] for k in table.scan]
+
+
+def test_a_simulator_gets_names_of_runs_as_numbers_only_if_they_are_different_numbers():
+    for given, expected in ((["1", "02"], [1.0, 2.0]), (["1.1", "1.10"], ["1.1", "1.10"]), (["1", "b"], ["1", "b"])):
+        table = RunTable({"run": given, "x": [0.0, 1.0]}, run="run")
+        assert table.columns_as_given["run"].tolist() == expected
+
+
+_FIRST = datetime.datetime(2026, 11, 23, 18, 0)
+_LATER = [datetime.timedelta(seconds=s) for s in (0, 2, 90)]
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        [_FIRST + later for later in _LATER],
+        [(_FIRST + later).replace(tzinfo=datetime.UTC) for later in _LATER],
+        np.array([_FIRST + later for later in _LATER], dtype="datetime64[ns]"),
+        np.array(_LATER, dtype="timedelta64[ms]"),
+        _LATER,
+        ["2026-11-23 18:00:00", "2026-11-23 18:00:02", "2026-11-23 18:01:30"],
+        [(_FIRST + later).time() for later in _LATER],
+    ],
+)
+def test_dates_clocks_and_time_differences_count_from_the_first_row(times):
+    table = RunTable({"t": times, "y": np.zeros(3)}, "t")
+    assert table.time_s.tolist() == [0.0, 2.0, 90.0]
+    assert table.notes[0].startswith("t counted in s from ")
+    np.testing.assert_allclose(RunTable({"t": times}, "t", time_unit="min").time_s, [0, 2 / 60, 1.5])
+
+
+def test_a_missing_date_is_refused():
+    for times in (np.array(["2026-01-01", "NaT"], dtype="datetime64[s]"), ["2026-01-01 10:00:00", ""]):
+        with pytest.raises(ParameterError, match=r"t in row 1 \(the first is 0\)"):
+            RunTable({"t": times}, "t")

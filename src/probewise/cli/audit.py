@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _audit_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanAudit:
     from probewise.diagnosis import audit_system
-    from probewise.systems import read_table_for, read_simulator
+    from probewise.systems import read_simulator, read_table_for
 
     refuse_sensor_options(arguments, "sensor")
     simulator = read_simulator(arguments.simulator)

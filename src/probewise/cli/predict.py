@@ -54,8 +54,8 @@ def _predict_by_simulator(arguments: argparse.Namespace) -> int:
     from probewise.systems import (
         predict_system,
         read_fitted_system,
-        read_table_for,
         read_simulator,
+        read_table_for,
         write_system_prediction,
     )
 

@@ -33,18 +33,17 @@ from probewise.recordings.times import looks_like_time, texts_to_times
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
 
-_WORDS = ("nan", "na", "n/a")
-_SPELT = (map("".join, itertools.product(*zip(word, word.upper(), strict=True))) for word in _WORDS)
-MISSING = frozenset(itertools.chain([""], *_SPELT))
-"""Texts that mark a missing number."""
-
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-# On texts of these characters float() accepts exactly what _NUMBER does ('infinity' and '1_000' have others).
-_OF_NUMBERS = re.compile(r"[-+.0-9eE]*", re.ASCII)
 _CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
 _SAMPLE = 100_000  # characters from which the layout is found
 _N_LAST = 10  # rows at the end of these that show how many cells a row has
-_SEPARATORS = (("\t", ""), (";", ""), (",", ""), ("\t", r"[ \t]{2,}"), ("\t", r"[ \t]+"))  # and the blanks that do
+_SEPARATORS = (
+    ("\t", ""),
+    (";", ""),
+    (",", ""),
+    ("|", ""),
+    ("\t", r"[ \t]{2,}"),
+    ("\t", r"[ \t]+"),
+)  # and the blanks that do
 _DECLARED = re.compile(r'"?sep=(.)"?\r?\n')  # a spreadsheet's own line
 _MAY_LACK = frozenset({"", "Comment", "comment"})  # the last column of LabVIEW's files, empty in most rows
 _X_VALUE = "X_Value"  # LabVIEW's column of times, in seconds, where X_Dimension is Time
@@ -130,49 +129,17 @@ class CSVTable:
         return out
 
 
-def parsed_numbers(cells: Sequence[str]) -> FloatArray | None:
-    """Convert cells to numbers in one pass; None if one of them is not a plain decimal number."""
-    if _OF_NUMBERS.fullmatch("".join(cells)) is None:
-        return None
-    try:
-        return np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
-    except ValueError:
-        return None
-
-
-def _is_number(cell: str) -> bool:
-    return _NUMBER.fullmatch(cell) is not None
-
-
-def first_cell_without_number(
-    cells: Sequence[object], *, missing: bool = True, largest: float = math.inf
-) -> int | None:
-    """Return the index of the first cell that is no number up to `largest` and, if `missing`, not missing; or None."""
-    for k, cell in enumerate(cells):
-        text = str(cell).strip()
-        is_number = _is_number(text) and abs(float(text)) <= largest
-        if not is_number and not (missing and text in MISSING):
-            return k
-    return None
-
-
-def count_numbers(cells: Sequence[str]) -> int:
-    """Count the cells that hold a plain decimal number (float() would accept 'infinity' and '1_000' too)."""
-    if parsed_numbers(cells) is not None:
-        return len(cells)
-    return sum(n for cell, n in Counter(cells).items() if _is_number(cell))
-
-
 def _cell_in_words(cell: str) -> str:
     return shown(cell) if cell else "the cell is empty"
 
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Where the header of a file is and how its cells are separated; rows are indices of records.
+    """Where the header of a file is, and how its cells are separated; rows are indices of records.
 
-    `declared` says whether the file itself names its separator. `numeric` are the numbers of the columns that hold numbers or times, `width` the cells of a row below the header,
-    `above` and `units` the rows above the header and those between it and the first reading.
+    `declared` says whether the file itself names its separator, `blanks` which blanks are one. `numeric` are the
+    columns that hold numbers or times, `width` the number of cells of a row below the header, `above` and `units` the
+    rows above the header and those between it and the first reading.
     """
 
     mark: str
@@ -180,7 +147,7 @@ class _Layout:
     declared: bool = False
     header: Sequence[str] = ()
     at: int = -1
-    first: int = 0
+    first: int = 2**62
     width: int = 0
     numeric: frozenset[int] = frozenset()
     above: Sequence[Sequence[str]] = ()
@@ -212,7 +179,7 @@ class _Layout:
         last = [rows[k] for k in full[-_N_LAST:]]
         counts = Counter(map(len, last))
         width = max(counts, key=lambda n: (counts[n], n))
-        columns = zip(*(row for row in last if len(row) == width), strict=True)
+        columns = zip(*(row for row in last[-max(1, len(last) // 2) :] if len(row) == width), strict=True)
         numeric = frozenset(j for j, cells in enumerate(columns) if _are_numbers(cells))
         readings = [k for k in full if len(rows[k]) == width and _holds_numbers(rows[k], numeric)]
         at = full[0]
@@ -220,10 +187,10 @@ class _Layout:
             at = heads[-1]
             if len(heads) > 1 and len(rows[heads[-2]]) == len(rows[at]) > 1 and all(rows[heads[-2]]):
                 at = heads[-2]  # below it the units
-        n_wanted = {k: len(set(wanted) & set(_names(rows[k], wanted))) for k in full}
+        n_wanted = {k: len(set(wanted) & set(_names(rows[k], wanted, width))) for k in full}
         if max(n_wanted.values()) > n_wanted[at]:
             at = max(full, key=lambda k: n_wanted[k])
-        header = _names(rows[at], wanted)
+        header = _names(rows[at], wanted, width)
         below = [k for k in full if k > at]
         first = next((k for k in below if not _holds_units(rows[k], numeric)), at + 1)
         if self.mark != "," and len(header) + 1 == width and _count_up([row[0] for row in last if len(row) == width]):
@@ -236,7 +203,7 @@ class _Layout:
         n = len(self.header)
         if not any(cell.strip() for cell in row[n:]) and all(name in _MAY_LACK for name in self.header[len(row) :]):
             return (row + [""] * n)[:n]
-        commas = self.mark == "," and len(row) > n and all(looks_like_number(cell.strip()) for cell in row)
+        commas = self.mark == "," and len(row) > n and all(_is_value(cell.strip()) for cell in row)
         cure = "; a decimal comma cannot be told from one between cells: write 1.5, or separate cells by semicolons"
         found = f"the row has {len(row)} cells; row {self.at + 1} is taken for the header: {_in_words(self.header)}"
         raise FileError(path, found, f"{n} cells as in the header{cure * commas}", row=number)
@@ -287,10 +254,12 @@ def _count_up(cells: Sequence[str]) -> bool:
     return numbers is not None and len(numbers) > 1 and bool((np.diff(numbers) == 1).all())
 
 
-def _names(row: Sequence[str], wanted: Sequence[str]) -> list[str]:
+def _names(row: Sequence[str], wanted: Sequence[str], width: int) -> list[str]:
     """Return the names of a header: on one line, without the # of a comment if such a column is wanted."""
     names = [re.sub(r"\s*[\r\n]\s*", " ", cell) for cell in row]
-    bare = names[0].lstrip("#% ") if names else ""
+    if names[0] in ("#", "%") and len(names) == width + 1:
+        return names[1:]
+    bare = names[0].lstrip("#% ")
     return [bare, *names[1:]] if bare in wanted else names
 
 
@@ -367,7 +336,7 @@ def read_table(
         raise FileError(path, "the file is empty", "a header row and one row per reading")
     notes = layout.notes()
     if left_out:
-        notes.append(f"left out, as no readings: {count_with_noun(len(left_out), 'row')}, first row {min(left_out)}")
+        notes.append(f"{count_with_noun(len(left_out), 'row')} without readings left out (first: row {min(left_out)})")
     joined = [separator.join(column) for column in columns]
     unnamed = [cells for name, cells in zip(header, joined, strict=True) if not name]
     if n_filled := sum(bool(cells.strip(separator)) for cells in unnamed):
@@ -394,16 +363,18 @@ def _with_plain_numbers(
     table: CSVTable, notes: list[str], names: Sequence[str], time: str | None, time_unit: str
 ) -> CSVTable:
     """Rewrite the numbers and times of a table as plain numbers, and join the notes to one."""
-    plain = re.compile(f"[-+.0-9eE{re.escape(table.separator)}]*")
+    end = re.escape(table.separator)
+    plain, dash = re.compile(f"[-+.0-9eE{end}]*"), re.compile(f"-({end}|$)")  # a dash alone is a word for missing
     odd = {
         name: table.cells(name)
         for name, cells in table.columns.items()
-        if name not in names and not plain.fullmatch(cells) and len(table)
+        if name not in names and len(table) and (not plain.fullmatch(cells) or dash.search(cells))
     }
     try:
-        if time in odd and (times := texts_to_times(time, odd[time], time_unit)) is not None:
+        cells = [] if time is None or time not in table.columns else table.cells(time)
+        if time and cells and (times := texts_to_times(time, cells, time_unit)) is not None:
             table = table.with_cells(time, map(number_text, times[0].tolist()))
-            del odd[time]
+            odd.pop(time, None)
             notes.append(times[1])
         usual = (name for name in table.columns if name not in odd and name not in names and name != time)
         rewritten, said = plain_cells(odd, lambda: {name: table.cells(name) for name in usual})

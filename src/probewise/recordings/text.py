@@ -1,7 +1,8 @@
-"""Reading of files as bytes and as UTF-8 text."""
+"""Reading of files as bytes and as text."""
 
 from __future__ import annotations
 
+import codecs
 import warnings
 from pathlib import Path
 
@@ -31,17 +32,18 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """Read a whole UTF-8 file, without its byte-order mark; `what` is as for `read_bytes`.
+    """Read a whole file of UTF-8, or of UTF-16 with its byte-order mark, without that mark; `what` as in `read_bytes`.
 
     Raises
     ------
     FileError
-        If it is missing, cannot be read or is not UTF-8.
+        If it is missing, cannot be read or is no such text.
     """
     content = read_bytes(path, what)
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        return content.decode("utf-8-sig")
+        return content.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
         row = content.count(b"\n", 0, error.start) + 1
-        found = f"byte 0x{content[error.start]:02x} at offset {error.start} is not UTF-8"
+        found = f"byte 0x{content[error.start]:02x} at offset {error.start} is not {'UTF-16' if wide else 'UTF-8'}"
         raise FileError(path, found, "UTF-8 text (save the file again with that encoding)", row=row) from error

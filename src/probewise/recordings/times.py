@@ -147,8 +147,8 @@ def _seconds_of_dates(parts: Sequence[dict[str, Any]]) -> tuple[FloatArray, str]
     if any(p["b"].isalpha() for p in parts):
         days = _days(((p["y"], _month(p["b"]), p["a"]) for p in parts), strict=True)
         return _DAY * (days - days[0]) + clocks, ""
-    day_first = _days(((p["y"], p["b"], p["a"]) for p in parts))
-    month_first = _days(((p["y"], p["a"], p["b"]) for p in parts))
+    day_first = _days((p["y"], p["b"], p["a"]) for p in parts)
+    month_first = _days((p["y"], p["a"], p["b"]) for p in parts)
     either = [days - days[0] for days in (day_first, month_first) if days.size]
     if len(either) == 2 and (either[0] != either[1]).any():
         k = int(np.argmax(either[0] != either[1]))

@@ -200,7 +200,8 @@ def predict_system(
     mean, sd, scores = mixture.mean_sd_and_log_density()
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
-        rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {int(np.argmax(lost)) + own.first_line}"
+        first_lost = int(np.argmax(lost)) + own.first_line
+        rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {first_lost}"
         warnings.warn(
             f"{rows}: a number that they need is missing; where an effect looks back to it, it is interpolated",
             DoubtfulResultWarning,

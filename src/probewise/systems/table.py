@@ -74,7 +74,8 @@ class RunTable:
             allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
             raise ParameterError("table", self.columns, allowed)
         columns: dict[str, NDArray[Any]] = {}
-        for name, values in self.columns.items():
+        for name, given in self.columns.items():
+            values: Any = given
             if name in columns:  # a data frame may have two of one name
                 raise ParameterError("columns", f"{name} twice", "each column once")
             if name == self.time and name != self.run:

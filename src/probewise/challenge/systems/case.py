@@ -17,7 +17,7 @@ from probewise.challenge.systems.held_out import log_densities_of_runs
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
-from probewise.systems import read_table_for, read_simulator
+from probewise.systems import read_simulator, read_table_for
 from probewise.world.systems import (
     SystemCase,
     SystemEffect,

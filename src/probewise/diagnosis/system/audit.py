@@ -128,7 +128,8 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
         never &= ~np.isfinite(predicted)
         is_constant |= bool(np.isfinite(predicted).all())
     if never.any():
-        found = f"no finite reading in {int(never.sum())} of {len(table)} rows, first in row {int(np.argmax(never)) + table.first_line}"
+        first = int(np.argmax(never)) + table.first_line
+        found = f"no finite reading in {int(never.sum())} of {len(table)} rows, first in row {first}"
         raise ParameterError("the table", found, "a number in each cell that the simulator reads")
     if not is_constant:
         found = f"not finite in some row at any of the {len(system.starts)} points of the prior that were tried"

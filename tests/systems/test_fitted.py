@@ -97,6 +97,15 @@ def test_predictions_that_are_no_number_are_stored():
     assert known.sd == 0.07
 
 
+def test_a_file_with_names_of_runs_as_numbers_is_read():
+    """Earlier versions wrote them so."""
+    document = json.loads(dataclasses.replace(fitted(), known=StoredFit(TABLE, ABOUT.predicted, 0.07)).to_json())
+    stored = document["bound_about"]["columns"]
+    stored["run"] = [float(name) for name in stored["run"]]
+    known = FittedSystem.from_json(json.dumps(document), SIMULATOR).known
+    assert known.table.scan_names == TABLE.scan_names
+
+
 def test_the_file_of_another_reading_is_refused_without_fingerprints():
     here, there = (dataclasses.replace(SIMULATOR, fingerprint="", unit=unit) for unit in ("degC", "K"))
     text = dataclasses.replace(fitted(), simulator=here).to_json()

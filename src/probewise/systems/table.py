@@ -281,6 +281,8 @@ def _column_of_names(name: str, values: Any) -> NDArray[Any]:
     array = np.asarray(_with_missing(values))
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one name for each row")
+    if array.dtype.kind == "U" and not array.flags.writeable:
+        return array
     texts = np.array([text_of_name(value) for value in array.tolist()], dtype=np.str_)
     texts.flags.writeable = False
     return texts

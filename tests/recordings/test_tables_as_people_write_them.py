@@ -129,6 +129,7 @@ REFUSED = {
     ),
     "two columns of one name": (table("{t},{y},{t}", "t_s,temp_c,t_s\n"), ["row 1, column t_s", "rename or delete"]),
     "row numbers twice": (table("{t},{t},{t},{y}", ",t_s,,temp_c\n"), ["row 1: two columns without a name"]),
+    "another unit of time": (table("{t} min,{y}"), ["row 2, column t_s: '0 min'", 'times in s, or time_unit = "min"']),
     "no header": (table(head=""), ["row 1, column t_s: no such column; the header has '0', '20.00'"]),
     "no such column below a preamble": (
         "; a\n; b\n" + PLAIN.replace("t_s", "t"),
@@ -152,6 +153,16 @@ def test_what_could_be_read_in_two_ways_is_refused_with_line_and_cure(tmp_path, 
         read_run_table(put(tmp_path, content), time="t_s", run=None, reading="temp_c")
     for fragment in fragments:
         assert fragment in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "names", [["1.1", "1.2", "1.10"], ["0E8", "0E9"], ["01", "1"], ["1,5", "1,50"], ["5 V", "6 V"]]
+)
+def test_names_of_runs_are_texts(tmp_path, names):
+    path = put(tmp_path, "run;y\n" + "".join(f"{name};1,5\n" for name in names))
+    read = read_run_table(path, time=None, run="run")
+    assert read.scan_names == tuple(names)
+    assert read.columns["y"].tolist() == [1.5] * len(names)
 
 
 def test_dates_need_a_unit_of_time_with_a_length(tmp_path):

@@ -78,6 +78,12 @@ def looks_like_number(cell: str) -> bool:
     return _QUANTITY.fullmatch(cell.translate(_ODD_SIGNS)) is not None
 
 
+def unit_of_cells(cells: Sequence[str]) -> str:
+    """Return the unit that stands in all cells of a column of numbers; "" if there is none."""
+    found = _Quantities.of(cells)
+    return "" if found is None else found.unit
+
+
 def plain_cells(
     odd: Mapping[str, Sequence[str]], usual: Callable[[], Mapping[str, Sequence[str]]]
 ) -> tuple[dict[str, list[str]], list[str]]:

@@ -26,9 +26,10 @@ from probewise.recordings.cells import (
     looks_like_number,
     parsed_numbers,
     plain_cells,
+    unit_of_cells,
 )
 from probewise.recordings.text import read_text
-from probewise.recordings.times import looks_like_time, texts_to_times
+from probewise.recordings.times import looks_like_time, require_unit_of_time, texts_to_times
 
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
@@ -36,14 +37,8 @@ LARGEST = 1e15
 _CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
 _SAMPLE = 100_000  # characters from which the layout is found
 _N_LAST = 10  # rows at the end of these that show how many cells a row has
-_SEPARATORS = (
-    ("\t", ""),
-    (";", ""),
-    (",", ""),
-    ("|", ""),
-    ("\t", r"[ \t]{2,}"),
-    ("\t", r"[ \t]+"),
-)  # and the blanks that do
+# Marks between cells, or the blanks to replace by one: first those that stand in numbers and texts least.
+_SEPARATORS = ("\t", ""), (";", ""), (",", ""), ("|", ""), ("\t", r"[ \t]{2,}"), ("\t", r"[ \t]+")
 _DECLARED = re.compile(r'"?sep=(.)"?\r?\n')  # a spreadsheet's own line
 _MAY_LACK = frozenset({"", "Comment", "comment"})  # the last column of LabVIEW's files, empty in most rows
 _X_VALUE = "X_Value"  # LabVIEW's column of times, in seconds, where X_Dimension is Time
@@ -347,12 +342,8 @@ def read_table(
     if len(unnamed) > n_filled or layout.width > len(header):
         notes.append("empty cells at the ends of rows ignored")
     named = {name: cells for name, cells in zip(header, joined, strict=True) if name}
-    if (
-        time not in named
-        and _X_VALUE in named
-        and time
-        and ["X_Dimension", "Time"] in [row[:2] for row in layout.above]
-    ):
+    is_time = ["X_Dimension", "Time"] in [row[:2] for row in layout.above]
+    if time and time not in named and time_unit == "s" and is_time:
         named = {time if name == _X_VALUE else name: cells for name, cells in named.items()}
         notes.append(f"{_X_VALUE}, in s, is {time}")
     table = CSVTable(path, named, separator, np.concatenate(rows), layout.at + 1)
@@ -376,7 +367,9 @@ def _with_plain_numbers(
             table = table.with_cells(time, map(number_text, times[0].tolist()))
             odd.pop(time, None)
             notes.append(times[1])
-        usual = (name for name in table.columns if name not in odd and name not in names and name != time)
+        elif time in odd:
+            require_unit_of_time(time, unit_of_cells(odd[time]), time_unit)
+        usual = [name for name in table.columns if name not in odd and name not in names and name != time]
         rewritten, said = plain_cells(odd, lambda: {name: table.cells(name) for name in usual})
     except UnclearCellError as error:
         cell = _cell_in_words(table.cells(error.name)[error.index])

@@ -39,6 +39,12 @@ def looks_like_time(cell: str) -> bool:
     return any(form.fullmatch(cell) for form in (_CLOCK_ALONE, _YEAR_FIRST, _YEAR_LAST))
 
 
+def require_unit_of_time(name: str, unit: str, wanted: str) -> None:
+    """Raise UnclearCellError if the cells of a column of times have another unit than is wanted."""
+    if unit and _SECONDS.get(unit.lower()) != _SECONDS.get(wanted.lower(), unit):
+        raise UnclearCellError(0, f'times in {wanted}, or time_unit = "{unit}"', name=name)
+
+
 def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[ArrayLike, str]:
     """Convert dates, clocks and time differences (NumPy's, Python's, texts) to the time since the first, in `unit`.
 

@@ -325,9 +325,8 @@ def read_run_table(
     """
     path = checked_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)")
     own = [name for name in (time, run) if name is not None]
-    table = read_table(
-        path, wanted=(*own, reading), names=() if run is None else (run,), time=time, time_unit=time_unit
-    )
+    wanted = (*own, reading) if reading else own
+    table = read_table(path, wanted=wanted, names=() if run is None else (run,), time=time, time_unit=time_unit)
     if not len(table):
         raise FileError(path, "there is no row below the header", "one row for each reading")
     table.require_columns(*own)

@@ -165,6 +165,11 @@ def test_names_of_runs_are_texts(tmp_path, names):
     assert read.columns["y"].tolist() == [1.5] * len(names)
 
 
+def test_a_first_row_that_lacks_its_numbers_is_no_row_of_units(tmp_path):
+    path = put(tmp_path, "run,x,y\na,#N/A,NULL\nb,1,2\nb,3,4\n")
+    assert read_run_table(path, time=None, run="run").scan_names == ("a", "b")
+
+
 def test_dates_need_a_unit_of_time_with_a_length(tmp_path):
     path = put(tmp_path, table("2026-01-20 22:09:{t:02},{y}"))
     with pytest.raises(FileError, match='in place of "month"'):

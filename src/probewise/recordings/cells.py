@@ -73,6 +73,11 @@ class UnclearCellError(ValueError):
         super().__init__(allowed)
 
 
+def is_missing(cell: str) -> bool:
+    """Return whether a cell is empty or holds a word for a missing number."""
+    return cell in MISSING or cell.lower() in _OTHER_WORDS
+
+
 def looks_like_number(cell: str) -> bool:
     """Return whether a cell holds a number, however it is written, with a unit or without."""
     return _QUANTITY.fullmatch(cell.translate(_ODD_SIGNS)) is not None

@@ -23,6 +23,7 @@ from probewise.recordings.cells import (
     MISSING,
     UnclearCellError,
     first_cell_without_number,
+    is_missing,
     looks_like_number,
     parsed_numbers,
     plain_cells,
@@ -228,19 +229,20 @@ def _is_value(cell: str) -> bool:
 
 
 def _are_numbers(cells: Sequence[str]) -> bool:
-    filled = [cell for cell in cells if cell not in MISSING]
+    filled = [cell for cell in cells if not is_missing(cell)]
     return 0 < len(filled) <= 2 * sum(_is_value(cell) for cell in filled)
 
 
 def _holds_numbers(row: Sequence[str], numeric: frozenset[int]) -> bool:
     """Return whether a row has numbers, times or missing cells in all columns of numbers."""
     cells = [row[j] for j in numeric]
-    return _are_numbers(cells) and all(cell in MISSING or _is_value(cell) for cell in cells)
+    return _are_numbers(cells) and all(is_missing(cell) or _is_value(cell) for cell in cells)
 
 
 def _holds_units(row: Sequence[str], numeric: frozenset[int]) -> bool:
     """Return whether a row has a text but no number in the columns of numbers, as a row of units."""
-    filled = [row[j] for j in numeric if j < len(row) and row[j] not in MISSING]
+    cells = [row[j] for j in numeric if j < len(row)]
+    filled = [cell for cell in cells if not is_missing(cell) or set(cell) == {"-"}]  # or a line below the header
     return bool(filled) and not any(_is_value(cell) for cell in filled)
 
 

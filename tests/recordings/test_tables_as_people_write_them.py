@@ -165,6 +165,14 @@ def test_names_of_runs_are_texts(tmp_path, names):
     assert read.columns["y"].tolist() == [1.5] * len(names)
 
 
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
+def test_a_long_table_is_read_to_its_end(tmp_path, end):
+    wide = ",".join(f"column_{k:04}" for k in range(12_000))
+    assert len(read_run_table(put(tmp_path, f"{wide}{end}{','.join(['1'] * 12_000)}{end}"), time=None, run=None)) == 1
+    long = put(tmp_path, end.join(["x,y", *(f"{k},{k}.5" for k in range(20_000)), "mean,7", ""]))
+    assert read_run_table(long, time=None, run=None).columns["y"][-1] == 19_999.5
+
+
 def test_a_first_row_that_lacks_its_numbers_is_no_row_of_units(tmp_path):
     path = put(tmp_path, "run,x,y\na,#N/A,NULL\nb,1,2\nb,3,4\n")
     assert read_run_table(path, time=None, run="run").scan_names == ("a", "b")

@@ -152,7 +152,8 @@ class _Layout:
     @classmethod
     def of_text(cls, text: str, wanted: Sequence[str]) -> _Layout:
         """Find the layout of a file by its first rows; where several would do, by the columns that are wanted."""
-        sample = text if len(text) <= _SAMPLE else text[: text.rfind("\n", 0, _SAMPLE) + 1]
+        end = max(text.rfind("\n", 0, _SAMPLE), text.rfind("\r", 0, _SAMPLE)) + 1
+        sample = text[:end] if end and len(text) > _SAMPLE else text
         declared = _DECLARED.match(sample)
         candidates = [cls(declared[1], declared=True)] if declared else [cls(m, blanks) for m, blanks in _SEPARATORS]
         found = [layout._fitted_to(sample, wanted) for layout in candidates if layout.mark in layout.separated(sample)]

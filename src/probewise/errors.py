@@ -18,6 +18,7 @@ __all__ = [
     "ShapeError",
     "SlowWarning",
     "UnitWarning",
+    "message_of",
     "shortened",
     "shown",
 ]
@@ -40,7 +41,20 @@ def shown(value: object, most: int = _LONGEST_VALUE) -> str:
         text = " ".join(repr(value).split())
     except (ValueError, RecursionError):  # an integer of thousands of digits, or a list nested too deep
         return f"a huge {type(value).__name__}"
+    except Exception:  # of a user's own __repr__
+        return f"a {type(value).__name__}"
     return shortened(text, most)
+
+
+def message_of(error: BaseException, most: int = 200, *, kind: bool = True) -> str:
+    """Return an exception's kind, unless False, and its message on one line, cut where it is long; never fails."""
+    try:
+        text = shortened(" ".join(str(error).split()), most)
+    except BaseException as failure:  # of a user's own __str__
+        if isinstance(failure, KeyboardInterrupt):
+            raise
+        text = f"its message raises {type(failure).__name__}"
+    return f"{type(error).__name__}: {text}".removesuffix(": ") if kind else text
 
 
 class ProbewiseError(Exception):

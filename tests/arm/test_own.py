@@ -242,6 +242,7 @@ FILES = {
     "no connect": ("def conect(): pass", "mine.py: connect is missing; allowed: def connect"),
     "a number": ("connect = 3", "mine.py: connect is a int; allowed: def connect"),
     "leaves": ("raise SystemExit(3)", "mine.py, line 1: stops with SystemExit: 3"),
+    "ends": ("raise GeneratorExit", "mine.py, line 1: stops with GeneratorExit; allowed"),
 }
 
 
@@ -263,6 +264,13 @@ RUNS = {
     "measure leaves": (
         "import sys\nclass A:\n  def measure(s, p): sys.exit('off')\ndef connect(): return A()",
         "line 3: measure raises SystemExit: off",
+    ),
+    "measure ends": (
+        "class A:\n  def measure(s, p): raise GeneratorExit\ndef connect(): return A()", "line 2: measure raises GeneratorExit$",
+    ),
+    "an error that cannot be shown": (
+        "class E(Exception):\n  def __str__(s): 1 / 0\ndef connect(): raise E",
+        "line 3: connect raises E: its message raises ZeroDivisionError",
     ),
     "deep down": (
         "import math\nclass A:\n  def measure(s, p):\n    return half(p)\ndef half(p):\n    return math.sqrt(-1)\n"

@@ -5,7 +5,7 @@ import pytest
 from heater import FILE, runs
 
 from probewise.cli import main
-from probewise.systems import run_table_csv
+from probewise.systems import System, read_simulator, run_table_csv
 
 
 def refused(capsys, tmp_path, file, *arguments, table=None, more=()):
@@ -26,6 +26,8 @@ def law_whose_rates(do):
     """A file like the heater's, of a law with one state, temp_c, and a last line of its rates."""
     return f'{FILE.partition("def simulate")[0]}states = {{"temp_c": "start_c"}}\n\ndef rates(s, p, u):\n    {do}\n'
 
+
+MUTE = "class Mute(Exception):\n    def __str__(self): raise ValueError\n"
 
 FILES = {
     "a column that the table lacks": (
@@ -56,6 +58,21 @@ FILES = {
     "an sd that is a list": (('"sd": 0.05', '"sd": [0.05]'), 'noise["sd"] is [0.05]'),
     "a negative sd of NumPy": (('"sd": 0.05', '"sd": np.int64(-1)'), 'noise["sd"] is'),
     "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "line 9: is no Python"),
+    "8,000 minus signs": (("noise =", f"sign = {8000 * '-'}1\nnoise ="), "an expression that is too long or too deeply"),
+    "100,000 pluses": (("noise =", f"sum = 1{100000 * '+1'}\nnoise ="), "an expression that is too long or too deeply"),
+    "100,000 dots": (("noise =", f"name = a{100000 * '.a'}\nnoise ="), "an expression that is too long or too deeply"),
+    "an end": (("noise =", "raise BaseException('over')\nnoise ="), "line 7: stops with BaseException: over"),
+    "an exit": (("noise =", "raise GeneratorExit\nnoise ="), "line 7: stops with GeneratorExit; allowed"),
+    "an error that cannot be shown": (("noise =", f"{MUTE}raise Mute\nnoise ="), "Mute: its message raises ValueError"),
+    "an end at every place": (("return p", "raise GeneratorExit\n    return p"), "line 10: simulate raises GeneratorExit;"),
+    "a mute error at every place": (
+        ("def simulate(p, data):", f"{MUTE}def simulate(p, data):\n    raise Mute"),
+        "simulate raises Mute: its message raises ValueError",
+    ),
+    "a prior beyond floats": (("(0, 10)", "(0, 10**400)"), "OverflowError"),
+    "a prior that cannot be shown": (
+        ("noise =", "class Odd:\n    def __repr__(self): 1 / 0\nparameters['gain'] = Odd()\nnoise ="), "is a Odd",
+    ),
     "no simulator": (("def simulate", "def simulat"), "simulate, rates is 'neither'"),
     "runs that are not named": (
         ('time, run = "t_s", "run"', 'time = "t_s"'), "per_run is ['start_c']; allowed: nothing, or run =",
@@ -67,6 +84,16 @@ FILES = {
 def test_a_mistake_in_the_file_is_one_line(capsys, tmp_path, change, said):
     assert change[0] in FILE
     assert said in refused(capsys, tmp_path, FILE.replace(*change))
+
+
+def test_an_exit_at_some_parameters_makes_them_impossible(tmp_path):
+    path = tmp_path / "heater.py"
+    path.write_text(FILE.replace("return p", "if np.any(p['gain'] < 5): raise SystemExit\n    return p"))
+    system = System.of(read_simulator(path), runs())
+    chain = system.chain(runs(), ())
+    readings = chain.predict(np.array([[15.0, gain, 20.0, 21.0, 19.0] for gain in (3.0, 7.0)]), runs())
+    assert np.isnan(readings[0]).all()
+    assert np.isfinite(readings[1]).all()
 
 
 def cell(row, column, text):

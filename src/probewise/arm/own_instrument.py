@@ -24,9 +24,9 @@ from probewise.arm.basics import Clock
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
-from probewise.errors import FileError, LinkError, ParameterError, ShapeError
+from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of
 from probewise.recordings.columns import KNOWN, SESSION
-from probewise.recordings.python_file import error_on_one_line, run_python_file
+from probewise.recordings.python_file import run_python_file
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
@@ -113,10 +113,9 @@ class OwnInstrument:
         """Exit or close the connected object, once; if an exception is pending, errors here become warnings."""
         own = self._own if self._entered is None else self._entered
         self._own = self._entered = None
-        leave = getattr(own, "__exit__", None)
-        close = getattr(own, "close", None)
         try:
             with defer_signals(), self._errors_located("close"):
+                leave, close = getattr(own, "__exit__", None), getattr(own, "close", None)
                 if hasattr(own, "__enter__") and callable(leave):
                     leave(kind, error, trace)
                 elif callable(close):
@@ -125,28 +124,30 @@ class OwnInstrument:
             if error is None:
                 raise
             warnings.warn(
-                f"the instrument may not be at rest: {error_on_one_line(failure)}", RuntimeWarning, stacklevel=2
+                f"the instrument may not be at rest: {message_of(failure, kind=False)}", RuntimeWarning, stacklevel=2
             )
 
     @property
     def can_turn(self) -> bool:
         """Whether the object turns its sensor to `pose.orientation_rad`: its attribute `turns`, by default False."""
-        return bool(getattr(self._own, "turns", False))
+        with self._errors_located("turns"):
+            return bool(getattr(self._own, "turns", False))
 
     turns = can_turn  # as every instrument declares it
 
     @property
     def can_lift(self) -> bool:
         """Whether the object reads at a given `pose.height_mm`: its attribute `lifts`, by default False."""
-        return bool(getattr(self._own, "lifts", False))
+        with self._errors_located("lifts"):
+            return bool(getattr(self._own, "lifts", False))
 
     lifts = can_lift  # as every instrument declares it
 
     @property
     def read_height_mm(self) -> float | None:
         """Height above the surface at which the object reads: its attribute `read_height_mm`; None: not known."""
-        height_mm = getattr(self._own, "read_height_mm", None)
         with self._errors_located("read_height_mm"):
+            height_mm = getattr(self._own, "read_height_mm", None)
             return None if height_mm is None else checked_finite_number("read_height_mm of the instrument", height_mm)
 
     def sentence(self) -> str:
@@ -232,8 +233,8 @@ class OwnInstrument:
         try:
             with aside:
                 yield
-        except (Exception, SystemExit) as error:
-            if not self.source:
+        except BaseException as error:
+            if not self.source or isinstance(error, KeyboardInterrupt):
                 raise
             raise LinkError(self._error_message(what, error)) from error
 
@@ -242,7 +243,7 @@ class OwnInstrument:
         where = f"{self.source}, line {frames[-1]}" if frames else self.source
         if isinstance(error, ParameterError | ShapeError) and not frames:  # a wrong value was returned
             return f"{where}: {error}"
-        return f"{where}: {what} raises {type(error).__name__}: {error_on_one_line(error)}".rstrip(": ")
+        return f"{where}: {what} raises {message_of(error)}"
 
 
 def as_instrument(

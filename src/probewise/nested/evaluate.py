@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._kinds import require_like
-from probewise.errors import NotConvergedError
+from probewise.errors import NotConvergedError, message_of
 from probewise.nested.space import Space, space_of
 from probewise.priors import Prior, require_prior
 
@@ -249,7 +249,7 @@ class Evaluator:
 
     def _failure_message(self, error: Exception, theta: FloatArray) -> str:
         """Describe the failure of a batch, (n, n_params), and name a hypothesis that fails by itself, if any."""
-        why = f"{type(error).__name__}: {error}"
+        why = message_of(error)
         if self.executor is not None and "pickle" in why.lower():
             return (
                 f"the problem cannot be sent to the executor's workers ({why}); allowed: one that pickles, so made of "

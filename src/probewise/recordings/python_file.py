@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 import traceback
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from probewise._kinds import checked_path
-from probewise.errors import FileError, shortened
-from probewise.recordings.text import read_text
+import numpy as np
 
-_LONGEST = 200
+from probewise._kinds import checked_path
+from probewise.errors import FileError, message_of
+from probewise.recordings.text import read_text
 
 
 def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any]:
@@ -42,8 +44,10 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
     """Run the text of a user's file and return the names that it defines, as `run_python_file` does."""
     try:
         code = compile(text, str(path), "exec")
-    except (SyntaxError, ValueError) as error:
-        found = f"is no Python: {error_on_one_line(error)}"
+    except Exception as error:
+        found = f"is no Python: {message_of(error, kind=False)}"
+        if isinstance(error, MemoryError | RecursionError):  # of the parser
+            found = f"has an expression that is too long or too deeply nested for Python ({type(error).__name__})"
         raise FileError(path, found, "a file that Python can run", row=getattr(error, "lineno", None)) from error
     module = ModuleType(f"probewise_file_{path.stem}")  # a prefix, so that serial.py cannot hide the package serial
     module.__file__ = str(path)
@@ -52,14 +56,31 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
     if folder not in sys.path:
         sys.path.insert(0, folder)
     try:
-        exec(code, module.__dict__)
-    except (Exception, SystemExit) as error:
+        with np.errstate(), warnings.catch_warnings():  # what the file sets is its own affair
+            exec(code, module.__dict__)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        found = f"stops with {type(error).__name__}: {error_on_one_line(error)}"
+        found = f"stops with {message_of(error)}"
         raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
     return module.__dict__
 
 
-def error_on_one_line(error: BaseException) -> str:
-    """Return an error's message on one line, cut where it is long."""
-    return shortened(" ".join(str(error).split()), _LONGEST)
+class EndedByFile(Exception):
+    """What a function of a user's file raised that is no Exception, such as SystemExit; the text names it."""
+
+
+def raising_exceptions(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of a user's file so that whatever it raises, but for Ctrl-C, is an Exception."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **named: Any) -> Any:
+        try:
+            return function(*args, **named)
+        except (Exception, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            raise EndedByFile(message_of(error)).with_traceback(error.__traceback__) from error
+
+    return call

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from probewise._kinds import checked_path
-from probewise.errors import FileError, ParameterError
-from probewise.recordings.python_file import error_on_one_line, run_python_text
+from probewise.errors import FileError, ParameterError, message_of, shown
+from probewise.recordings.python_file import raising_exceptions, run_python_text
 from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, parse_prior
 
@@ -50,14 +50,14 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     try:
         return _build_simulator(said, path, text)
     except ParameterError as error:
-        found = f"{error.name} is {error.value!r}" if error.value is not None else f"{error.name} is missing"
+        found = f"{error.name} is {shown(error.value)}" if error.value is not None else f"{error.name} is missing"
         like = get_close_matches(error.name, said.keys() - set(_NAMES), 1) if error.value is None else []
         hint = f"; was {like[0]} meant to be {error.name}?" if like else ""
         raise FileError(path, found, error.allowed + hint) from error
-    except (TypeError, ValueError, AttributeError, LookupError) as error:
+    except Exception as error:  # objects of the file may raise anything
         raise FileError(
             path,
-            f"what it says does not fit together ({error_on_one_line(error)})",
+            f"what it says does not fit together ({message_of(error)})",
             f"these names: {', '.join(_NAMES)}",
         ) from error
 
@@ -122,7 +122,7 @@ def _checked_function(said: Mapping[str, Any], name: str) -> Any:
     value = said.get(name)
     if not callable(value):
         raise ParameterError(name, value, f"a function: def {name}(...)")
-    return value
+    return raising_exceptions(value)
 
 
 def _parse_extra(name: str, given: object) -> Extra:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import traceback
 from collections.abc import Mapping
 from typing import Any
@@ -9,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise.errors import FileError
+from probewise.errors import FileError, message_of
+from probewise.recordings.python_file import EndedByFile
 from probewise.systems.simulator import Simulator
 
-_LONGEST = 160
 _WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
     "output operand": "k = k * x in place of k *= x: an array changed in place keeps its shape",
     "converted to Python scalar": "np.sin(x) in place of math.sin(x), and so on: states and columns are arrays",
@@ -37,12 +38,11 @@ def user_function_error(
     where = _files_of_user_functions(simulator)
     if simulator.law is not None and simulator.law.observe is not None:
         raised_in = {frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)}
-        what = "observe" if getattr(simulator.law.observe, "__code__", None) in raised_in else what
+        what = "observe" if getattr(inspect.unwrap(simulator.law.observe), "__code__", None) in raised_in else what
     frames = traceback.extract_tb(error.__traceback__)
     lines = [f.lineno for f in frames if f.filename in where]
-    said = " ".join(str(error).split())
-    said = said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."
-    found = f"{what} raises {type(error).__name__}: {said}".rstrip(": ")
+    said = message_of(error, kind=False)
+    found = f"{what} raises {said if isinstance(error, EndedByFile) else message_of(error)}"
     law, outside = simulator.law, not frames or frames[-1].filename not in where
     if law is not None and outside:
         by_name = f"a dict with a rate for each state, under its name: {', '.join(law.states)}"
@@ -75,7 +75,7 @@ def _files_of_user_functions(simulator: Simulator) -> set[str]:
     functions: list[Any] = [simulator.simulate]
     if simulator.law is not None:
         functions += [simulator.law.rates, simulator.law.observe]
-    codes = (getattr(function, "__code__", None) for function in functions)
+    codes = (getattr(inspect.unwrap(function), "__code__", None) for function in functions if function is not None)
     return {code.co_filename for code in codes if code is not None}
 
 

@@ -108,6 +108,16 @@ def test_the_same_generator_and_readings_give_the_same_choices():
     np.testing.assert_array_equal(runs[0].posterior.theta, runs[1].posterior.theta)
 
 
+def test_a_reading_without_its_setting_is_taken_once_for_each_choice():
+    asked = inquiry()
+    for _ in range(2):
+        with pytest.raises(ParameterError, match=r"setting is None; allowed: .* tell\(reading, setting\)"):
+            asked.tell(0.5)
+        asked.next()
+        asked.tell(0.5)
+    assert len(asked.readings) == 2
+
+
 def test_readings_told_to_a_new_inquiry_are_taken_in_again():
     first = follow(inquiry(), lambda x: 0.5 * x, 3)
     again = inquiry(seed=9)

@@ -179,18 +179,22 @@ class Inquiry(ShowsItself):
         reading
             The value read.
         setting
-            Its setting, by default that of `next()`; it need not be one of the settings.
+            Its setting, which need not be one of the settings; by default the one that `next()` returned since the
+            last reading.
 
         Raises
         ------
         ParameterError
-            If the reading is not a finite number, or the setting not of the form of `settings`. The posterior is
-            unchanged.
+            If the reading is not a finite number, the setting not of the form of `settings`, or not given though
+            `next()` was not called since the last reading. The posterior is unchanged.
         NotConvergedError
             If no hypothesis could have given these readings. The posterior is unchanged.
         """
         value = checked_finite_number("reading", reading, "a finite number; leave out a missing reading")
-        at = self._settings.checked_setting(self.next() if setting is None else setting)
+        if setting is None and self._next is None:
+            way_out = "the setting of this reading: tell(reading, setting); next() has chosen none since the last reading"
+            raise ParameterError("setting", None, way_out)
+        at = self._settings.checked_setting(self._next if setting is None else setting)
         readings = _append_reading(self._readings, self._model, at, value)
         theta = self._posterior.theta
         log_density = self._model.log_density(theta, at, np.array([value]))[:, 0]

@@ -8,6 +8,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
+from probewise._kinds import checked_texts
 from probewise.errors import ParameterError, ShapeError
 
 MIN_SAMPLES = 500
@@ -55,8 +56,10 @@ def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
     Raises
     ------
     ShapeError, ParameterError
-        If the shapes do not fit, there are fewer than 500 samples, a value is not finite, or an sd is not positive.
+        If the shapes do not fit, a name is no text, there are fewer than 500 samples, a value is not finite, or an sd
+        is not positive.
     """
+    checked_texts("names", names, "names of the columns of samples")
     samples, noise_sd = read_only_floats(samples), read_only_floats(noise_sd)
     if samples.ndim != 2 or samples.shape[1] != len(names):
         raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(names)})")

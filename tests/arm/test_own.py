@@ -266,7 +266,8 @@ RUNS = {
         "line 3: measure raises SystemExit: off",
     ),
     "measure ends": (
-        "class A:\n  def measure(s, p): raise GeneratorExit\ndef connect(): return A()", "line 2: measure raises GeneratorExit$",
+        "class A:\n  def measure(s, p): raise GeneratorExit\ndef connect(): return A()",
+        "line 2: measure raises GeneratorExit$",
     ),
     "an error that cannot be shown": (
         "class E(Exception):\n  def __str__(s): 1 / 0\ndef connect(): raise E",

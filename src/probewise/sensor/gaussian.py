@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, singledispatch
+from functools import cache, lru_cache, singledispatch
 
 import numpy as np
 from scipy.special import ndtr, owens_t
@@ -574,6 +574,14 @@ def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes:
     return out
 
 
+@lru_cache(maxsize=64)
+def _rule_over_row(n_panels: int) -> tuple[FloatArray, FloatArray]:
+    """Return nodes and weights of a Gauss-Legendre rule over a row of pixels, (0, 1), in `n_panels` equal parts."""
+    node, weight = np.polynomial.legendre.leggauss(6)
+    nodes = ((np.arange(n_panels)[:, None] + 0.5 * (node + 1)) / n_panels).ravel()
+    return nodes, np.tile(0.5 * weight / n_panels, n_panels)
+
+
 def _image_albedo_under_one_gaussian(
     region: ImageRegion, x: float, y: float, var_x: float, var_y: float, cov: float
 ) -> float:
@@ -590,10 +598,7 @@ def _image_albedo_under_one_gaussian(
     if first_row >= last_row or first_column >= last_column:
         return 0.0
     scale = min(s_y, s_free / max(abs(slope), 1e-9))
-    n_panels = max(1, int(np.ceil(1 / scale)))
-    node, weight = np.polynomial.legendre.leggauss(6)
-    inner = ((np.arange(n_panels)[:, None] + 0.5 * (node + 1)) / n_panels).ravel()
-    inner_weight = np.tile(0.5 * weight / n_panels, n_panels)
+    inner, inner_weight = _rule_over_row(max(1, int(np.ceil(1 / scale))))
     rows = np.arange(first_row, last_row)
     height = rows[:, None] + inner - v  # (n_rows_near, n_inner)
     edges = np.arange(first_column, last_column + 1)

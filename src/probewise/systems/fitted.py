@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._kinds import require_kind
+from probewise._kinds import checked_texts, require_kind
 from probewise._posterior_samples import (
     NamedSamples,
     checked_samples,
@@ -23,10 +23,11 @@ from probewise._posterior_samples import (
 )
 from probewise._version import __version__
 from probewise.effects import EFFECTS, name_without_copy_suffix
-from probewise.errors import FileError, ParameterError, ProbewiseError
+from probewise.errors import FileError, ParameterError, message_of
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
+from probewise.sensor import Stage
 from probewise.systems.forms.rebinding import StoredFit, counts_from_far_origin
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
@@ -100,7 +101,9 @@ class FittedSystem(NamedSamples):
         ]
         if lacking:
             raise ParameterError("names", self.names, f"all parameters of the simulator; {lacking[0]} is missing")
-        if self.known is None and not set(self.effects) <= set(EFFECTS):
+        checked_texts("notes", self.notes, "reasons to use the result with care")
+        effects = checked_texts("effects", self.effects, "names of effects")
+        if self.known is None and any(getattr(EFFECTS.get(name), "stage", None) != Stage.NOISE for name in effects):
             raise ParameterError("effects", list(self.effects), "effects on the noise alone, unless `known` is given")
         require_masks_of_absent_effects(self.absent, self.effects, len(samples))
         object.__setattr__(self, "samples", samples)
@@ -223,8 +226,10 @@ class FittedSystem(NamedSamples):
             raise
         except (KeyError, IndexError) as error:
             raise FileError(path, f"no entry {error}", f"every entry of {_WHAT}") from error
-        except (ProbewiseError, ValueError, TypeError, AttributeError) as error:
-            raise FileError(path, f"contents that do not fit together ({error})", f"undamaged: {_WHAT}") from error
+        except Exception as error:  # effects of a damaged recording, bound to it again, may raise anything
+            raise FileError(
+                path, f"contents that do not fit together ({message_of(error, kind=False)})", f"undamaged: {_WHAT}"
+            ) from error
 
 
 def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator) -> FittedSystem:

@@ -405,7 +405,10 @@ def _chain_samples_and_whether_drawn(
             # One stratified draw from the prior for each sample.
             out[:, k] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
         else:
-            effect = next(own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}."))
+            per_run = (own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}."))
+            effect = next(per_run, None)
+            if effect is None:  # its effect, bound to the recording again, has other parameters
+                raise ParameterError("names", fitted.names, f"all parameters of the effects; {name} is missing")
             known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
             positive = effect == NoisePerRun.name  # positive parameters scatter in the logarithm
             drawn = draw_value_for_new_run(np.log(known) if positive else known, rng=rng)

@@ -192,7 +192,9 @@ class Inquiry(ShowsItself):
         """
         value = checked_finite_number("reading", reading, "a finite number; leave out a missing reading")
         if setting is None and self._next is None:
-            way_out = "the setting of this reading: tell(reading, setting); next() has chosen none since the last reading"
+            way_out = (
+                "the setting of this reading: tell(reading, setting); next() has chosen none since the last reading"
+            )
             raise ParameterError("setting", None, way_out)
         at = self._settings.checked_setting(self._next if setting is None else setting)
         readings = _append_reading(self._readings, self._model, at, value)

@@ -22,7 +22,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.errors import NotConvergedError, ParameterError
+from probewise.errors import NotConvergedError, ParameterError, message_of
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
 from probewise.nested.hills import HillEstimate, log_evidence_of_unmet_hills
@@ -216,9 +216,11 @@ def check_and_repeat(
                 )
                 now, second = _choose_agreeing_run_and_estimate(second, now, again)
             now = _with_check_stored(now, second, n_check)
-    except NotConvergedError as error:
-        # A second estimate may evaluate hypotheses that the first run never met.
-        notes = (f"the second pass, which checks the evidence, failed: {error}",)
+    except Exception as error:
+        # A second estimate may evaluate hypotheses that the first run never met. Whatever a check meets, a posterior
+        # narrower than floats among it, the run that ended is kept.
+        why = str(error) if isinstance(error, NotConvergedError) else message_of(error)
+        notes = (f"the second pass, which checks the evidence, failed: {why}",)
     return replace(now, n_calls=budget.spent, warnings=(*now.warnings, *notes, *missing.doubts(now)))
 
 

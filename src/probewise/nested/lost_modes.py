@@ -41,10 +41,12 @@ def _n_early_dead_points(run: NestedResult) -> int:
 def sds_after_early_dead_points(run: NestedResult, space: Space) -> FloatArray:
     """Compute the sds of the 600 points that die next after the early ones, in coordinates of the space, (n_params,).
 
-    Early dead points are those that hold the first tenth of the posterior's mass.
+    Early dead points are those that hold the first tenth of the posterior's mass. No sd is below the spacing of
+    floating-point numbers there, nor so small that squared distances in sds overflow.
     """
     last = _n_early_dead_points(run)
-    return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
+    u = space.enter(run.theta[last : last + _BLOCK])
+    return np.asarray(np.maximum(u.std(axis=0), np.maximum(np.spacing(np.abs(u).max(axis=0)), 1e-150)))
 
 
 def peaks_climbed_from_early_points(

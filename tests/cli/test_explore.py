@@ -126,7 +126,7 @@ REFUSED = {
     "into the table": (("--heights", "0,10"), "finite, greater than 0"),
     "no angle": (("--orientations", "0,north"), "not a list of numbers"),
     "no end": (("--orientations", "inf"), "not a list of numbers"),
-    "never": (("--repeats", "1,0"), "not a whole number greater than 0"),
+    "never": (("--repeats", "1,0"), "not a whole number from 1 to 1,000"),
 }
 
 

@@ -11,13 +11,18 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 from probewise._kinds import did_you_mean
-from probewise.errors import ProbewiseError
+from probewise.errors import ProbewiseError, shown
 
 DEFAULT_SEED = 2013  # year of the paper; printed with every run
+MOST = 100_000
+"""Largest count that an option takes unless it says otherwise: of more readings, runs or live points the time, days at
+least, and the memory have no bound."""
+MOST_BATCH = 100  # readings chosen at a time, each given those before it
 
 
 @dataclass(frozen=True)
@@ -80,9 +85,11 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary; errors still show")
 
 
-def add_count_option(parser: argparse._ActionsContainer, name: str, about: str, *, default: int | None = None) -> None:
-    """Add an option that takes a whole number greater than 0."""
-    parser.add_argument(name, type=parse_positive_int, default=default, metavar="N", help=about)
+def add_count_option(
+    parser: argparse._ActionsContainer, name: str, about: str, *, default: int | None = None, most: int = MOST
+) -> None:
+    """Add an option that takes a whole number from 1 to `most`."""
+    parser.add_argument(name, type=partial(parse_positive_int, most=most), default=default, metavar="N", help=about)
 
 
 def add_path(
@@ -106,24 +113,24 @@ def parse_path(text: str) -> Path:
     return Path(text)
 
 
-def _parse_whole_number(text: str, *, least: int, allowed: str) -> int:
+def _parse_whole_number(text: str, *, least: int, most: int, allowed: str) -> int:
     try:
         value = int(text)
     except ValueError:
         value = least - 1
-    if value < least:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number {allowed}")
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(f"{shown(text)} is not a whole number {allowed}")
     return value
 
 
-def parse_positive_int(text: str) -> int:
-    """Parse an integer above zero, for argparse."""
-    return _parse_whole_number(text, least=1, allowed="greater than 0")
+def parse_positive_int(text: str, *, most: int = MOST) -> int:
+    """Parse an integer from 1 to `most`, for argparse."""
+    return _parse_whole_number(text, least=1, most=most, allowed=f"from 1 to {most:,}")
 
 
 def parse_seed(text: str) -> int:
     """Parse an integer of 0 or more, for argparse."""
-    return _parse_whole_number(text, least=0, allowed="of 0 or more")
+    return _parse_whole_number(text, least=0, most=2**128 - 1, allowed="of 0 or more, less than 2^128")
 
 
 def positive_number_parser(unit: str) -> Callable[[str], float]:
@@ -135,7 +142,7 @@ def positive_number_parser(unit: str) -> Callable[[str], float]:
         except ValueError:
             value = math.nan
         if not 0 < value < math.inf:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a number of {unit} greater than 0")
+            raise argparse.ArgumentTypeError(f"{shown(text)} is not a number of {unit} greater than 0")
         return value
 
     return read

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 from collections.abc import Iterator
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 
 from probewise.cli._common import message_to_resume, parse_positive_int
@@ -17,7 +18,13 @@ from probewise.progress import Progress
 def add_executor(parser: argparse.ArgumentParser) -> None:
     """Add --workers and --scheduler."""
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=parse_positive_int, default=1, metavar="N", help="processes here (default 1)")
+    where.add_argument(
+        "--workers",
+        type=partial(parse_positive_int, most=1024),
+        default=1,
+        metavar="N",
+        help="processes here (default 1)",
+    )
     where.add_argument(
         "--scheduler", metavar="HOST:PORT", help="a dask scheduler whose workers do it (extra `cluster`)"
     )

@@ -19,9 +19,6 @@ from probewise.cli._output import checked_output_directory, staged_output, table
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
-MOST_LIVE = 100_000
-"""More live points than this take days and all memory."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise calibrate`."""
@@ -110,11 +107,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _checked_n_live(n_live: int, orders: Sequence[int]) -> int:
-    """Return `n_live`; raise ParameterError if it is too large, or too small for the largest number of Gaussians."""
+    """Return `n_live`; raise ParameterError if it is too small for the largest number of Gaussians."""
     from probewise.nested import LIVE_PER_PARAM, least_live
 
-    if n_live > MOST_LIVE:
-        raise ParameterError("--live", n_live, f"up to {MOST_LIVE:,}; time and memory grow with it")
     n_params = 6 * max(orders) + 2
     least, most = least_live(n_params), (n_live // LIVE_PER_PARAM - 2) // 6
     if n_live >= least:

@@ -17,6 +17,7 @@ from probewise.cli._arm import (
     warn_if_place_sd_large,
 )
 from probewise.cli._common import (
+    MOST_BATCH,
     Verb,
     add_count_option,
     add_out_directory,
@@ -29,7 +30,7 @@ from probewise.cli._common import (
 )
 from probewise.cli._output import checked_output_directory, staged_output, tables_and_descriptions
 from probewise.cli._stopping import reporting_what_is_kept
-from probewise.errors import FileError
+from probewise.errors import FileError, shown
 from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a card that lies on the field, its centre and size in mm, its albedo from 0 (as the field) to 1 (as the "
         "shape); may be given again",
     )
-    parser.add_argument("--batch", type=parse_positive_int, default=1, metavar="N", help="choose N readings at a time")
+    add_count_option(parser, "--batch", "choose N readings at a time", default=1, most=MOST_BATCH)
     more = parser.add_argument_group("more than a place", "further choices, for an arm that supports them")
     more.add_argument(
         "--orientations", type=_parse_numbers, metavar="DEG,...", help="orientations to choose from, such as 0,45,90"
@@ -273,13 +274,13 @@ def _parse_numbers(text: str) -> tuple[float, ...]:
     except ValueError:
         values = (math.nan,)
     if not all(map(math.isfinite, values)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 0,45,90")
+        raise argparse.ArgumentTypeError(f"{shown(text)} is not a list of numbers such as 0,45,90")
     return tuple(dict.fromkeys(values))
 
 
 def _parse_counts(text: str) -> tuple[int, ...]:
     """Parse "N,M,...", integers above zero, each once, for argparse."""
-    return tuple(dict.fromkeys(parse_positive_int(cell) for cell in text.split(",")))
+    return tuple(dict.fromkeys(parse_positive_int(cell, most=1000) for cell in text.split(",")))
 
 
 def _journal_to_resume(journal: Path, *, resume: bool) -> Journal | None:

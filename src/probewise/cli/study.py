@@ -8,11 +8,11 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import (
+    MOST_BATCH,
     Verb,
     add_count_option,
     add_out_directory,
     add_quiet,
-    parse_positive_int,
     parse_seed,
     print_result,
 )
@@ -27,14 +27,17 @@ if TYPE_CHECKING:
     from probewise.study import SearchConfiguration
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
+MOST_CIRCLES = 10_000  # of a row: a month of processor time, and a list of tasks that fits in memory
 _SIZES = ("small", "plain", "gross")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise study`."""
     add_out_directory(parser)
-    add_count_option(parser, "--circles", "circles per row, always the first ones (default 200)", default=200)
-    add_count_option(parser, "--quoted", "circles of the first row (default as --circles)")
+    add_count_option(
+        parser, "--circles", "circles per row, always the first ones (default 200)", default=200, most=MOST_CIRCLES
+    )
+    add_count_option(parser, "--quoted", "circles of the first row (default as --circles)", most=MOST_CIRCLES)
     parser.add_argument(
         "--concealed",
         action="store_true",
@@ -45,7 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed", type=parse_seed, metavar="S", help="with --concealed: circles, noise and robot of another seed"
     )
     parser.add_argument("--size", choices=_SIZES, help="with --concealed: only this one of the three sizes")
-    add_count_option(parser, "--clean", "with --concealed: circles of the row without a concealed effect")
+    add_count_option(
+        parser, "--clean", "with --concealed: circles of the row without a concealed effect", most=MOST_CIRCLES
+    )
     parser.add_argument(
         "--beside-paper",
         action="store_true",
@@ -58,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     one.add_argument("--utility", metavar="NAME", help="acquisition function: finishing, information, entropy, ...")
     one.add_argument("--noise", type=float, metavar="SD", help="sd of the noise, LEGO units (reference: 1)")
     one.add_argument("--width", type=float, metavar="F", help="assumed width of the SSF over the true one")
-    one.add_argument("--batch", type=parse_positive_int, metavar="N", help="number of readings chosen at a time")
+    add_count_option(one, "--batch", "number of readings chosen at a time", most=MOST_BATCH)
     one.add_argument("--learn-sensor", action="store_true", default=None, help="learn the sensor along with the shape")
     one.add_argument("--method", metavar="NAME", help="how the robot infers and chooses: particles or paper")
     one.add_argument(

@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import parse_arm, parse_place
-from probewise.cli._arm_tasks.opening import MOST_READINGS, confirm_lowering, open_instrument, prompter_unless_dry_run
+from probewise.cli._arm_tasks.opening import confirm_lowering, open_instrument, prompter_unless_dry_run
 from probewise.cli._common import print_result, print_warning
 from probewise.errors import ParameterError
 
@@ -29,8 +29,6 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
 
     if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
         raise ParameterError("--arm", arguments.arm, "nxt:PORT, or emulator:TRUE.toml")
-    if arguments.readings > MOST_READINGS:
-        raise ParameterError("--readings", arguments.readings, f"up to {MOST_READINGS}")
     width, height = geometry.field_mm
     places = [parse_place("X,Y", text) for text in arguments.places]
     places = places or [(width / 2, height / 2), *((x, y) for x, y in spread_mark_places(geometry).tolist())]

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from probewise.cli._bench import SimulatedBench
 
 UNITS = "LEGO units (1 dark to 100 bright)"
-MOST_READINGS = 100_000
-"""Limit of readings at one place or in one scan."""
 
 
 def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:

@@ -7,9 +7,8 @@ import math
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import parse_arm, parse_place
-from probewise.cli._arm_tasks.opening import MOST_READINGS, UNITS, confirm_lowering, open_instrument, open_lego_arm
+from probewise.cli._arm_tasks.opening import UNITS, confirm_lowering, open_instrument, open_lego_arm
 from probewise.cli._common import print_result
-from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry
@@ -31,8 +30,6 @@ def scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm.carry_out import reachable_places_of
 
     start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
-    if arguments.readings > MOST_READINGS:
-        raise ParameterError("--readings", arguments.readings, f"up to {MOST_READINGS}")
     places = np.linspace(start, end, arguments.readings)
     if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before connecting to the brick
         require_within_reach(geometry, places, "reading of the scan")

@@ -22,7 +22,7 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
     Raises
     ------
     ParameterError
-        If there is a text, a date, a complex number, a set or a ragged list.
+        If there is a text, a date, a complex number, a set, a ragged list, or a whole number beyond floats.
     """
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(np.object_), np.nan)
@@ -35,9 +35,9 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
         if texts or array.dtype.kind not in "biufO":
             raise ParameterError(name, values, allowed)
         return array.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        if isinstance(error, ParameterError):
-            raise
+    except ParameterError:
+        raise
+    except Exception as error:  # objects may raise anything where a number is wanted
         raise ParameterError(name, values, allowed) from error
 
 

@@ -6,6 +6,7 @@ import difflib
 import inspect
 import math
 import os
+import sys
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from probewise.errors import ParameterError, UnitWarning
 
 _FULL_TURN_RAD = math.tau * (1 + 1e-9)
+_MOST = 10_000_000  # of anything that is counted: more fill the memory
 _MOST_LISTED = 250  # characters of names, so that what was perhaps meant is not cut off
 
 
@@ -31,7 +33,10 @@ def require_rng(rng: object) -> None:
 def checked_number(name: str, value: object, allowed: str = "a number") -> float:
     """Return a real number (NaN and infinity included) as a float; raise ParameterError for anything else."""
     if isinstance(value, Real) or (isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf"):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ParameterError(name, value, f"{allowed}, within the range of floats") from None
     raise ParameterError(name, value, allowed)
 
 
@@ -43,18 +48,21 @@ def checked_finite_number(name: str, value: object, allowed: str = "a finite num
     return number
 
 
-def checked_whole(name: str, value: object, *, least: int | None = 1) -> int:
-    """Return a whole number, `least` or more (None: any), as an int; raise ParameterError for anything else."""
-    if isinstance(value, Integral) and not isinstance(value, bool) and (least is None or int(value) >= least):
-        return int(value)
-    raise ParameterError(name, value, "a whole number" + ("" if least is None else f", {least} or more"))
+def checked_whole(name: str, value: object, *, least: int | None = 1, most: int | None = _MOST) -> int:
+    """Return a whole number from `least` to `most` (None: any) as an int; raise ParameterError for anything else."""
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        number = int(value)
+        if (least is None or number >= least) and (most is None or number <= most):
+            return number
+    bounds = ("" if least is None else f", {least} or more") + ("" if most is None else f", up to {most:,}")
+    raise ParameterError(name, value, f"a whole number{bounds}")
 
 
 def checked_pair(name: str, value: object, allowed: str = "two finite numbers (x, y)") -> tuple[float, float]:
     """Return two finite numbers as a tuple of floats, or raise ParameterError."""
     if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | bytes) and len(value) == 2:
         first, second = value
-        if all(isinstance(v, Real) and math.isfinite(v) for v in (first, second)):
+        if _is_finite_real(first) and _is_finite_real(second):
             return float(first), float(second)
     raise ParameterError(name, value, allowed)
 
@@ -64,9 +72,14 @@ def checked_one_or_several_numbers(name: str, value: object) -> tuple[float, ...
     if isinstance(value, Real):
         value = (value,)
     array_like = isinstance(value, Sequence | np.ndarray | range) and not isinstance(value, str | bytes)
-    if not array_like or not all(isinstance(v, Real) and math.isfinite(v) for v in value):  # type: ignore[attr-defined]
+    if not array_like or not all(map(_is_finite_real, value)):  # type: ignore[attr-defined]
         raise ParameterError(name, value, "a number, or several in a list")
     return tuple(v.item() if isinstance(v, np.generic) else v for v in value)  # type: ignore[attr-defined]
+
+
+def _is_finite_real(value: object) -> bool:
+    """Return whether a value is a real number within the range of floats; whole numbers of any size are none beyond."""
+    return isinstance(value, Real) and abs(value) <= sys.float_info.max
 
 
 def require_one_of(name: str, value: object, known: Sequence[str]) -> None:

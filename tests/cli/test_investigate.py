@@ -75,7 +75,7 @@ def test_what_stands_in_the_folder_is_not_lost(few, tmp_path, capsys):
     [
         (("--truth", "bcklash:1"), "did you mean backlash"),
         (("--minutes", "-1"), "greater than 0"),
-        (("--readings", "0"), "greater than 0"),
+        (("--readings", "0"), "from 1 to 100,000"),
         (("--plan", "nowhere.csv"), "nowhere.csv"),
     ],
 )

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from typing import Any
 
+from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.campaign import run_campaign
 from probewise.challenge.case import Task, run_case
-from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 
 
@@ -54,8 +54,7 @@ def run_challenge(
     FileError, NotConvergedError
         See `run_campaign`.
     """
-    if n_cases < 1:
-        raise ParameterError("n_cases", n_cases, "1 or more")
+    checked_whole("n_cases", n_cases, most=100_000)
     return run_cases(range(n_cases), seed=seed, work=work, of=of, path=path, executor=executor, progress=progress)
 
 

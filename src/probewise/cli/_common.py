@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from probewise._kinds import did_you_mean
-from probewise.errors import ProbewiseError, shown
+from probewise.errors import ProbewiseError, shortened, shown
 
 DEFAULT_SEED = 2013  # year of the paper; printed with every run
 MOST = 100_000
@@ -43,7 +43,7 @@ class OneLineParser(argparse.ArgumentParser):
     """An argument parser that reports errors in one line, with a suggestion for misspelt options."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: {shortened(message)} (see {self.prog} --help)\n")
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from probewise.study import SearchConfiguration
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
-MOST_CIRCLES = 10_000  # of a row: a month of processor time, and a list of tasks that fits in memory
+MOST_CIRCLES = 10_000  # as of `probewise.study`, which takes a second to import
 _SIZES = ("small", "plain", "gross")
 
 

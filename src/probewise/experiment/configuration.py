@@ -43,6 +43,7 @@ from probewise.scene.albedo import Shape, require_shape
 from probewise.scene.any_of import AnyOf
 from probewise.sensor.stages import SensorModel
 
+_MOST_BATCH = 100
 _MOST_LIFTED = 10.0
 """Largest factor between reading height and calibrated height, either way."""
 
@@ -192,8 +193,10 @@ class Experiment:
             raise ParameterError("n_samples", self.n_samples, "2 or more: one hypothesis leaves nothing to ask")
         if self.n_particles < max(self.n_samples, 100):
             raise ParameterError("n_particles", self.n_particles, "100 or more, and no fewer than n_samples")
-        if self.batch < 1 or (self.batch > 1 and self.utility not in (Finishing(), InformationGain())):
-            raise ParameterError("batch", self.batch, "1, or more with the utility Finishing() or InformationGain()")
+        most = _MOST_BATCH if self.utility in (Finishing(), InformationGain()) else 1
+        if not 1 <= self.batch <= most:
+            allowed = f"1, or up to {_MOST_BATCH} with the utility Finishing() or InformationGain()"
+            raise ParameterError("batch", self.batch, allowed)
 
     def _require_heights(self) -> None:
         """Raise ParameterError unless the heights are positive and within a factor of ten of the calibration's."""

@@ -13,6 +13,8 @@ from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
 from probewise.recordings.plan import Plan
 
+_MOST_REPEATS = 1000
+
 
 @dataclass(frozen=True)
 class Design:
@@ -53,8 +55,8 @@ class Designs:
     def __post_init__(self) -> None:
         if not self.orientations_rad or not np.isfinite(self.orientations_rad).all():
             raise ParameterError("orientations_rad", self.orientations_rad, "one finite angle or more")
-        if not self.repeats or min(self.repeats) < 1:
-            raise ParameterError("repeats", self.repeats, "one number or more, each 1 or greater")
+        if not self.repeats or min(self.repeats) < 1 or max(self.repeats) > _MOST_REPEATS:
+            raise ParameterError("repeats", self.repeats, f"one number or more, each from 1 to {_MOST_REPEATS}")
         for name, values in self.settings:
             if not values or not np.isfinite(values).all():
                 raise ParameterError(f"settings {name}", values, "one finite value or more")

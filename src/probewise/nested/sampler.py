@@ -54,11 +54,25 @@ _STUCK_SHARE = 0.02
 # Chains of each first live point where some began at others: after three, ln Z of a prior of which one in 5,000 is
 # possible was still 0.7 too low.
 _MIXING = 10
+_MOST_BYTES = 2**28  # of one array of each kind for all live points; the points that die take tens of times as much
 
 
 def least_live(n_params: int) -> int:
     """Return the least number of live points for a problem: two per parameter, 10 at least."""
     return max(LIVE_PER_PARAM * n_params, 10)
+
+
+def checked_n_live(n_live: object, n_params: int) -> int:
+    """Return a number of live points for a problem; raise ParameterError where they are too few, or fill the memory."""
+    least, most = least_live(n_params), _MOST_BYTES // (8 * (2 * n_params + 3))
+    number = checked_whole("n_live", n_live, least=None, most=None)
+    if number < least:
+        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
+    if number > most:
+        way_out = "for a smaller error merge the results of several runs: nested.merge"
+        allowed = f"up to {most:,} for {n_params} parameters, whose arrays take {_MOST_BYTES >> 20} MB; {way_out}"
+        raise ParameterError("n_live", n_live, allowed)
+    return number
 
 
 def move_at_volume(move: Move, log_volume: float) -> Move:
@@ -237,14 +251,11 @@ def _checked_n_live_and_n_replaced(
     n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int
 ) -> tuple[int, int]:
     """Return the number of live points and that of those replaced per round, or raise ParameterError."""
-    least = least_live(n_params)
-    n_live = checked_whole("n_live", n_live, least=None)
-    if n_live < least:
-        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
+    n_live = checked_n_live(n_live, n_params)
     n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
     if not 1 <= n_replaced <= n_live // 2:
         raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
-    if max_calls is not None and checked_whole("max_calls", max_calls, least=None) < n_live:
+    if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
         raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
     return n_live, n_replaced
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, floats
 from probewise._kinds import require_kind, require_mapping
@@ -94,14 +94,22 @@ def texts_to_numbers(values: ArrayLike) -> ArrayLike:
 
     A column without texts, or with a text that is none of these, is returned unchanged.
     """
-    cells = values if isinstance(values, str) else np.asarray(values)
-    if isinstance(cells, str) or cells.ndim != 1 or cells.dtype.kind not in "OUT":
+    cells = values if isinstance(values, str) else _array_or_none(values)
+    if isinstance(cells, str) or cells is None or cells.ndim != 1 or cells.dtype.kind not in "OUT":
         return values
     try:
         read = [_number_or_nan(cell) for cell in cells.tolist()]
-    except ValueError:
+        return np.array(read, dtype=np.float64)
+    except (ValueError, OverflowError):
         return values
-    return np.array(read, dtype=np.float64)
+
+
+def _array_or_none(values: ArrayLike) -> NDArray[Any] | None:
+    """Return values as an array; None for a ragged list, which `floats` refuses by its name."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        return None
 
 
 def _number_or_nan(cell: Any) -> Any:

@@ -14,13 +14,14 @@ from probewise._arrays import (
     BoolArray,
     FloatArray,
     IntArray,
+    floats,
     frozen_int,
     read_only_floats,
     require_finite,
     rounding_error,
 )
 from probewise._display import ShowsItself
-from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
+from probewise._kinds import checked_finite_number, checked_texts, checked_whole, require_kind, warn_of_likely_degrees
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
     A_SESSION,
@@ -71,9 +72,7 @@ class Instrumentation:
         for name in ("step", "height_mm"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "a number greater than 0")
-        if isinstance(self.controls, str) or not all(isinstance(name, str) for name in self.controls):
-            raise ParameterError("controls", self.controls, "a tuple of texts")
-        object.__setattr__(self, "controls", tuple(self.controls))
+        object.__setattr__(self, "controls", checked_texts("controls", self.controls, "names of columns"))
 
     @property
     def unit_after_number(self) -> str:
@@ -113,7 +112,9 @@ class Plan:
         if len(self.sessions) not in (0, len(self.scan_names)):
             allowed = f"one number per scan ({len(self.scan_names)}), or none"
             raise ParameterError("sessions", self.sessions, allowed)
-        object.__setattr__(self, "sessions", tuple(checked_whole("sessions", each, least=0) for each in self.sessions))
+        object.__setattr__(
+            self, "sessions", tuple(checked_whole("sessions", each, least=0, most=None) for each in self.sessions)
+        )
         for name in ("scan_names", "pattern_names"):
             names: object = getattr(self, name)
             if isinstance(names, str) or not all(isinstance(n, str) for n in getattr(self, name)):
@@ -205,7 +206,8 @@ class Plan:
         >>> len(plan), plan.pattern_names
         (3, ('pattern',))
         """
-        sizes = [np.size(values) for values in (x_mm, y_mm) if np.ndim(values) > 0]
+        x_mm, y_mm = floats(x_mm, "x_mm"), floats(y_mm, "y_mm")
+        sizes = [values.size for values in (x_mm, y_mm) if values.ndim > 0]
         x = numbers_per_reading("x_mm", x_mm, sizes[0] if sizes else 1)
         n_points = len(x)
         turns = numbers_per_reading("orientation_rad", orientation_rad, n_points)
@@ -384,9 +386,10 @@ class Recording(ShowsItself):
         >>> recording.plan.pattern_names, int(recording.usable.sum())
         (('edge',), 3)
         """
-        sizes = [np.size(places) for places in (x_mm, y_mm) if np.ndim(places) > 0]
-        fitting = np.ndim(readings) == 0 or not sizes or np.size(readings) in sizes
-        values = numbers_per_reading("readings", texts_to_numbers(readings), None if fitting else sizes[0])
+        x_mm, y_mm, numbers = floats(x_mm, "x_mm"), floats(y_mm, "y_mm"), floats(texts_to_numbers(readings), "readings")
+        sizes = [places.size for places in (x_mm, y_mm) if places.ndim > 0]
+        fitting = numbers.ndim == 0 or not sizes or numbers.size in sizes
+        values = numbers_per_reading("readings", numbers, None if fitting else sizes[0])
         plan = Plan.from_arrays(
             x_mm=numbers_per_reading("x_mm", x_mm, len(values)),
             y_mm=y_mm,

@@ -12,6 +12,8 @@ from probewise.errors import ParameterError
 from probewise.scene import Circle, Field
 
 FIELD = Field()
+MOST_CIRCLES = 10_000
+"""Largest number of circles of a row: a month of processor time, whose tasks are listed in memory."""
 _SEED = 2013
 
 

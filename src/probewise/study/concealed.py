@@ -17,13 +17,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
 from probewise.campaign import run_campaign
 from probewise.experiment import CLEAN, TRUST, left_out_after_step, recording_of
 from probewise.progress import Progress, silent
 from probewise.recordings import Disc
-from probewise.study.circles import FIELD, POPULATIONS
+from probewise.study.circles import FIELD, MOST_CIRCLES, POPULATIONS
 from probewise.study.rows import REFERENCE
 from probewise.study.table import WRONG_MM, Estimate, share_with_interval
 from probewise.study.trial import (
@@ -245,6 +246,8 @@ def run_concealed(
     executor, progress
         As for `run_study`.
     """
+    for n in (n_circles, n_clean or n_circles):
+        checked_whole("n_circles", n, most=MOST_CIRCLES)
     rows = {("", 0): n_clean or n_circles, **{(name, size): n_circles for name in effects for size in sizes}}
     trials = [
         ConcealedTrial(name, size, circle, trust, max_readings, seed)

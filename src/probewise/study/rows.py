@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
@@ -60,8 +59,8 @@ class SearchConfiguration:
             raise ParameterError("model", self.model, "ssf or naive")
         utility_named(self.utility)
         for name in ("noise_sd", "width"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ParameterError(name, getattr(self, name), "finite, greater than 0")
+            if not 1e-3 <= getattr(self, name) <= 1e3:
+                raise ParameterError(name, getattr(self, name), "from 0.001 to 1000")
         if self.model == "naive":
             for name, plain in (("width", 1.0), ("learn_sensor", False)):
                 if getattr(self, name) != plain:

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.campaign import read_campaign, run_campaign
 from probewise.errors import FileError, ParameterError
 from probewise.progress import Progress, silent
+from probewise.study.circles import MOST_CIRCLES
 from probewise.study.rows import SearchConfiguration
 from probewise.study.table import Summary, summarise
 from probewise.study.trial import Trial, run_trial
@@ -67,8 +69,7 @@ def run_study(
     if not wanted:
         raise ParameterError("rows", rows, "one row or more, such as those of standard_rows()")
     for row, n in wanted.items():
-        if n < 1:
-            raise ParameterError(f"circles of the row {row.name!r}", n, "1 or more")
+        checked_whole(f"circles of the row {row.name!r}", n, most=MOST_CIRCLES)
     # Circle by circle, so that an interrupted study has equally many runs in each row.
     trials = [Trial(row, k, max_readings) for k in range(max(wanted.values())) for row, n in wanted.items() if k < n]
     results = run_campaign(

@@ -91,7 +91,7 @@ class Inquiry(ShowsItself):
         self._goal = _checked_goal(goal, self._model.prior.names)
         self._cost_s = cost_s
         self._n_samples, self._n_live = (
-            checked_whole("n_samples", n_samples, least=400),
+            checked_whole("n_samples", n_samples, least=400, most=1_000_000),
             checked_whole("n_live", n_live),
         )
         self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)

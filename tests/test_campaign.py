@@ -8,7 +8,7 @@ from multiprocessing import get_all_start_methods, get_context
 import pytest
 
 from probewise.campaign import read_campaign, run_campaign
-from probewise.errors import FileError, NotConvergedError, ParameterError
+from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError
 
 TASKS = {f"task {k}": k for k in range(12)}
 SETTINGS = {"seed": 1, "rows": ["a", "b"]}
@@ -98,6 +98,23 @@ def test_a_worker_that_dies_loses_nothing(tmp_path):
         run_campaign(die, TASKS, path=path, settings=SETTINGS, executor=pool)
     kept = read_campaign(path).results
     assert kept == {f"task {k}": square(k) for k in range(5)}
+    assert run_campaign(square, TASKS, path=path, settings=SETTINGS) == {key: square(k) for key, k in TASKS.items()}
+
+
+def test_an_executor_that_drops_its_tasks_loses_nothing(tmp_path):
+    """As that of a cluster whose scheduler was killed."""
+
+    class Dropping(ThreadPoolExecutor):
+        def submit(self, work, k):
+            future = super().submit(work, k)
+            future.result()
+            if k == 3:
+                future._state = "CANCELLED_AND_NOTIFIED"
+            return future
+
+    path = tmp_path / "c.jsonl"
+    with Dropping(1) as lost, pytest.raises(LinkError, match="the connection to its scheduler was lost"):
+        run_campaign(square, TASKS, path=path, settings=SETTINGS, executor=lost)
     assert run_campaign(square, TASKS, path=path, settings=SETTINGS) == {key: square(k) for key, k in TASKS.items()}
 
 

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,14 +73,14 @@ def checked_one_or_several_numbers(name: str, value: object) -> tuple[float, ...
     if isinstance(value, Real):
         value = (value,)
     array_like = isinstance(value, Sequence | np.ndarray | range) and not isinstance(value, str | bytes)
-    if not array_like or not all(map(_is_finite_real, value)):  # type: ignore[attr-defined]
+    if not array_like or not all(_is_finite_real(v) for v in value):  # type: ignore[attr-defined]
         raise ParameterError(name, value, "a number, or several in a list")
     return tuple(v.item() if isinstance(v, np.generic) else v for v in value)  # type: ignore[attr-defined]
 
 
-def _is_finite_real(value: object) -> bool:
-    """Return whether a value is a real number within the range of floats; whole numbers of any size are none beyond."""
-    return isinstance(value, Real) and abs(value) <= sys.float_info.max
+def _is_finite_real(value: object) -> TypeGuard[float]:
+    """Return whether a value is a real number within the range of floats, which whole numbers may leave."""
+    return isinstance(value, Real) and bool(abs(value) <= sys.float_info.max)  # type: ignore[operator]
 
 
 def require_one_of(name: str, value: object, known: Sequence[str]) -> None:

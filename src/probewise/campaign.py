@@ -11,12 +11,12 @@ import contextlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from probewise.errors import FileError, NotConvergedError, ParameterError, shown
+from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
 from probewise.recordings.atomic import write_and_sync
@@ -75,6 +75,8 @@ def run_campaign(
         If the file belongs to another campaign, is damaged before its last line, or is being written to.
     NotConvergedError
         If a worker dies; finished results are kept.
+    LinkError
+        If the executor drops its tasks, as where a scheduler is killed; finished results are kept.
     ParameterError
         If a result is not a JSON object of finite numbers.
     Exception
@@ -177,9 +179,11 @@ def _results_as_tasks_end(
 
 
 def _result_of_future(future: Future[Result]) -> Result:
-    """Return a task's result; raise NotConvergedError if its worker died."""
+    """Return a task's result; raise NotConvergedError if its worker died, LinkError if its executor dropped it."""
     try:
         return future.result()
+    except CancelledError as error:
+        raise LinkError("the executor dropped its tasks: the connection to its scheduler was lost") from error
     except BrokenExecutor as error:
         raise NotConvergedError(
             f"a worker died ({error}); finished results are kept, and the same command continues from there"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from functools import partial
@@ -83,6 +84,9 @@ def _cluster_executor(address: str) -> Iterator[Executor]:
             "--scheduler needs the package distributed, which is not installed; "
             "install it with: pip install distributed; --workers N does without"
         ) from error
+    # A lost scheduler is reported in one line: its library's log would add a page.
+    for name in ("distributed", "distributed.client", "tornado", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=10)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:

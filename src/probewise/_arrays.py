@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +14,24 @@ from probewise.errors import ParameterError
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def own_arithmetic(function: Callable[P, T]) -> Callable[P, T]:
+    """Run a public function with floating-point errors as NumPy has them by default, whatever `np.seterr` says.
+
+    Underflow is ignored; what is ignored already stays so, and anything else is a warning, no error. A user's functions
+    that it calls run so, too.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **named: P.kwargs) -> T:
+        kept = {name: "ignore" if way == "ignore" else "warn" for name, way in np.geterr().items()}
+        with np.errstate(**{**kept, "under": "ignore"}):  # type: ignore[arg-type]
+            return function(*args, **named)
+
+    return call
 
 
 def floats(values: ArrayLike, name: str = "values") -> FloatArray:

@@ -13,7 +13,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_flag, require_like, require_rng
 from probewise._posterior_samples import MIN_SAMPLES
@@ -116,6 +116,7 @@ class Calibration(ShowsItself):
         return self.sensor.summary()
 
 
+@own_arithmetic
 def calibrate(
     recording: Recording,
     *,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from probewise._arrays import FloatArray, floats
+from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
 from probewise.effects import PredictiveMixture
@@ -22,6 +22,7 @@ from probewise.scene import KnownScene
 _BLOCK = 4_000_000
 
 
+@own_arithmetic
 def predict(
     sensor: FittedSensor,
     plan: Plan | Recording,

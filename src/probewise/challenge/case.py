@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from probewise._arrays import own_arithmetic
 from probewise.challenge.aliasing import cosines_with_vocabulary, residual_norms_with_one_named
 from probewise.challenge.coverage import effect_truths_and_intervals, place_overlap, sensor_truths_and_intervals
 from probewise.challenge.held_out import log_densities_of_scans
@@ -59,6 +60,7 @@ class RunCaseInRounds:
         return _case_result(task, partial(_investigation_result, rounds=self.rounds))
 
 
+@own_arithmetic
 def run_case(task: Task) -> dict[str, Any]:
     """Draw a case and diagnose it from its recording alone; return the diagnosis and the truth.
 

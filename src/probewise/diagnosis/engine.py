@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from probewise._arrays import own_arithmetic
 from probewise._kinds import require_like, require_progress, require_rng
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.advice.rivals import choose_next_measurement
@@ -46,6 +47,7 @@ Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]
 """Function that recomputes the evidence of a search; returns it with better probabilities, and both evidences."""
 
 
+@own_arithmetic
 def diagnose(
     recordings: Recording | Sequence[Recording],
     *,

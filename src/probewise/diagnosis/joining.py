@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern, have_same_albedo
 from probewise.recordings.plan import Plan, Recording, require_recording
@@ -16,6 +16,7 @@ from probewise.sensor import COMMANDED, with_declared_height_commanded
 from probewise.systems.joining import unused_name
 
 
+@own_arithmetic
 def join(recordings: Sequence[Recording]) -> Recording:
     """Concatenate recordings: scans remain distinct, and so do patterns of one name with different descriptions.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias, get_args
 
+from probewise._arrays import own_arithmetic
 from probewise.calibration import FittedSensor
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
@@ -17,6 +18,7 @@ from probewise.scene import Card, Field, Shape
 MethodName: TypeAlias = Literal["particles", "paper"]
 
 
+@own_arithmetic
 def experiment_from_names(
     sensor: FittedSensor,
     shape: Shape,

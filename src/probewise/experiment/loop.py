@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_path, checked_whole, require_callable, require_kind, require_rng
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, as_instrument, require_measures
@@ -54,6 +55,7 @@ from probewise.nested.importance import Weighted
 from probewise.sensor.commanded import require_possible_commands
 
 
+@own_arithmetic
 def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Generator) -> ExplorationState:
     """Return the state before the first reading: draws from the prior, and the pose with the largest utility.
 
@@ -88,6 +90,7 @@ def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Ge
     return ExplorationState((), posterior, pose, tuple(planned))
 
 
+@own_arithmetic
 def step(
     state: ExplorationState,
     reading: Reading,
@@ -330,6 +333,7 @@ def explore(
     )
 
 
+@own_arithmetic
 def run(
     instrument: Instrument | Measures,
     experiment: Experiment,

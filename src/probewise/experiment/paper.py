@@ -14,7 +14,7 @@ from typing import get_args
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
@@ -224,6 +224,7 @@ def student_t_likelihood(levels: FixedLevels, step: float | None) -> OneScan:
     return OneScan(floor, max(span, 10.0 * floor))
 
 
+@own_arithmetic
 def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> Naive:
     """Estimate the naive model's levels and sds from a recording's readings over black and over white.
 
@@ -253,6 +254,7 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
     return _naive_from_readings(black, white, scale_of(sensor.instrumentation).step)
 
 
+@own_arithmetic
 def naive_levels_from_world(
     world: World, scale: ReadingScale, *, rng: np.random.Generator, n_each: int = _N_EACH
 ) -> Naive:

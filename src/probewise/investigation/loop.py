@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_whole, require_accepts_positional, require_kind, require_rng
 from probewise.diagnosis import Diagnosis, SensorPrior, diagnose
 from probewise.effects import VOCABULARY, NamedEffect
@@ -22,6 +23,7 @@ Record: TypeAlias = Callable[[int, Plan, str], Recording]
 """Function of a round's number, its plan and the plan in words; returns the recording, which may be shorter."""
 
 
+@own_arithmetic
 def investigate(
     record: Record,
     plan: Plan,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray, floats
+from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise._kinds import checked_whole, require_rng
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evaluate import Evaluator, Samplable
@@ -33,6 +33,7 @@ class DiversifyTally:
     mixing: float
 
 
+@own_arithmetic
 def diversify(
     theta: FloatArray, problem: Samplable, *, rng: np.random.Generator, n_steps: int = 1000
 ) -> tuple[FloatArray, DiversifyTally]:

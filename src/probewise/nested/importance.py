@@ -17,7 +17,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from probewise._arrays import FloatArray, read_only_floats
+from probewise._arrays import FloatArray, own_arithmetic, read_only_floats
 from probewise._kinds import checked_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
@@ -151,6 +151,7 @@ def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
     return (*result.warnings, *apart)
 
 
+@own_arithmetic
 def update(
     previous: Posterior,
     problem: Samplable,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import weighted_mean_and_error
@@ -24,6 +24,7 @@ _DISAGREE = 1e-3
 _LEAST_ERROR = 1e-12
 
 
+@own_arithmetic
 def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
     """Merge independent runs of the same problem into one run with the live points of all.
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_whole, require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
@@ -28,6 +29,7 @@ from probewise.nested.space import unbounded_space_of
 _FIRST = 0.75  # share of the better form of density in the mixture
 
 
+@own_arithmetic
 def refine(
     result: Posterior,
     problem: Samplable,

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_number, require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import check_and_repeat
@@ -23,6 +24,7 @@ from probewise.nested.sampler import least_live, run_once
 from probewise.nested.stop import RoundSummary, StopRule
 
 
+@own_arithmetic
 def run(
     problem: Samplable | Callable[..., Any],
     prior: AnyPrior | None = None,

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
@@ -155,6 +155,7 @@ class ConcealedTrial:
         return f"{self.effect or CLEAN} / {self.size} / {self.circle} / {self.trust:g}"
 
 
+@own_arithmetic
 def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     """Search for a circle with a sensor that has a concealed effect.
 

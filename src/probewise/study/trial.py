@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm
 from probewise.experiment import (
     AdjustedMixture,
@@ -106,6 +106,7 @@ def experiment_of_trial(trial: Trial) -> Experiment:
     return replace(posed, model=model, likelihood=naive)
 
 
+@own_arithmetic
 def run_trial(trial: Trial) -> dict[str, Any]:
     """Search for a circle.
 

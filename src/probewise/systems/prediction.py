@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
@@ -108,6 +108,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     return recording
 
 
+@own_arithmetic
 def predict_system(
     fitted: FittedSystem, table: RunTable | Mapping[str, Any], *, rng: np.random.Generator, progress: Progress = silent
 ) -> SystemPrediction:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from probewise._arrays import own_arithmetic
 from probewise.challenge.case import Task, statements_to_score
 from probewise.challenge.coverage import effect_truths_and_intervals
 from probewise.challenge.scoring import NOISE, names_in_label
@@ -30,6 +31,7 @@ from probewise.world.systems import (
 _LIKELY = 0.05
 
 
+@own_arithmetic
 def run_system_case(task: Task) -> dict[str, Any]:
     """Draw a case, diagnose it from its simulator file and table alone, and return the diagnosis and the truth.
 

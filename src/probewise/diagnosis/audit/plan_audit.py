@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from probewise._arrays import FloatArray, read_only_floats
+from probewise._arrays import FloatArray, own_arithmetic, read_only_floats
 from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
@@ -228,6 +228,7 @@ def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:
     return [*lines, line.rstrip()] if names else []
 
 
+@own_arithmetic
 def audit_plan(
     plan: Plan | Recording,
     *,

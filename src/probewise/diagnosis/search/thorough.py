@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from probewise import nested
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.diagnosis.evidence.folded import fold_problem
 from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
@@ -48,6 +48,7 @@ _STEPS = 100  # steps of the bar per hypothesis
 Run = Callable[..., nested.NestedResult]
 
 
+@own_arithmetic
 def weigh_thoroughly(
     searched: Searched, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress = silent
 ) -> tuple[Searched, tuple[Weighing, ...]]:

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise.diagnosis.audit.detectability import LAMBDA, ExpectedSensor, PlanTemplates
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, audits_and_cosines
 from probewise.diagnosis.system.apparatus import ON_NOISE, SimulatorApparatus
@@ -27,6 +27,7 @@ _MOST_ROWS = 1200  # rows used
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
+@own_arithmetic
 def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> PlanAudit:
     """Determine for each effect whether readings in the rows of a table can detect it and tell it from the others.
 

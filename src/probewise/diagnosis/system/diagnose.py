@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from probewise._arrays import own_arithmetic
 from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
 from probewise.diagnosis.noise.law import white_noise_of_recording
@@ -36,6 +37,7 @@ from probewise.systems.forms.sorted_rows import sorting_column
 from probewise.systems.row_order import note_on_row_order
 
 
+@own_arithmetic
 def diagnose_system(
     simulator: Simulator,
     table: RunTable | Mapping[str, Any],

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from probewise import nested
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind, require_progress, require_rng
 from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
@@ -97,6 +97,7 @@ class SystemFit(ShowsItself):
         return "\n".join([*lines, own.parameter_table()])
 
 
+@own_arithmetic
 def fit_simulator(
     simulator: Simulator,
     table: RunTable | Mapping[str, Any],

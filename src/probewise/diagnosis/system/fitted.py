@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_kind
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
@@ -19,6 +19,7 @@ from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit
 
 
+@own_arithmetic
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
     """Return the repaired model of a diagnosis: the simulator with the effects that it leaves out.
 
@@ -30,6 +31,7 @@ def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
     return _fitted_system_of(diagnosis, "repaired")
 
 
+@own_arithmetic
 def calibrated_of(diagnosis: Diagnosis) -> FittedSystem:
     """Return the calibrated null model of a diagnosis: the simulator alone. Raises as `repaired_of`."""
     return _fitted_system_of(diagnosis, "null")

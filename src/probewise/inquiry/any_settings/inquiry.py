@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray, floats
+from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, did_you_mean, require_callable, require_rng
 from probewise.errors import ParameterError, ShapeError
@@ -68,6 +68,7 @@ class Inquiry(ShowsItself):
         If `cost_s` has not one number per setting.
     """
 
+    @own_arithmetic
     def __init__(
         self,
         model: Callable[..., Any],
@@ -117,6 +118,7 @@ class Inquiry(ShowsItself):
         return tuple(self._taken)
 
     @property
+    @own_arithmetic
     def utility(self) -> FloatArray:
         """Acquisition function of each setting, (n_settings,), per second if the costs in seconds are given.
 
@@ -136,6 +138,7 @@ class Inquiry(ShowsItself):
         return f"{_NEARER if self._is_near_goal else _BITS}{per_second}"
 
     @property
+    @own_arithmetic
     def settled(self) -> bool:
         """Whether the posterior sd of every parameter in the goal is at most its goal.
 
@@ -146,6 +149,7 @@ class Inquiry(ShowsItself):
         return self._largest_sd_over_goal <= 1.0
 
     @property
+    @own_arithmetic
     def doubt(self) -> str | None:
         """A warning if even the best posterior sample does not explain the readings (chi-square, p < 1e-6); or None.
 
@@ -164,6 +168,7 @@ class Inquiry(ShowsItself):
             "greater than stated"
         )
 
+    @own_arithmetic
     def next(self) -> Any:
         """Return the setting with the largest acquisition function, in the form of `settings`; ties break at random."""
         if self._next is None:
@@ -171,6 +176,7 @@ class Inquiry(ShowsItself):
             self._next = self._settings[row]
         return self._next
 
+    @own_arithmetic
     def tell(self, reading: float, setting: Any = None) -> None:
         """Update the posterior by a reading.
 
@@ -207,6 +213,7 @@ class Inquiry(ShowsItself):
         self._taken.append((at[0], value))
         self._utility, self._next = None, None
 
+    @own_arithmetic
     def several(self, n: int) -> list[Any]:
         """Choose the settings of `n` readings to be taken before any of them is known; best first.
 
@@ -233,6 +240,7 @@ class Inquiry(ShowsItself):
             rows.append(choose(utility, everywhere, rng=self._rng))
         return [self._settings[row] for row in rows]
 
+    @own_arithmetic
     def summary(self) -> str:
         """Describe the posterior in plain text."""
         found = self._posterior

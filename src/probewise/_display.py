@@ -64,7 +64,9 @@ class ShowsItself:
         for load in list(_waiting):
             load()
         _waiting.clear()
-        return render_html(self)
+        from probewise._arrays import own_arithmetic  # NumPy is loaded by the time there is a result
+
+        return own_arithmetic(render_html)(self)
 
     def _repr_pretty_(self, printer: Printer, cycle: bool) -> None:
         printer.text(str(self))

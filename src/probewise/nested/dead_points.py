@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, frozen_int, read_only_floats
+from probewise._arrays import FloatArray, IntArray, frozen_int, own_arithmetic, read_only_floats
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evidence import log_volumes
 from probewise.nested.weighted_samples import WeightedSamples
@@ -87,6 +87,7 @@ class DeadPoints(WeightedSamples):
         """Expected natural log of the prior share (volume X) with a likelihood above each sample's, (n_dead,)."""
         return log_volumes(self.n_at_death, self.log_start)
 
+    @own_arithmetic
     def mean(self, f: Callable[[FloatArray], FloatArray] | None = None, *, block: int | None = None) -> FloatArray:
         """Average the parameters, or any function of them, over the posterior.
 

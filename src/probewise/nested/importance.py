@@ -110,6 +110,7 @@ class Weighted(WeightedSamples):
         )
         return (*(words for so, words in reasons if so), *self.inherited)
 
+    @own_arithmetic
     def mean(self, f: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
         """Posterior mean of the parameters, (n_params,), or of `f(theta)`, (n, ...), of the trailing shape."""
         values = self.theta if f is None else np.asarray(f(self.theta))

@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_number, checked_whole, require_rng
 from probewise.errors import ParameterError
@@ -25,10 +25,12 @@ class WeightedSamples(ShowsItself):
         """Posterior mean of the parameters, (n_params,)."""
 
     @property
+    @own_arithmetic
     def weight(self) -> FloatArray:
         """Posterior weights, summing to one, (n,)."""
         return np.asarray(np.exp(self.log_weight))
 
+    @own_arithmetic
     def draw_rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
         """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
         require_rng(rng)
@@ -43,15 +45,18 @@ class WeightedSamples(ShowsItself):
         """
         return np.asarray(self.theta[self.draw_rows(n, rng=rng)])
 
+    @own_arithmetic
     def sd(self) -> FloatArray:
         """Posterior standard deviation of the parameters, (n_params,)."""
         return np.asarray(np.sqrt(self.weight @ (self.theta - self.mean()) ** 2))
 
+    @own_arithmetic
     def covariance(self) -> FloatArray:
         """Posterior covariance of the parameters, (n_params, n_params)."""
         centred = self.theta - self.mean()
         return np.asarray((centred * self.weight[:, None]).T @ centred)
 
+    @own_arithmetic
     def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
         """Weighted quantiles of each parameter at levels 0 to 1, (n_q,) -> (n_q, n_params); ParameterError outside."""
         return weighted_quantiles(self.theta, self.weight, q)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from probewise.arm import shipped_geometry_path
 from probewise.cli import VERBS, main
 from probewise.cli._geometry import parse_truth
 from probewise.scene import Field
@@ -93,6 +94,29 @@ def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, 
 )
 def test_options_that_contradict_each_other_are_refused_before_any_work(words, says, tmp_path, capsys):
     assert says in refused(capsys, tmp_path / "out", *words, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("value", ["9" * 30, "1" * 5000, "1e400", "nan", "-1", "0"], ids=lambda value: value[:6])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("calibrate", "rec.csv", "--live"), ("explore", "--sensor", "s.json", "--batch"),
+        ("explore", "--sensor", "s.json", "--repeats"), ("explore", "--sensor", "s.json", "--max-readings"),
+        ("study", "--circles"), ("study", "--concealed", "--clean"), ("study", "--batch"), ("study", "--workers"),
+        ("challenge", "--cases"), ("investigate", "--plan", "paper", "--rounds"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_a_count_out_of_range_is_refused_with_the_range(words, value, tmp_path, capsys):
+    said = refused(capsys, tmp_path / "out", *words[:-1], "--out", tmp_path / "out", f"{words[-1]}={value}")
+    assert "is not a whole number from 1 to" in said
+    assert len(said) < 500
+
+
+def test_no_warning_of_arithmetic_stands_beside_an_error(tmp_path, capsys):
+    arm = tmp_path / "arm.toml"
+    arm.write_text(shipped_geometry_path().read_text().replace("upper_mm = 350", "upper_mm = 1e-320"))
+    assert "reach is 'nowhere on the field'" in refused(capsys, tmp_path / "out", "arm", "check", "--geometry", arm)
 
 
 def test_a_scan_of_more_readings_than_memory_holds_is_refused(tmp_path, capsys):

@@ -45,6 +45,34 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20240229)
 
 
+def test_a_posterior_narrower_than_floats_is_doubted_and_kept() -> None:
+    with pytest.warns(DoubtfulResultWarning, match="within 0 steps between floating-point numbers"):
+        found = run(lambda p: -0.5 * (p[0] - 0.2) ** 2 * 1e40, {"x": (0, 1)}, rng=np.random.default_rng(1), n_live=60)
+    assert found.mean()[0] == 0.2
+
+
+def test_a_run_is_not_lost_to_a_check_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    def break_down(*_: object, **__: object) -> None:
+        raise IndexError("out of bounds")
+
+    monkeypatch.setattr("probewise.nested.check.find_missed_hills", break_down)
+    with pytest.warns(DoubtfulResultWarning, match="which checks the evidence, failed: IndexError: out of bounds"):
+        found = run(lambda p: -0.5 * (p[0] / 0.1) ** 2, {"x": (-1, 1)}, rng=np.random.default_rng(1), n_live=60)
+    assert found.complete
+
+
+def test_no_setting_of_numpy_ends_a_run() -> None:
+    with np.errstate(all="raise"):
+        found = run(lambda p: -0.5e6 * (p**2).sum(), {"x": (-1, 1)}, rng=np.random.default_rng(1), n_live=60)
+        assert "x " in found.summary()
+        assert np.geterr()["under"] == "raise"
+
+
+def test_live_points_that_fill_the_memory_are_refused() -> None:
+    with pytest.raises(ParameterError, match=r"n_live is 1000000000; allowed: up to .* for 1 parameters, .* merge"):
+        run(lambda p: 0.0, {"x": (0, 1)}, rng=np.random.default_rng(1), n_live=10**9)
+
+
 @pytest.mark.parametrize("name", ["shells 2-D", "Rosenbrock 2-D", "plateau", "naive steps"])
 def test_the_evidence_is_right_within_its_own_error(name: str, rng: np.random.Generator) -> None:
     problem = problems.PROBLEMS[name]()

@@ -243,6 +243,13 @@ def test_an_image_of_pixels_is_the_sum_of_its_squares(rho):
     assert see(image, 3.0, -2.0, cov) == pytest.approx(wanted, abs=1e-8)
 
 
+def test_the_quadrature_over_pixels_is_computed_once(monkeypatch):
+    image, cov = region_of(PATTERNS["image"]), covariance(5.0, 5.0, 0.0)
+    see(image, 3.0, -2.0, cov)
+    monkeypatch.setattr(np.polynomial.legendre, "leggauss", lambda n: pytest.fail("computed again"))
+    see(image, 3.0, -2.0, cov)
+
+
 def test_an_image_out_of_sight_is_black():
     assert see(region_of(PATTERNS["image"]), 500.0, 0.0, covariance(5.0, 5.0, 0.0)) == 0.0
 

@@ -1,5 +1,6 @@
 """repaired.json: what is written is read back bit for bit, and only for the simulator that it was made with."""
 
+import contextlib
 import dataclasses
 import json
 
@@ -30,6 +31,30 @@ def test_the_file_of_another_simulator_is_refused():
     other = dataclasses.replace(SIMULATOR, fingerprint="def")
     with pytest.raises(FileError, match=r"fingerprint abc.*has def"):
         FittedSystem.from_json(fitted().to_json(), other)
+
+
+def _places(value, at=()):
+    """Every place of a JSON value: all entries of its objects, the first of its lists."""
+    yield at
+    inner = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    for key, item in inner:
+        yield from _places(item, (*at, key))
+
+
+@pytest.mark.parametrize("wrong", [None, [], {}, "x", -1, 1e300, True, [["x"]]], ids=repr)
+def test_a_value_of_a_wrong_kind_anywhere_is_refused_in_one_line_or_does_no_harm(wrong):
+    text = dataclasses.replace(fitted(("gain_drift",)), notes=("doubtful",)).to_json()
+    for at in _places(json.loads(text)):
+        spoilt = {"all": json.loads(text)}
+        *way, last = ("all", *at)
+        inner = spoilt
+        for key in way:
+            inner = inner[key]
+        inner[last] = wrong
+        with contextlib.suppress(FileError):
+            model = FittedSystem.from_json(json.dumps(spoilt["all"]), SIMULATOR)
+            assert "parameter" in model.summary(), at
+            assert "".join((*model.names, *model.effects, *model.notes)), at
 
 
 @pytest.mark.parametrize(

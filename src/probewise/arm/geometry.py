@@ -329,7 +329,7 @@ class Geometry:
         upper_mm, lower_mm = self.links_mm
         span = np.hypot(out, up)
         rise = np.arctan2(up, out)
-        with np.errstate(invalid="ignore", divide="ignore"):  # arccos beyond 1: too far or too near
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # arccos beyond 1: too far or too near
             shoulder = rise + np.arccos((upper_mm**2 + span**2 - lower_mm**2) / (2 * upper_mm * span))
             lower = rise - np.arccos((lower_mm**2 + span**2 - upper_mm**2) / (2 * lower_mm * span))
         elbow = lower - shoulder if self.elbow_is_relative else lower

@@ -135,4 +135,6 @@ def _write_warning(
     file: object = None,
     line: object = None,
 ) -> None:
+    if issubclass(category, RuntimeWarning) and " encountered in " in str(message):
+        return  # NumPy's, of arithmetic: whether a result can be used is checked, and said in our words
     sys.stderr.write(f"warning: {' '.join(str(message).split())}\n")

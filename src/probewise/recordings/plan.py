@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -21,7 +21,7 @@ from probewise._arrays import (
     rounding_error,
 )
 from probewise._display import ShowsItself
-from probewise._kinds import checked_finite_number, checked_texts, checked_whole, require_kind, warn_of_likely_degrees
+from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
     A_SESSION,
@@ -72,7 +72,10 @@ class Instrumentation:
         for name in ("step", "height_mm"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "a number greater than 0")
-        object.__setattr__(self, "controls", checked_texts("controls", self.controls, "names of columns"))
+        listed = isinstance(self.controls, Iterable) and not isinstance(self.controls, str)
+        if not listed or not all(isinstance(name, str) for name in self.controls):
+            raise ParameterError("controls", self.controls, "a tuple of texts")
+        object.__setattr__(self, "controls", tuple(self.controls))
 
     @property
     def unit_after_number(self) -> str:

@@ -108,6 +108,14 @@ def test_the_same_generator_and_readings_give_the_same_choices():
     np.testing.assert_array_equal(runs[0].posterior.theta, runs[1].posterior.theta)
 
 
+def test_no_setting_of_numpy_ends_an_inquiry():
+    with np.errstate(all="raise"):
+        asked = inquiry(model=lambda p, x: p["slope"] * np.exp(-900.0 * x) + p["offset"], goal={"offset": 0.2})
+        follow(asked, lambda x: 0.5, 2)
+        assert asked.doubt is None
+        assert "offset" in asked.summary()
+
+
 def test_a_reading_without_its_setting_is_taken_once_for_each_choice():
     asked = inquiry()
     for _ in range(2):

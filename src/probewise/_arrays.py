@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeAlias, TypeVar
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +59,14 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
         raise
     except Exception as error:  # objects may raise anything where a number is wanted
         raise ParameterError(name, values, allowed) from error
+
+
+def array_or_none(values: ArrayLike) -> NDArray[Any] | None:
+    """Return values as an array; None for a ragged list, which `floats` refuses by its name."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        return None
 
 
 def read_only_floats(values: ArrayLike, name: str = "values") -> FloatArray:

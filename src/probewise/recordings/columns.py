@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, floats
+from probewise._arrays import BoolArray, FloatArray, IntArray, array_or_none, floats
 from probewise._kinds import require_kind, require_mapping
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.cells import MISSING, count_numbers
@@ -94,7 +94,7 @@ def texts_to_numbers(values: ArrayLike) -> ArrayLike:
 
     A column without texts, or with a text that is none of these, is returned unchanged.
     """
-    cells = values if isinstance(values, str) else _array_or_none(values)
+    cells = values if isinstance(values, str) else array_or_none(values)
     if isinstance(cells, str) or cells is None or cells.ndim != 1 or cells.dtype.kind not in "OUT":
         return values
     try:
@@ -102,14 +102,6 @@ def texts_to_numbers(values: ArrayLike) -> ArrayLike:
         return np.array(read, dtype=np.float64)
     except (ValueError, OverflowError):
         return values
-
-
-def _array_or_none(values: ArrayLike) -> NDArray[Any] | None:
-    """Return values as an array; None for a ragged list, which `floats` refuses by its name."""
-    try:
-        return np.asarray(values)
-    except ValueError:
-        return None
 
 
 def _number_or_nan(cell: Any) -> Any:

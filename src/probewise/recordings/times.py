@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, array_or_none
 from probewise.errors import ParameterError
 from probewise.recordings.cells import UnclearCellError
 
@@ -57,7 +57,9 @@ def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[Arr
     ParameterError
         If a cell is missing or can be read in several ways, or some dates have a time zone and others none.
     """
-    array = np.asarray(values)
+    array = array_or_none(values)
+    if array is None:
+        return values, ""
     cells = array.tolist() if array.ndim == 1 and array.dtype.kind in "OUmM" else []
     if not cells:
         return values, ""

@@ -30,6 +30,7 @@ from probewise.effects import (
     Halo,
     HeavyTailedPrior,
     HeightOffset,
+    Hysteresis,
     Lag,
     LogHeavyTailedPrior,
     MissingTooth,
@@ -48,7 +49,7 @@ from probewise.effects.origin import CountsFromOrigin, Origin
 from probewise.effects.patches import distinct_scan_lines
 from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples, value_with_sd
 from probewise.errors import ParameterError
-from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
+from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseParameters, Poses, Stage
@@ -752,3 +753,21 @@ def test_what_all_samples_have_in_common_is_written_as_it_is():
     (share, value) = parameters_found(Dropouts(unit="V"), samples, "V")
     assert (value.mean, value.sd) == (0.1, 0.0)
     assert share.sd == pytest.approx(sd[0])
+
+
+@pytest.mark.parametrize(
+    ("x_mm", "said"),
+    [
+        ([0, 1, 2, 9, 2, 1, 0], "of forward motion are 6.00 ± 0.40 V higher than those of backward motion"),
+        ([0, 1, 2, 9], "of forward motion are 3.00 ± 0.20 V higher than those at rest"),
+        ([2, 1, 0, 9], "at rest are 3.00 ± 0.20 V higher than those of backward motion"),
+    ],
+)
+def test_hysteresis_compares_the_directions_that_the_recording_has(x_mm, said):
+    """The reading at 9 mm is a scan of its own, at rest."""
+    scan = ["rest" if x == 9 else "back" if k > 3 else "forth" for k, x in enumerate(x_mm)]
+    recording = Recording.from_arrays(
+        x_mm=x_mm, y_mm=0.0, readings=np.arange(len(x_mm)), scan=scan, patterns=Uniform(0.5), unit="V"
+    )
+    effect = Hysteresis.for_extent(Extent.of(recording))
+    assert said in effect.sentence(np.array([3.0]), np.array([0.2]))

@@ -7,7 +7,12 @@ import pytest
 
 from probewise.diagnosis import Place
 from probewise.report.covariate import covariate_in_words, covariate_unit
-from probewise.report.covariate_view import ResidualNoise, _probability_unknown_depends_on
+from probewise.report.covariate_view import (
+    ResidualNoise,
+    _probability_unknown_depends_on,
+    view_along_place_covariate,
+)
+from probewise.report.diagnosis import _place_caption
 from probewise.systems import RunTable
 from probewise.systems.table import RunRecording
 
@@ -22,6 +27,30 @@ def test_the_last_part_of_a_columns_name_is_its_unit_and_the_rest_its_name():
     assert (covariate_in_words("battery_mv"), covariate_unit("battery_mv", "counts")) == ("battery", "mV")
     assert (covariate_in_words("k"), covariate_in_words("_k")) == ("k", " k")
     assert covariate_unit("time", "counts") == "s"
+
+
+@pytest.mark.parametrize(
+    ("covariate", "values", "names"),
+    [
+        ("direction", [1.0, 0.0, np.nan], ["at rest", "forwards"]),
+        ("direction", [0.0, -1.0, 1.0], ["backwards", "at rest", "forwards"]),
+        ("orientation", [90.0, 0.0, np.nan, 90.0], ["0°", "90°"]),
+        ("scan", [1.0, 0.0, 1.0], ["one", "two"]),
+    ],
+)
+def test_every_category_has_its_name_on_the_axis_and_in_the_caption(covariate, values, names):
+    """Readings at rest, such as single ones between scans, are compared with those of motion."""
+    at = np.array(values)
+    start, end = (None, None) if covariate == "scan" else (np.nanmin(at), np.nanmax(at))
+    scan = "one" if covariate == "scan" else None
+    place = Place(covariate, scan, start, end, 0.001, 5.0, np.zeros(2), np.zeros(2), np.ones(2), values=at)
+    plan = SimpleNamespace(scan_names=("one", "two"), instrumentation=SimpleNamespace(unit="V"))
+    words = SimpleNamespace(run="scan")
+    diagnosis = SimpleNamespace(recording=SimpleNamespace(plan=plan), apparatus=SimpleNamespace(words=words))
+    view = view_along_place_covariate(diagnosis, place, at)
+    assert view.category_names_on_axis == names
+    assert view.window == ((-0.5, 0.5) if scan else (-0.5, len(names) - 0.5))
+    assert ("scan one" if scan else ", ".join(names)) in _place_caption(diagnosis, place)
 
 
 def test_an_unknown_effect_that_depends_on_the_run_is_found_by_its_run():

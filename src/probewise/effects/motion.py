@@ -21,11 +21,6 @@ def sign_of_motion(plan: Plan) -> FloatArray:
     return np.asarray(np.where(along_x != 0, along_x, along_y))
 
 
-def direction_varies(plan: Plan) -> bool:
-    """Return whether the signs of motion differ: forward and back, or moving and at rest."""
-    return bool(np.ptp(sign_of_motion(plan)) > 0)
-
-
 def scan_indicator(plan: Plan, names: tuple[str, ...]) -> FloatArray:
     """Return 1.0 for the readings of these scans, 0.0 for the others, (n_points,)."""
     member = np.array([name in names for name in plan.scan_names], dtype=np.float64)

@@ -14,11 +14,13 @@ from probewise.effects.decaying_sum import decaying_sum
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
-from probewise.effects.motion import direction_varies, sign_of_motion
+from probewise.effects.motion import sign_of_motion
 from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
+
+_IN_DIRECTION = {-1.0: "of backward motion", 0.0: "at rest", 1.0: "of forward motion"}
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class Hysteresis(LinearEffect[FloatArray]):
 
     typical: float = 0.5
     unit: str = field(default="", kw_only=True)
+    directions: tuple[float, ...] = field(default=(-1.0, 1.0), kw_only=True)  # the signs of motion in the recording
 
     name = "hysteresis"
     words = "an offset that depends on the direction"
@@ -41,16 +44,18 @@ class Hysteresis(LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical amplitude to 1 % of the readings' range; None where the direction never changes."""
-        return cls(typical=0.01 * extent.span, unit=extent.reading_unit) if direction_varies(extent.plan) else None
+        signs = tuple(np.unique(sign_of_motion(extent.plan)).tolist())
+        return cls(0.01 * extent.span, unit=extent.reading_unit, directions=signs) if len(signs) > 1 else None
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         return np.asarray(value + theta[:, :1] * sign_of_motion(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "higher" if mean[0] > 0 else "lower"
+        way, least, most = "higher" if mean[0] > 0 else "lower", self.directions[0], self.directions[-1]
+        size = value_with_sd(abs(mean[0]), sd[0], self.unit, factor=most - least)
         return (
-            f"readings of forward motion are {value_with_sd(abs(mean[0]), sd[0], self.unit, factor=2)} {way} than "
-            "those of backward motion, over black and white alike: hysteresis"
+            f"readings {_IN_DIRECTION[most]} are {size} {way} than those {_IN_DIRECTION[least]}, over black and white "
+            "alike: hysteresis"
         )
 
 

@@ -7,12 +7,13 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.effects import orientation_deg
 from probewise.report.words import unit_name
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}
 """Units by the last part of a user's column name, such as battery_mv."""
+DIRECTIONS = {-1.0: "backwards", 0.0: "at rest", 1.0: "forwards"}
+"""Names of the signs of motion."""
 WORDS = {
     "level": "predicted reading",
     "slope": "slope of the predicted reading along the motion",
@@ -79,17 +80,17 @@ def covariate_values_by_place(diagnosis: Diagnosis) -> dict[str, FloatArray]:
 def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
     """Return the names, by value, of a place's covariate if it is scan, run, direction, or up to 24 orientations.
 
-    None for other covariates; of a simulator's covariates, only the run has names.
+    Values ascend. None for other covariates; of a simulator's covariates, only the run has names.
     """
     if place.covariate == diagnosis.apparatus.words.run:
         return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}
     if isinstance(diagnosis.apparatus, SimulatorApparatus):
         return None  # a table's column may be called as a covariate of a light sensor is
+    there = [] if place.values is None else np.unique(place.values[np.isfinite(place.values)]).tolist()
     match place.covariate:
         case "direction":
-            return {-1.0: "backwards", 1.0: "forwards"}
+            return {sign: DIRECTIONS[sign] for sign in there}
         case "orientation":
-            angles = np.unique(orientation_deg(diagnosis.recording.plan))
-            return {float(angle): f"{angle:g}°" for angle in angles} if len(angles) <= 24 else None
+            return {angle: f"{angle:g}°" for angle in there} if len(there) <= 24 else None
         case _:
             return None

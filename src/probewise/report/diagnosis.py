@@ -28,7 +28,7 @@ from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import name_without_copy_suffix, spoken_name
 from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
-from probewise.report.covariate import covariate_in_words_and_unit, term_family_in_words
+from probewise.report.covariate import category_name_by_value, covariate_in_words_and_unit, term_family_in_words
 from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
 from probewise.report.diagnosis_figures import encoded_figures, first_figure_content, noun_of_held_out_part
 from probewise.report.effect_words import (
@@ -613,6 +613,8 @@ def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> 
         what = f"{run} {place.scan}"
     elif place.start is None or place.end is None:
         what = covariate
+    elif names := category_name_by_value(diagnosis, place):
+        what = ", ".join([covariate, *(name for v, name in names.items() if place.start <= v <= place.end)])
     else:
         what = f"{covariate}, {range_text(place.start, place.end)} {unit}".rstrip()
     if place.scan and place.covariate != run:

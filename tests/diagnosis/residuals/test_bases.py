@@ -58,6 +58,16 @@ def test_what_varies_does_not_depend_on_the_unit(unit):
     assert not {"level", "slope", "dark"} & set(names(still, still - still[0], still))
 
 
+def test_a_column_that_is_called_as_another_covariate_is_a_covariate_beside_it():
+    names = ("time", "level", "slope", "direction", "orientation", "place", "edge_distance", "dark")
+    plan = replace(PLAN, covariates=dict.fromkeys(names, 360 * TIME))
+    own = [c.name for c in varying_covariates(replace(PLAN, covariates={}), np.arange(N), SIGNAL, SLOPE)]
+    found = [c.name for c in varying_covariates(plan, np.arange(N), SIGNAL, SLOPE)]
+    added = {"dark", *(f"column {name}" for name in names if name != "dark")}
+    assert [name for name in found if name not in added] == own
+    assert added < set(found)
+
+
 @pytest.mark.parametrize("mismatch", MISMATCHES.values(), ids=MISMATCHES)
 def test_some_basis_holds_it(mismatch):
     left = []

@@ -14,6 +14,7 @@ from probewise.effects import NamedEffect, orientation_deg, sign_of_motion
 from probewise.recordings.plan import Plan
 from probewise.scene import edge_distance, region_of
 
+_NOT_COLUMNS = frozenset({"time", "level", "edge_distance", "slope", "direction", "orientation", "scan", "place"})
 _MOST_SCANS = 24  # number of scans above which residuals are not located in single scans
 
 
@@ -53,7 +54,7 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
         "time": plan.time_s[usable],
         "level": level,
         "edge_distance": _edge_distance_mm(plan)[usable],
-        **{name: values[usable] for name, values in plan.covariates.items()},
+        **{_covariate_of_column(name): values[usable] for name, values in plan.covariates.items()},
     }
     out: list[Covariate] = []
     for name, values in pooled.items():
@@ -70,6 +71,11 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
     if len(np.unique(scan)) > 1:
         out.append(Covariate("scan", scan.astype(np.float64), everything, groups=True))
     return out + _place_covariates_along_scans(plan, usable)
+
+
+def _covariate_of_column(name: str) -> str:
+    """Return the covariate's name for a column of the recording: as it is, or "column NAME" if that is taken."""
+    return f"column {name}" if name in _NOT_COLUMNS else name
 
 
 def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariate]:

@@ -129,7 +129,7 @@ def test_a_verb_and_the_function_behind_it_have_the_same_defaults():
 def test_a_seed_calibrates_the_same_sensor_in_python_and_on_the_command_line(
     recording_file, recording, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("probewise.report.calibration.encoded_figures", lambda *_: {})
+    monkeypatch.setattr("probewise.report.calibration.figure_drawers", lambda *_: {})
     monkeypatch.setattr("probewise.report.calibration.page_html", lambda *_, **__: "")
     options = ["--orders", "1", "--live", "16", "--seed", "5", "--quiet"]
     assert main(["calibrate", str(recording_file), "--out", str(tmp_path / "out"), *options]) == 0

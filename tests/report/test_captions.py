@@ -181,7 +181,7 @@ def test_the_page_of_a_calibration_names_what_is_there_and_prints_no_error_of_ze
     sensor = hand_made_sensor()
     found = SimpleNamespace(sensor=sensor, orders=sensor.orders, fields={1: sensor.field, 2: sensor.field})
     prediction = predict(sensor, recording.plan, recording.readings)
-    drawn = calibration_report.encoded_figures(found, recording, prediction)
+    drawn = {n: draw() for n, draw in calibration_report.figure_drawers(found, recording, prediction).items()}
     page = calibration_report.page_html(found, recording, prediction, drawn, seed=0)
     assert named_but_not_there(page) == []
     text = re.sub("<[^>]+>", " ", page)

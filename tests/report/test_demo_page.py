@@ -131,7 +131,7 @@ def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
     outline = np.array([600.0, 260.0]) + 90.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
     searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("trusting", "doubting")]
-    drawn = doubting_robot.encoded_figures(searches)
+    drawn = {name: draw() for name, draw in doubting_robot.figure_drawers(searches).items()}
     assert list(drawn) == ["doubt.png", "belief.png"]
     widest = 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
     assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= widest

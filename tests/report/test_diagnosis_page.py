@@ -45,9 +45,13 @@ def saturated():
     return diagnose(Recording(plan, readings), rng=np.random.default_rng(1))
 
 
+def drawn_figures(diagnosis):
+    return {name: draw() for name, draw in page.figure_drawers(diagnosis).items()}
+
+
 @pytest.mark.slow
 def test_the_page_says_what_is_missing_and_what_to_do(saturated):
-    drawn = page.encoded_figures(saturated)
+    drawn = drawn_figures(saturated)
     assert {place.figure_name for place in saturated.where} <= set(drawn)
     audit = audit_plan_of_diagnosis(saturated)
     html = page.page_html(saturated, drawn, source="some.csv", seed=1, audit=audit)
@@ -76,7 +80,7 @@ def test_every_place_has_its_covariate_row_by_row(saturated):
 
 @pytest.mark.slow
 def test_every_figure_is_svg_that_a_browser_can_read(saturated):
-    for name, image in page.encoded_figures(saturated).items():
+    for name, image in drawn_figures(saturated).items():
         assert name.endswith(".svg")
         root = ElementTree.fromstring(image)
         assert root.tag.endswith("svg")
@@ -90,7 +94,7 @@ def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     scan, by_row = plan.scan_names[0], plan.scan[usable].astype(float)
     changed = {"covariate": "scan", "scan": scan, "start": None, "end": None, "values": by_row}
     place = dataclasses.replace(saturated.where[0], **changed, without_effect=False)
-    drawn = page.encoded_figures(dataclasses.replace(saturated, where=(place,)))
+    drawn = drawn_figures(dataclasses.replace(saturated, where=(place,)))
     shown = drawn[place.figure_name].decode()
     assert shown.count("<!-- one reading -->") == 2
     assert f"(mm), scan {scan}" in shown
@@ -104,7 +108,7 @@ def test_scans_that_an_effect_is_bound_to_are_named(saturated):
     )
     report = dataclasses.replace(saturated.report, effects=(effect,))
     found = dataclasses.replace(saturated, report=report)
-    html = page.page_html(found, page.encoded_figures(found), source="some.csv", seed=1)
+    html = page.page_html(found, drawn_figures(found), source="some.csv", seed=1)
     assert "edge_90_out, edge_90_back" in html
     assert "5.5" not in html.split("<summary>")[0].split("95 % interval")[1]
 
@@ -195,7 +199,7 @@ def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
 def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
     worse = dataclasses.replace(saturated.improvement, heldout_log_density_per_reading=-1.0, heldout_sd=0.1)
     found = dataclasses.replace(saturated, repair=dataclasses.replace(saturated.repair, improvement=worse))
-    drawn = {**page.encoded_figures(saturated), "gain.svg": b"<svg"}
+    drawn = {**drawn_figures(saturated), "gain.svg": b"<svg"}
     assert "Worse than before" in page.page_html(found, drawn, source="some.csv", seed=1)
 
 

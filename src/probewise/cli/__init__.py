@@ -7,7 +7,8 @@ The steps of the paper as commands: `calibrate` (section 2.5, the SSF from a rec
 measure how good the robot and the diagnosis are; `sheets` draws patterns to print, `arm` moves and reads the LEGO arm,
 `emulate-nxt` emulates it.
 
-Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer;
+Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer, a figure or page that
+could not be drawn (the results are complete);
 2: unusable input, reported in one line, nothing written; 128 + N: stopped by signal N (130: Ctrl-C).
 """
 
@@ -35,6 +36,7 @@ from probewise.cli import (
     study,
 )
 from probewise.cli._common import OneLineParser, Verb
+from probewise.cli._output import NotDrawnError
 from probewise.cli._stopping import Stopped, stoppable
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
@@ -97,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _write_complaint(verb, f"stopped; {str(stop) or 'nothing was written'}")
             _discard_unwritable_output()
             return stop.status
-        except (NotConvergedError, LinkError) as error:
+        except (NotConvergedError, LinkError, NotDrawnError) as error:
             _write_complaint(verb, str(error))
             return 1
         except BrokenPipeError:  # the reader of a pipe has closed it; written files are complete

@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from probewise.cli._common import print_result
-from probewise.cli._output import StagedFiles, checked_output_directory, holds_readings, staged_output
+from probewise.cli._output import (
+    PAGE,
+    Drawings,
+    StagedFiles,
+    checked_output_directory,
+    holds_readings,
+    staged_output,
+)
 from probewise.cli._simulator import read_joined_table, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -44,22 +51,25 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
             rng=diagnosis_rng,
             progress=progress,
         )
+        read, source = _files_not_to_replace(arguments, out, simulator.reading), diagnosis.recording.source
+        figures, drawings = report.figure_drawers(diagnosis), Drawings(out)
+        with staged_output(out, inputs=read, outdated=(*_OF_ONE_RUN, *figures, PAGE)) as stage:
+            write_results(diagnosis, stage)
         progress("drawing the figures")
-        drawn = report.encoded_figures(diagnosis)
-        page = report.page_html(diagnosis, drawn, source=diagnosis.recording.source, seed=arguments.seed)
-    with staged_output(
-        out, inputs=_files_not_to_replace(arguments, out, simulator.reading), outdated=_OF_ONE_RUN
-    ) as stage:
-        write_results(diagnosis, drawn, stage)
-        stage.write("report.html", page)
+        drawings.write_report(
+            figures,
+            lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed),
+            inputs=read,
+        )
     for note in (*diagnosis.recording.notes, *notes_on_calls(diagnosis), *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 
-def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagedFiles) -> None:
-    """Write diagnosis.json, the calibrated and the repaired simulator, the next rows to take and the figures."""
+def write_results(diagnosis: Diagnosis, stage: StagedFiles) -> None:
+    """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
     from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
     from probewise.systems import run_table_csv, write_fitted_system
 
@@ -69,7 +79,6 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagedFi
     if diagnosis.next_measurement is not None:
         asked = cast("RunTable", diagnosis.next_measurement.plan)
         stage.write(diagnosis.apparatus.words.next_plan, run_table_csv(asked))
-    stage.write_figures(drawn)
 
 
 def _files_not_to_replace(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import webbrowser
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,9 +12,8 @@ import numpy as np
 
 from probewise import experiment as posing
 from probewise.cli._explore_inputs import ExploreInputs
-from probewise.cli._output import StagedFiles
-from probewise.cli._stopping import raise_if_stopped
-from probewise.recordings import write_bytes_atomically, write_text_atomically
+from probewise.cli._output import PAGE, Drawings, StagedFiles, staged_output
+from probewise.recordings import write_bytes_atomically
 from probewise.report import exploration as report
 from probewise.report.animation import animated_gif
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from probewise._arrays import FloatArray
     from probewise.experiment import Exploration, Step
+
+_ANIMATION = "run.gif"
 
 
 @dataclass
@@ -40,25 +42,32 @@ class Pictures:
     shadows: list[Step] = field(default_factory=list)
     """Steps of the other sensor model on the same readings."""
     frames: list[bytes] = field(default_factory=list)
+    """PNG of each step; b"" where it could not be drawn."""
+
+    def __post_init__(self) -> None:
+        self.drawings = Drawings(self.out)
 
     def draw_and_write(self, step: Step, shadow: Step | None) -> None:
         """Draw a step, with the other sensor model's (`shadow`), if any; write a PNG and, if `live`, the page."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)
-        self.frames.append(self._draw_frame(step, shadow))
-        raise_if_stopped()  # a signal may have damaged the picture
+        name = f"{step.number:03d}.png"
+        self.frames.append(self.drawings.draw(f"frames/{name}", partial(self._draw_frame, step, shadow)))
         if step.number == 1 and not step.replayed:
             _remove_earlier_results(self.out, self.files)
         folder = self.out / "frames"
         folder.mkdir(exist_ok=True)
-        write_bytes_atomically(folder / f"{step.number:03d}.png", self.frames[-1])
-        if self.live:
-            trust = self.inputs.experiment.trust
-            page = report.live_page_html(step, self.frames[-1], earlier=self.steps[:-1], trust=trust)
-            write_text_atomically(self.out / "live.html", page)
+        if self.frames[-1]:
+            write_bytes_atomically(folder / name, self.frames[-1])
+        if self.live and (page := self.drawings.draw("live.html", partial(self._live_page, step))):
+            write_bytes_atomically(self.out / "live.html", page)
             if len(self.frames) == 1:
                 webbrowser.open((self.out / "live.html").absolute().as_uri())
+
+    def _live_page(self, step: Step) -> bytes:
+        trust = self.inputs.experiment.trust
+        return report.live_page_html(step, self.frames[-1], earlier=self.steps[:-1], trust=trust).encode()
 
     def _draw_frame(self, step: Step, shadow: Step | None) -> bytes:
         inputs = self.inputs
@@ -74,30 +83,32 @@ class Pictures:
             titled, readings, levels=inputs.black_and_white_readings, truth_mm=self.truth_mm
         )
 
-    def write_results(
-        self, stage: StagedFiles, result: Exploration, *, seed: int, known: Mapping[str, float] | None
-    ) -> None:
-        """Write report, animation, result.json, posterior samples and sensor.json.
+    def write_results(self, result: Exploration, *, seed: int, known: Mapping[str, float] | None) -> StagedFiles:
+        """Write result.json, posterior samples and sensor.json, then animation and report; return the former.
 
         The sensor is the one that the run was given, with the effect that the run found in it, if any; what a run with
         --learn-sensor learnt of SSF and levels is not in it.
         """
+        with staged_output(self.out, inputs=self.files, outdated=(_ANIMATION, PAGE)) as stage:
+            stage.write("result.json", posing.result_json(result))
+            stage.write("samples.csv", posing.samples_csv(result))
+            learnt = posing.repaired_sensor(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
+            stage.write("sensor.json", learnt.to_json())
         beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
-        page = report.page_html(
-            result,
-            self.frames,
-            seed=seed,
-            model=self.inputs.model,
-            truth=known,
-            beside=beside,
-            unit=self.inputs.sensor.instrumentation.unit,
+        self.drawings.write_report(
+            {_ANIMATION: lambda: animated_gif([frame for frame in self.frames if frame])},
+            lambda _: report.page_html(
+                result,
+                self.frames,
+                seed=seed,
+                model=self.inputs.model,
+                truth=known,
+                beside=beside,
+                unit=self.inputs.sensor.instrumentation.unit,
+            ),
+            inputs=self.files,
         )
-        stage.write("report.html", page)
-        stage.write("run.gif", animated_gif(self.frames))
-        stage.write("result.json", posing.result_json(result))
-        stage.write("samples.csv", posing.samples_csv(result))
-        learnt = posing.repaired_sensor(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
-        stage.write("sensor.json", learnt.to_json())
+        return stage
 
 
 def _remove_earlier_results(out: Path, files: Sequence[Path]) -> None:

@@ -13,15 +13,17 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from probewise._signals import defer_signals
-from probewise.cli._stopping import raise_if_stopped
-from probewise.errors import FileError, ParameterError
+from probewise.cli._stopping import raise_if_stopped, reporting_what_is_kept
+from probewise.errors import FileError, ParameterError, ProbewiseError, shortened
 
 _FOLDER, _COMMIT = ".writing", "commit.json"
+PAGE = "report.html"
+_MOST_FAILED = 3  # drawings that a message names
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 
 
@@ -55,15 +57,64 @@ class StagedFiles:
         """Write a document as strict JSON."""
         self.write(name, json.dumps(document, allow_nan=False, indent=1) + "\n")
 
-    def write_figures(self, drawn: Mapping[str, bytes]) -> None:
-        """Write figures, given as bytes by file name."""
-        for name, content in drawn.items():
-            self.write(name, content)
-
     @property
     def notes_on_renamed_inputs(self) -> list[str]:
         """A sentence for each input file that was renamed."""
         return [f"what was {path} is now {now}" for path, now in self.kept.items()]
+
+
+class NotDrawnError(ProbewiseError):
+    """Report figures or pages that could not be drawn, beside results that are complete."""
+
+
+class Drawings:
+    """Figures and pages of a run, drawn after its results were written: if one fails, only that one is missing."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self._failed: dict[str, str] = {}
+
+    def draw(self, name: str, drawer: Callable[[], bytes]) -> bytes:
+        """Return what `drawer` returns; b"" if it raises, which `raise_if_any_failed` tells."""
+        try:
+            content = drawer()
+        except Exception as error:  # whatever it is, the results are more than their pictures
+            self._failed[name], content = f"{type(error).__name__}: {shortened(' '.join(str(error).split()))}", b""
+        raise_if_stopped()  # a signal may have damaged the picture
+        return content
+
+    def write_report(
+        self,
+        drawers: Mapping[str, Callable[[], bytes]],
+        page: Callable[[Mapping[str, bytes]], str],
+        *,
+        inputs: Sequence[Path] = (),
+    ) -> None:
+        """Draw figures and the page report.html into the directory of results, which are complete there.
+
+        Parameters
+        ----------
+        drawers
+            Functions that draw the figures, by file name.
+        page
+            Function that builds the HTML from the figures by name; b"" stands for one that could not be drawn.
+        inputs
+            Input files of this run, which nothing replaces.
+        """
+        kept = f"the results are in {self.out}, without figures and report"
+        with reporting_what_is_kept(lambda: kept, results=True), staged_output(self.out, inputs=inputs) as stage:
+            drawn = {name: self.draw(name, drawer) for name, drawer in drawers.items()}
+            for name, content in (*drawn.items(), (PAGE, self.draw(PAGE, lambda: page(drawn).encode()))):
+                if content:
+                    stage.write(name, content)
+
+    def raise_if_any_failed(self) -> None:
+        """Raise NotDrawnError, in one line, if something could not be drawn."""
+        if self._failed:
+            first = ", ".join(f"{name} ({error})" for name, error in list(self._failed.items())[:_MOST_FAILED])
+            more = len(self._failed) - _MOST_FAILED
+            rest = f" and {more} more" if more > 0 else ""
+            raise NotDrawnError(f"could not draw {first}{rest}; everything else is complete in {self.out}")
 
 
 def checked_output_directory(path: Path) -> Path:

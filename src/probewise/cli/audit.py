@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from probewise.cli._common import Verb, add_path, add_quiet, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import (
+    PAGE,
+    Drawings,
     checked_output_directory,
     holds_readings,
     staged_output,
@@ -52,13 +54,15 @@ def run(arguments: argparse.Namespace) -> int:
             plan = read_plan(arguments.plan, progress=progress)
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
             audit = audit_plan(plan, sensor=sensor, progress=progress)
+        drawings = None if out is None else Drawings(out)
         progress("drawing the figures")
-        notes = [] if out is None else _write_results(audit, out, arguments.plan)
+        notes = [] if drawings is None else _write_results(audit, drawings, arguments.plan)
     print_result(audit.summary(), quiet=arguments.quiet)
     for note in (*getattr(audit.plan, "notes", ()), *notes):
         print_result(f"note: {note}", quiet=arguments.quiet)
-    if out is not None:
+    if drawings is not None:
         print_result(f"written to {out}", quiet=arguments.quiet)
+        drawings.raise_if_any_failed()
     return 0
 
 
@@ -73,19 +77,18 @@ def _audit_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanA
     return audit_system(simulator, table)
 
 
-def _write_results(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
+def _write_results(audit: PlanAudit, drawings: Drawings, plan: Path) -> list[str]:
     from probewise.diagnosis import CURE_PLAN, audit_json
     from probewise.recordings import write_plan
     from probewise.report import audit as report
 
-    drawn = report.encoded_figures(audit)
+    figures, read = report.figure_drawers(audit), _files_not_to_replace(plan, drawings.out)
     cures = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
-    with staged_output(out, inputs=_files_not_to_replace(plan, out), outdated=cures) as stage:
+    with staged_output(drawings.out, inputs=read, outdated=(*cures, *figures, PAGE)) as stage:
         stage.write_json("audit.json", audit_json(audit))
-        stage.write_figures(drawn)
-        stage.write("report.html", report.page_html(audit, drawn, source=plan.name))
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
+    drawings.write_report(figures, lambda drawn: report.page_html(audit, drawn, source=plan.name), inputs=read)
     return stage.notes_on_renamed_inputs
 
 

@@ -15,7 +15,13 @@ from probewise.cli._common import (
     print_result,
 )
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import checked_output_directory, staged_output, tables_and_descriptions
+from probewise.cli._output import (
+    PAGE,
+    Drawings,
+    checked_output_directory,
+    staged_output,
+    tables_and_descriptions,
+)
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
@@ -94,15 +100,23 @@ def run(arguments: argparse.Namespace) -> int:
             progress=progress,
         )
         prediction = predict(result.sensor, recording, progress=progress)
-        progress("drawing the figures")
-        drawn = report.encoded_figures(result, recording, prediction)
-        with staged_output(out, inputs=tables_and_descriptions([arguments.recording])) as stage:
+        figures, read = (
+            report.figure_drawers(result, recording, prediction),
+            tables_and_descriptions([arguments.recording]),
+        )
+        with staged_output(out, inputs=read, outdated=(*figures, PAGE)) as stage:
             write_sensor(result.sensor, stage / "sensor.json")
-            stage.write_figures(drawn)
-            stage.write("report.html", report.page_html(result, recording, prediction, drawn, seed=arguments.seed))
+        progress("drawing the figures")
+        drawings = Drawings(out)
+        drawings.write_report(
+            figures,
+            lambda drawn: report.page_html(result, recording, prediction, drawn, seed=arguments.seed),
+            inputs=read,
+        )
     for note in (*recording.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 

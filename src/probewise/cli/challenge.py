@@ -15,7 +15,7 @@ from probewise.cli._common import (
     print_result,
 )
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
-from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 
 
@@ -79,13 +79,15 @@ def run(arguments: argparse.Namespace) -> int:
     command = shlex.join(
         ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
     )
-    drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
+    drawings = Drawings(out)
+    with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
+        with staged_output(out, outdated=(PAGE,)) as stage:
+            stage.write("table.csv", report.target_table_csv(rows))
         progress("drawing the report")
-        stage.write("table.csv", report.target_table_csv(rows))
-        stage.write("report.html", report.page_html(results, rows, command=command, systems=arguments.systems))
+        drawings.write_report({}, lambda _: report.page_html(results, rows, command=command, systems=arguments.systems))
     print_result(report.summary_sentence(rows, len(results)), quiet=arguments.quiet)
     print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 

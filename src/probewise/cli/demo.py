@@ -6,20 +6,21 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from probewise.cli._common import Verb, add_out_directory, add_seed_and_quiet, print_result
-from probewise.cli._output import StagedFiles, checked_output_directory, staged_output
+from probewise.cli._output import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from concurrent.futures import Executor, Future
 
     from probewise.arm import Pose
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis
-    from probewise.experiment import Exploration, Model
+    from probewise.experiment import Exploration, Model, Step
     from probewise.progress import Progress
     from probewise.report.robot_search import RobotSearch
     from probewise.scene import Circle
 
+_DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
 MODELS: tuple[Model, ...] = ("naive", "ssf")
 MODEL_NAMES: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
 TRUSTS = {"trusting": 1.0, "doubting": 0.9}
@@ -42,17 +43,24 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo, print its summary, and return the exit status."""
     from probewise._progress import progress_shown
 
+    out = checked_output_directory(arguments.out)
+    drawings = (Drawings(out), Drawings(out / _DIAGNOSIS))
     with progress_shown(quiet=arguments.quiet) as progress:
-        lines = _run_demo(arguments, progress)
+        lines = _run_demo(arguments, *drawings, progress)
     for line in lines:
         print_result(line, quiet=arguments.quiet)
+    for each in drawings:
+        each.raise_if_any_failed()
     return 0
 
 
-def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, ...]:
+def _run_demo(
+    arguments: argparse.Namespace, drawings: Drawings, drawings_of_diagnosis: Drawings, progress: Progress
+) -> tuple[str, ...]:
     """Calibrate, search and diagnose, write all files, and return the lines to print."""
     import json
     import time
+    from functools import partial
 
     from probewise.arm import read_geometry, shipped_geometry_path
     from probewise.calibration import predict, write_sensor
@@ -66,7 +74,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
 
     started = time.monotonic()
     seed = arguments.seed
-    out = checked_output_directory(arguments.out)
+    out = drawings.out
     truth = random_hidden_circle_mm(seed)
     with worker_pool(2) as pool:
         progress("calibrating and diagnosing", 0, 8)
@@ -80,9 +88,8 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         for done, future in enumerate(parts, start=1):
             progress("searching and diagnosing", done, 8)
             future.result()
-    progress("drawing the report")
     diagnosis, alike = diagnosing.result(), [future.result() for future in starting]
-    runs, frames = zip(*(future.result() for future in searching), strict=True)
+    runs = [future.result() for future in searching]
     recording = read_recording(shipped("paper"))
     prediction = predict(sensor, recording.plan, recording.readings)
     names = MODEL_NAMES.values()
@@ -91,7 +98,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     doubted = searches_with_true_circle(
         sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth
     )
-    drawn = report.encoded_figures(
+    figures = report.figure_drawers(
         calibration,
         recording,
         prediction=prediction,
@@ -99,19 +106,28 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         started_alike=started_alike,
         geometry=read_geometry(shipped_geometry_path()),
     )
-    drawn |= report.encoded_diagnosis_figures(diagnosis) | doubting_robot.encoded_figures(doubted)
+    figures |= report.diagnosis_figure_drawers(diagnosis) | doubting_robot.figure_drawers(doubted)
+    figures_of_diagnosis = diagnosis_report.figure_drawers(diagnosis)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
-    witnesses = diagnosis_report.encoded_figures(diagnosis)
-    diagnosis_page = diagnosis_report.page_html(diagnosis, witnesses, source="concealed.csv", seed=seed)
     seconds = time.monotonic() - started
-    with staged_output(out) as stage:
+    of_diagnosis = (f"{_DIAGNOSIS}/{name}" for name in (*figures_of_diagnosis, PAGE))
+    with staged_output(out, outdated=(*figures, PAGE, *of_diagnosis)) as stage:
         write_sensor(sensor, stage / "sensor.json")
-        stage.write_figures(drawn)
-        (stage / "diagnosis").mkdir()
+        (stage / _DIAGNOSIS).mkdir()
         *_, rng = diagnose_verb.generators_of_diagnosis(seed)
-        diagnose_verb.write_results(diagnosis, witnesses, StagedFiles(stage / "diagnosis"), rng=rng)
-        stage.write("diagnosis/report.html", diagnosis_page)
-        page = report.page_html(
+        diagnose_verb.write_results(diagnosis, StagedFiles(stage / _DIAGNOSIS), rng=rng)
+        answers = report.main_findings_by_key(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
+        stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
+
+    def page(drawn: Mapping[str, bytes]) -> str:
+        frames = [
+            [
+                drawings.draw(f"{search.model}, step {step.number}", partial(_frame_png, search, step))
+                for step in search.run.steps
+            ]
+            for search in searches
+        ]
+        return report.page_html(
             calibration,
             recording,
             prediction=prediction,
@@ -125,9 +141,13 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
             seed=seed,
             seconds=seconds,
         )
-        stage.write("report.html", page)
-        answers = report.main_findings_by_key(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
-        stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
+
+    progress("drawing the report")
+    drawings_of_diagnosis.write_report(
+        figures_of_diagnosis,
+        lambda drawn: diagnosis_report.page_html(diagnosis, drawn, source="concealed.csv", seed=seed),
+    )
+    drawings.write_report(figures, page)
     return (
         *report.search_comparison_lines(searches),
         report.summary_sentence(started_alike),
@@ -184,44 +204,37 @@ def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calib
     )
 
 
-def _search_from_empty_field(
-    sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int
-) -> tuple[Exploration, list[bytes]]:
-    """Search for the circle without a first reading on it; return the run and a PNG of each step."""
+def _search_from_empty_field(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
+    """Search for the circle without a first reading on it."""
     import numpy as np
 
-    from probewise._words import count_with_noun
     from probewise.experiment import arm_over, experiment_for, run, surface_of
-    from probewise.report import exploration as report
-    from probewise.report.plots import grid_of_axes, png
-    from probewise.scene import Field, outlines
+    from probewise.scene import Field
     from probewise.world.shipped import true_world as world_behind
 
-    field, means = Field(), sensor.mean()
+    field = Field()
     experiment = experiment_for(sensor, hypothesised_circle(), field, model=model, n_live=N_LIVE_ROBOT)
     surface = surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
-        found = run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
-    outline_mm = outlines(hypothesised_circle().region(np.array([truth])))[0]
-    places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
-    levels = (means["I_min"], means["I_max"])
-    name = MODEL_NAMES[model]
-    frames = [
-        png(
-            report.draw_robot_view(
-                step,
-                experiment,
-                places[: step.number],
-                levels=levels,
-                truth_mm=outline_mm,
-                title=f"{name} model, after {count_with_noun(step.number, 'reading')}",
-                ax=grid_of_axes(1, 1, size_in=(6.6, 4.0))[0, 0],
-            ),
-            dpi=90,
-        )
-        for step in found.steps
-    ]
-    return found, frames
+        return run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
+
+
+def _frame_png(search: RobotSearch, step: Step) -> bytes:
+    """Draw the view of a search after a step; return a PNG."""
+    from probewise._words import count_with_noun
+    from probewise.report import exploration as report
+    from probewise.report.plots import grid_of_axes, png
+
+    ax = report.draw_robot_view(
+        step,
+        search.run.experiment,
+        [(r.pose.x_mm, r.pose.y_mm, r.value) for r in search.run.readings][: step.number],
+        levels=search.levels,
+        truth_mm=search.truth_mm,
+        title=f"{search.model} model, after {count_with_noun(step.number, 'reading')}",
+        ax=grid_of_axes(1, 1, size_in=(6.6, 4.0))[0, 0],
+    )
+    return png(ax, dpi=90)
 
 
 def search_from_reading_on_circle(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,8 @@ from probewise.cli._common import Verb, add_out_directory, add_path, add_seed_an
 from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
 from probewise.cli._output import (
+    PAGE,
+    Drawings,
     StagedFiles,
     checked_output_directory,
     holds_readings,
@@ -90,19 +92,23 @@ def run(arguments: argparse.Namespace) -> int:
         )
         if null is not None:
             diagnosis = null.with_shape_in_next_plan(diagnosis)
-        progress("auditing the plan")
-        audit = None if null is not None else audit_plan_of_diagnosis(diagnosis, sensor=sensor)
-        progress("drawing the figures")
-        drawn = report.encoded_figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
         read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
-        with staged_output(out, inputs=files_not_to_replace(read, out), outdated=OF_ONE_RUN) as stage:
-            write_results(diagnosis, drawn, stage, rng=files_rng)
-            page = report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
-            stage.write("report.html", page)
+        spared, figures, drawings = files_not_to_replace(read, out), report.figure_drawers(diagnosis), Drawings(out)
+        with staged_output(out, inputs=spared, outdated=(*OF_ONE_RUN, *figures, PAGE)) as stage:
+            write_results(diagnosis, stage, rng=files_rng)
+
+        def page(drawn: Mapping[str, bytes]) -> str:
+            progress("auditing the plan")
+            audit = None if null is not None else audit_plan_of_diagnosis(diagnosis, sensor=sensor)
+            return report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
+
+        progress("drawing the figures")
+        drawings.write_report(figures, page, inputs=spared)
     for note in (*joined.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 
@@ -148,10 +154,8 @@ def files_not_to_replace(read: Sequence[Path], out: Path) -> list[Path]:
     return tables_and_descriptions([*read, *([filled_in] if holds_readings(filled_in, "reading") else [])])
 
 
-def write_results(
-    diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagedFiles, *, rng: np.random.Generator
-) -> None:
-    """Write diagnosis.json, both sensor models, the next plan and the figures, but not the report."""
+def write_results(diagnosis: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
+    """Write diagnosis.json, both sensor models and the next plan."""
     from probewise.calibration import write_sensor
     from probewise.diagnosis import NEXT_PLAN, diagnosis_json
     from probewise.recordings import write_plan
@@ -161,7 +165,6 @@ def write_results(
     write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), stage / "calibrated.json")
     if diagnosis.next_measurement is not None:
         write_plan(diagnosis.next_measurement.plan, stage / NEXT_PLAN)
-    stage.write_figures(drawn)
 
 
 VERB = Verb(

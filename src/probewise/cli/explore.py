@@ -28,7 +28,7 @@ from probewise.cli._common import (
     parse_positive_int,
     print_result,
 )
-from probewise.cli._output import checked_output_directory, staged_output, tables_and_descriptions
+from probewise.cli._output import checked_output_directory, tables_and_descriptions
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, shown
 from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
@@ -225,19 +225,15 @@ def run(arguments: argparse.Namespace) -> int:
         for step, shadow in pairs:
             pictures.draw_and_write(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
-    drawing = progress_shown(quiet=arguments.quiet)
-    with (
-        reporting_what_is_kept(kept_message, results=True),
-        drawing as progress,
-        staged_output(out, inputs=read) as stage,
-    ):
+    with reporting_what_is_kept(kept_message, results=True), progress_shown(quiet=arguments.quiet) as progress:
         progress("drawing the report")
-        pictures.write_results(stage, result, seed=arguments.seed, known=site.known)
+        stage = pictures.write_results(result, seed=arguments.seed, known=site.known)
     for line in _closing_lines(result, inputs, site, journal):
         print_result(line, quiet=arguments.quiet)
     for note in stage.notes_on_renamed_inputs:
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
+    pictures.drawings.raise_if_any_failed()
     return 0
 
 

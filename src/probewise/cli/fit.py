@@ -12,7 +12,7 @@ from probewise.cli._common import (
     parse_path,
     print_result,
 )
-from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
 from probewise.cli._simulator import add_simulator, read_joined_table
 
 
@@ -44,17 +44,17 @@ def run(arguments: argparse.Namespace) -> int:
     with progress_shown(quiet=arguments.quiet) as progress:
         rng = np.random.default_rng(arguments.seed)
         fitted = fit_simulator(simulator, table, source=source, notes=notes, rng=rng, progress=progress)
+        figures, read, drawings = report.figure_drawers(fitted), [*arguments.tables, arguments.simulator], Drawings(out)
+        with staged_output(out, inputs=read, outdated=(*figures, PAGE)) as stage:
+            stage.write_json("fit.json", fit_json(fitted))
+            write_fitted_system(fitted.fitted, stage / "fitted.json")
+            stage.write("samples.csv", samples_csv(fitted.fitted))
         progress("drawing the figures")
-        drawn = report.encoded_figures(fitted)
-    with staged_output(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
-        stage.write_json("fit.json", fit_json(fitted))
-        write_fitted_system(fitted.fitted, stage / "fitted.json")
-        stage.write("samples.csv", samples_csv(fitted.fitted))
-        stage.write_figures(drawn)
-        stage.write("report.html", report.page_html(fitted, drawn, seed=arguments.seed))
+        drawings.write_report(figures, lambda drawn: report.page_html(fitted, drawn, seed=arguments.seed), inputs=read)
     for note in (*fitted.recording.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 

@@ -31,7 +31,7 @@ from probewise.cli._common import (
     positive_number_parser,
     print_result,
 )
-from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
 from probewise.cli._plans import SHIPPED, plan_for_lego_arm, plan_for_own_instrument, read_or_shipped_plan
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
@@ -162,28 +162,30 @@ def run(arguments: argparse.Namespace) -> int:
             rounds.append(each)
     found = Investigation(tuple(rounds))
     diagnosis = found.last.diagnosis
-    drawing = progress_shown(quiet=arguments.quiet)
     read = [] if arguments.plan in SHIPPED else [Path(arguments.plan)]
     read += [] if arguments.sensor is None else [arguments.sensor]
-    with (
-        reporting_what_is_kept(kept_message, results=True),
-        drawing as progress,
-        staged_output(out, inputs=files_not_to_replace(read, out), outdated=OF_ONE_RUN) as stage,
-    ):
+    spared, drawings = files_not_to_replace(read, out), Drawings(out)
+    figures = of_a_diagnosis.figure_drawers(diagnosis) | {"by_round.png": partial(report.probabilities_png, found)}
+    concealed = None if world is None else tuple(effect.name for effect in world.concealed)
+    with reporting_what_is_kept(kept_message, results=True), progress_shown(quiet=arguments.quiet) as progress:
+        with staged_output(out, inputs=spared, outdated=(*OF_ONE_RUN, *figures, PAGE)) as stage:
+            write_results(diagnosis, stage, rng=np.random.default_rng(files_seed))
+            write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
         progress("drawing the report")
-        drawn = of_a_diagnosis.encoded_figures(diagnosis)
-        write_results(diagnosis, drawn, stage, rng=np.random.default_rng(files_seed))
-        write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
-        stage.write("by_round.png", report.probabilities_png(found))
-        concealed = None if world is None else tuple(effect.name for effect in world.concealed)
-        page = report.page_html(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
-        stage.write("report.html", page)
+        drawings.write_report(
+            figures,
+            lambda drawn: report.page_html(
+                found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed
+            ),
+            inputs=spared,
+        )
     print_result(found.summary(), quiet=arguments.quiet)
     if concealed is not None:
         print_result(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
     for note in stage.notes_on_renamed_inputs:
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 

@@ -17,7 +17,7 @@ from probewise.cli._common import (
     print_result,
 )
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
-from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
@@ -100,13 +100,15 @@ def run(arguments: argparse.Namespace) -> int:
         study = run_study(
             numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=progress
         )
-    drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
+    drawings = Drawings(out)
+    with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
+        with staged_output(out, outdated=(PAGE,)) as stage:
+            stage.write("table.csv", report.table_csv(study))
         progress("drawing the report")
-        stage.write("table.csv", report.table_csv(study))
-        stage.write("report.html", report.page_html(study, command=_command_line(arguments)))
+        drawings.write_report({}, lambda _: report.page_html(study, command=_command_line(arguments)))
     print_result(report.summary_sentence(study), quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 
@@ -134,12 +136,13 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
             progress=progress,
         )
     table = concealed_csv_rows(found)
-    rows = concealed_rows(found)
-    with staged_output(out) as stage:
+    rows, drawings = concealed_rows(found), Drawings(out)
+    with staged_output(out, outdated=(PAGE,)) as stage:
         stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
-        stage.write("report.html", report.page_html(rows, command=_concealed_command_line(arguments)))
+    drawings.write_report({}, lambda _: report.page_html(rows, command=_concealed_command_line(arguments)))
     print_result(report.summary_sentence(rows), quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
+    drawings.raise_if_any_failed()
     return 0
 
 

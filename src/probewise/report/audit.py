@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from probewise._words import count_with_noun
 from probewise.diagnosis import PlanAudit
@@ -30,9 +30,9 @@ def summary_sentence(audit: PlanAudit) -> str:
     return f"{said} {count_with_noun(audit.extra_readings, 'more reading')} make {cured} more fine."
 
 
-def encoded_figures(audit: PlanAudit) -> dict[str, bytes]:
-    """Draw the figure of an audit; return it as {"audit.png": PNG}."""
-    return {"audit.png": png(draw_detectability_and_aliases(audit))}
+def figure_drawers(audit: PlanAudit) -> dict[str, Callable[[], bytes]]:
+    """Return the function that draws an audit's figure, a PNG, by file name."""
+    return {"audit.png": lambda: png(draw_detectability_and_aliases(audit))}
 
 
 def draw_detectability_and_aliases(audit: PlanAudit) -> AxesGrid:
@@ -42,7 +42,7 @@ def draw_detectability_and_aliases(audit: PlanAudit) -> AxesGrid:
 
 
 def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
-    """Return the HTML of an audit's page; `drawn` is from `encoded_figures`, `source` the plan's name."""
+    """Return the HTML of an audit's page; `drawn` is from `figure_drawers`, `source` the plan's name."""
     shown = figure(
         drawn["audit.png"],
         "Fine: these readings detect the effect and tell it from every other. Aliased: they detect it, but another "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import PurePath
 
 import numpy as np
@@ -61,14 +61,16 @@ def ssf_centre_and_axis_sds_mm(sensor: FittedSensor) -> tuple[float, float, tupl
     return float(u), float(v), (float(long), float(short))
 
 
-def encoded_figures(calibration: Calibration, recording: Recording, prediction: Prediction) -> dict[str, bytes]:
-    """Draw the figures of a calibration; return their PNGs by file name."""
+def figure_drawers(
+    calibration: Calibration, recording: Recording, prediction: Prediction
+) -> dict[str, Callable[[], bytes]]:
+    """List the figures of a calibration by file name: functions that draw them, as PNGs."""
     return {
-        "readings.png": png(readings_by_orientation(recording)),
-        "predicted.png": png(predicted_and_recorded_by_scan(recording, prediction.mean, prediction.sd)),
-        "residuals.png": png(standardised_residuals(recording, prediction.mean, prediction.sd)),
-        "ssf.png": png(spatial_sensitivity(calibration.sensor.field)),
-        "ssf_by_order.png": png(draw_ssf_by_n_gaussians(calibration)),
+        "readings.png": lambda: png(readings_by_orientation(recording)),
+        "predicted.png": lambda: png(predicted_and_recorded_by_scan(recording, prediction.mean, prediction.sd)),
+        "residuals.png": lambda: png(standardised_residuals(recording, prediction.mean, prediction.sd)),
+        "ssf.png": lambda: png(spatial_sensitivity(calibration.sensor.field)),
+        "ssf_by_order.png": lambda: png(draw_ssf_by_n_gaussians(calibration)),
     }
 
 
@@ -84,7 +86,7 @@ def draw_ssf_by_n_gaussians(calibration: Calibration) -> AxesGrid:
 def sections(
     sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
 ) -> list[Section]:
-    """Build the sections of a calibration's page, below the first screen; `drawn` is from `encoded_figures`."""
+    """Build the sections of a calibration's page, below the first screen; `drawn` is from `figure_drawers`."""
     ok = recording.usable
     z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
     return [
@@ -208,7 +210,7 @@ def _printed_unit(unit: str) -> str:
 def page_html(
     calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
 ) -> str:
-    """Return the HTML of a calibration's page; `drawn` is from `encoded_figures`."""
+    """Return the HTML of a calibration's page; `drawn` is from `figure_drawers`."""
     return page(
         f"Calibration of {PurePath(calibration.sensor.source).name or 'a sensor'}",
         answer=summary_sentence(calibration.sensor),

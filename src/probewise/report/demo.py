@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -137,7 +137,7 @@ def search_comparison_table(searches: Sequence[RobotSearch], caption: str = "") 
     )
 
 
-def encoded_figures(
+def figure_drawers(
     calibration: Calibration,
     recording: Recording,
     *,
@@ -145,8 +145,8 @@ def encoded_figures(
     searches: Sequence[RobotSearch],
     started_alike: Sequence[RobotSearch],
     geometry: Geometry,
-) -> dict[str, bytes]:
-    """Draw all figures of the demo but the diagnosis's; return their PNGs by file name.
+) -> dict[str, Callable[[], bytes]]:
+    """List all figures of the demo but the diagnosis's by file name, as functions that draw PNGs.
 
     Parameters
     ----------
@@ -159,14 +159,19 @@ def encoded_figures(
     geometry
         Of the arm.
     """
-    drawn = calibration_report.encoded_figures(calibration, recording, prediction)
     hidden = started_alike[0].truth_mm
-    drawn["arm.png"] = png(arm_and_sensor(geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden))
-    drawn["orientations.png"] = png(sensor_orientations(recording))
-    drawn["quadrants.png"] = png(quadrant_patterns(recording))
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
-    drawn["first_three.png"] = png(_draw_paper_views(started_alike, n_first))
-    drawn["equal_readings.png"] = png(_draw_paper_views(started_alike, [len(started_alike[-1].run.steps)]))
+    return calibration_report.figure_drawers(calibration, recording, prediction) | {
+        "arm.png": lambda: png(arm_and_sensor(geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden)),
+        "orientations.png": lambda: png(sensor_orientations(recording)),
+        "quadrants.png": lambda: png(quadrant_patterns(recording)),
+        "first_three.png": lambda: png(_draw_paper_views(started_alike, n_first)),
+        "equal_readings.png": lambda: png(_draw_paper_views(started_alike, [len(started_alike[-1].run.steps)])),
+        "progress.png": lambda: png(_draw_widths_and_information(searches)),
+    }
+
+
+def _draw_widths_and_information(searches: Sequence[RobotSearch]) -> AxesGrid:
     names = [f"{s.model} model" for s in searches]
     axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
     posterior_widths(
@@ -178,25 +183,26 @@ def encoded_figures(
         ax=axes[0, 1],
     )
     axes[0, 1].set_ylim(top=1.3 * axes[0, 1].get_ylim()[1])  # room for the legend above the lines
-    drawn["progress.png"] = png(axes)
-    return drawn
+    return axes
 
 
-def encoded_diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw the figures of the demo's section on the diagnosis; return their PNGs by file name."""
+def diagnosis_figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
+    """List the figures of the demo's section on the diagnosis by file name, as functions that draw PNGs."""
     likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
     labels = [h.label.replace("+", " + ") for h in likely]
     recording, before, after = diagnosis.recording, diagnosis.repair.before.readings, diagnosis.repair.after.readings
-    drawn = {
-        "explanations.png": png(hypothesis_probabilities(labels, [h.probability for h in likely])),
-        "scans.png": png(residuals_by_scan(recording, before, after)),
+    drawers: dict[str, Callable[[], bytes]] = {
+        "explanations.png": lambda: png(hypothesis_probabilities(labels, [h.probability for h in likely])),
+        "scans.png": lambda: png(residuals_by_scan(recording, before, after)),
     }
     best = part_with_largest_gain(diagnosis)
     if best is not None:
         name, gain, rows = best
         title = f"{name}: {gain:+.2f} nats per reading when it was held out"
-        drawn["before_after.png"] = png(readings_before_and_after_repair(recording, rows, before, after, name=title))
-    return drawn
+        drawers["before_after.png"] = lambda: png(
+            readings_before_and_after_repair(recording, rows, before, after, name=title)
+        )
+    return drawers
 
 
 def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
@@ -237,7 +243,7 @@ def page_html(
     Parameters
     ----------
     calibration, recording, prediction, searches, started_alike
-        See `encoded_figures`.
+        See `figure_drawers`.
     frames
         PNG of each step of each search.
     diagnosis
@@ -245,7 +251,7 @@ def page_html(
     doubt
         The search of the robot that trusts its sensor model, and of the one that doubts it.
     drawn
-        From `encoded_figures`, `encoded_diagnosis_figures` and `report.doubting_robot.encoded_figures`.
+        From `figure_drawers`, `diagnosis_figure_drawers` and `report.doubting_robot.figure_drawers`.
     concealed
         Name of the effect that the simulated world concealed in the second recording.
     seed, seconds

@@ -30,7 +30,7 @@ from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import category_name_by_value, covariate_in_words_and_unit, term_family_in_words
 from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
-from probewise.report.diagnosis_figures import encoded_figures, first_figure_content, noun_of_held_out_part
+from probewise.report.diagnosis_figures import figure_drawers, first_figure_content, noun_of_held_out_part
 from probewise.report.effect_words import (
     EFFECTS_IN_WORDS,
     effect_has_words,
@@ -53,7 +53,7 @@ from probewise.report.words import (
     unit_name,
 )
 
-__all__ = ["encoded_figures", "page_html", "sections", "summary_sentence"]
+__all__ = ["figure_drawers", "page_html", "sections", "summary_sentence"]
 
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
@@ -78,7 +78,7 @@ def summary_sentence(diagnosis: Diagnosis) -> str:
 
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
-    """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `encoded_figures`."""
+    """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `figure_drawers`."""
     return [
         Section("What it could be", _explanation_elements(diagnosis)),
         Section("Where it shows", _place_elements(diagnosis, drawn)),
@@ -95,7 +95,7 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
 def page_html(
     diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
 ) -> str:
-    """Return the HTML of a diagnosis's page; `drawn` is from `encoded_figures`, `audit` that of its plan, if any."""
+    """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`, `audit` that of its plan, if any."""
     run = Section(
         "This run",
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, partial
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -46,18 +47,21 @@ _FIGURE_IN = 6.8  # width of the first figure
 _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readings' value counts as lost
 
 
-def encoded_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw a diagnosis's figures; return SVGs by file name: first, before and after, residuals, noise, gain, places."""
-    chance, values = ResidualNoise.of_diagnosis(diagnosis), covariate_values_by_place(diagnosis)
-    drawn = {
-        "first.svg": _first_figure_svg(diagnosis, chance),
-        "before_after.svg": _before_and_after_svg(diagnosis),
-        "residuals.svg": _all_residuals_svg(diagnosis),
-        "noise.svg": _noise_tests_svg(diagnosis, chance),
+def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
+    """List a diagnosis's figures by file name, as functions that draw SVGs.
+
+    These are: first, before and after, residuals, noise, gain, places.
+    """
+    chance = cache(partial(ResidualNoise.of_diagnosis, diagnosis))
+    drawers: dict[str, Callable[[], bytes]] = {
+        "first.svg": lambda: _first_figure_svg(diagnosis, chance()),
+        "before_after.svg": lambda: _before_and_after_svg(diagnosis),
+        "residuals.svg": lambda: _all_residuals_svg(diagnosis),
+        "noise.svg": lambda: _noise_tests_svg(diagnosis, chance()),
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
-        drawn["gain.svg"] = svg(
+        drawers["gain.svg"] = lambda: svg(
             heldout_gain_by_scan(
                 gain.heldout_by_scan,
                 gain.heldout_log_density_per_reading,
@@ -65,9 +69,7 @@ def encoded_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
                 part=noun_of_held_out_part(diagnosis),
             )
         )
-    for place in diagnosis.where:
-        drawn[place.figure_name] = _place_svg(diagnosis, chance, place, values[place.figure_name])
-    return drawn
+    return drawers | {place.figure_name: partial(_place_svg, diagnosis, chance, place) for place in diagnosis.where}
 
 
 def noun_of_held_out_part(diagnosis: Diagnosis) -> str:
@@ -114,11 +116,12 @@ def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     return svg(above)
 
 
-def _place_svg(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
+def _place_svg(diagnosis: Diagnosis, noise: Callable[[], ResidualNoise], place: Place) -> bytes:
     """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
 
     A whole scan or run gets two panels: above, its residuals along X, Y, time or rows; below, its mean beside others.
     """
+    chance, at = noise(), covariate_values_by_place(diagnosis)[place.figure_name]
     by_covariate = view_along_place_covariate(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         axes = stack_of_axes([2.6])

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from probewise._words import count_with_noun
-from probewise.experiment import left_out_after_step
+from probewise.experiment import Exploration, left_out_after_step
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Section, figure, paragraph, table
 from probewise.report.paper_view import window_around_runs_mm
-from probewise.report.plots import PAGE_IN, draw_field_legend, effect_probabilities_by_reading, grid_of_axes, png
+from probewise.report.plots import (
+    PAGE_IN,
+    AxesGrid,
+    draw_field_legend,
+    effect_probabilities_by_reading,
+    grid_of_axes,
+    png,
+)
 from probewise.report.robot_search import RobotSearch
 from probewise.report.words import number_text
 
@@ -29,8 +37,18 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
 
 
-def encoded_figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
-    """Draw both robots' final posteriors, and the doubting one's probabilities of effects; return PNGs by file name."""
+def figure_drawers(searches: Sequence[RobotSearch]) -> dict[str, Callable[[], bytes]]:
+    """List the section's figures by file name, as functions that draw PNGs.
+
+    These are both robots' final posteriors, and the doubting one's probabilities of effects.
+    """
+    return {
+        "doubt.png": lambda: png(_draw_final_posteriors(searches)),
+        "belief.png": lambda: png(_draw_effect_probabilities(searches[-1].run)),
+    }
+
+
+def _draw_final_posteriors(searches: Sequence[RobotSearch]) -> AxesGrid:
     ends = np.array([window_around_runs_mm([s.run], len(s.run.steps)) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
@@ -48,13 +66,16 @@ def encoded_figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
             ax=ax,
         ).set(xlim=(left, right), ylim=(low, high))
     draw_field_legend(axes)
-    doubting = searches[-1].run
+    return axes
+
+
+def _draw_effect_probabilities(doubting: Exploration) -> Axes:
     beliefs = [left_out_after_step(step, doubting.experiment.trust).probability for step in doubting.steps]
-    return {"doubt.png": png(axes), "belief.png": png(effect_probabilities_by_reading(beliefs))}
+    return effect_probabilities_by_reading(beliefs)
 
 
 def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
-    """Build the demo's section from both searches, the trusting robot's first, and from `encoded_figures`."""
+    """Build the demo's section from both searches, the trusting robot's first, and from `figure_drawers`."""
     doubting = searches[-1].run
     missing = left_out_after_step(doubting.last, doubting.experiment.trust)
     introduction = paragraph(

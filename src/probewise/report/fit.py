@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import cast
 
 import numpy as np
@@ -25,18 +25,23 @@ def summary_sentence(fit: SystemFit) -> str:
     return f"The simulator fits {n} readings with residuals of {fit.rms:.3g} {unit} (rms)."
 
 
-def encoded_figures(fit: SystemFit) -> dict[str, bytes]:
-    """Draw a fit's recorded against predicted readings, and residuals; return SVGs by file name.
+def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
+    """List a fit's figures by file name: functions that draw recorded against predicted readings, and residuals.
 
     Residuals are drawn against time, predicted reading, and up to four input columns of eight distinct values or more.
     """
     recording, own = fit.recording, fit.fitted.simulator
     unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
-    drawn = svg(recorded_against_predicted(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
-    clouds = residuals_against_covariates(
-        _labelled_covariates(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
-    )
-    return {"predicted.svg": drawn, "residuals.svg": svg(clouds)}
+    return {
+        "predicted.svg": lambda: svg(
+            recorded_against_predicted(readings, fit.predicted, fit.sd, label=own.reading, unit=unit)
+        ),
+        "residuals.svg": lambda: svg(
+            residuals_against_covariates(
+                _labelled_covariates(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
+            )
+        ),
+    }
 
 
 def _labelled_covariates(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
@@ -49,7 +54,7 @@ def _labelled_covariates(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, Flo
 
 
 def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
-    """Return the HTML of a fit's page; `drawn` is from `encoded_figures`."""
+    """Return the HTML of a fit's page; `drawn` is from `figure_drawers`."""
     own, evidence = fit.fitted, fit.evidence
     median, interval = np.median(own.samples, axis=0), own.interval()
     error = f" ± {number_text(evidence.error, 2)}" if evidence.error else ""

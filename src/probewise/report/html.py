@@ -74,7 +74,12 @@ def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
 
 
 def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
-    """Build a figure that embeds a PNG or an SVG; `alt`, by default the caption, is its alternative text."""
+    """Build a figure that embeds a PNG or an SVG; `alt`, by default the caption, is its alternative text.
+
+    Without an image (b""), it says that none could be drawn.
+    """
+    if not image:
+        return element("figure", paragraph("This figure could not be drawn."), element("figcaption", caption))
     kind = "svg+xml" if image.startswith(b"<svg") else "png"
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
     size = "" if kind == "svg+xml" else _least_width_attribute(image)

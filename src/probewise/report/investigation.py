@@ -25,11 +25,9 @@ def probabilities_png(found: Investigation) -> bytes:
     return png(probabilities_by_round({_round_title(each): _probability_by_explanation(each) for each in found.rounds}))
 
 
-def probabilities_figure_html(found: Investigation) -> Markup:
-    """Build the HTML of the figure, with caption, of the probability of each explanation after each round."""
-    return figure(
-        probabilities_png(found), "Probability of each explanation after each round, given all readings so far."
-    )
+def probabilities_figure_html(image: bytes) -> Markup:
+    """Build the HTML of the figure of `probabilities_png`, with its caption."""
+    return figure(image, "Probability of each explanation after each round, given all readings so far.")
 
 
 def summary_sentence(found: Investigation) -> str:
@@ -57,7 +55,7 @@ def page_html(
     found
         The investigation, with all rounds.
     drawn
-        Figures of the last diagnosis, by file name.
+        Figures of the last diagnosis and that of `probabilities_png`, by_round.png, by file name.
     source
         Source of the readings, in words.
     seed
@@ -66,7 +64,7 @@ def page_html(
         Names of the effects that a simulated world concealed, stated at the end; None for any other arm.
     """
     last = found.last
-    bars = probabilities_figure_html(found)
+    bars = probabilities_figure_html(drawn["by_round.png"])
     run = definition_list(
         (
             ("arm", source),

@@ -202,6 +202,6 @@ def _investigation_html(value: Investigation) -> str:
     said = _pre(value.summary())
     return _div(
         paragraph(investigation_report.summary_sentence(value)),
-        investigation_report.probabilities_figure_html(value),
+        investigation_report.probabilities_figure_html(investigation_report.probabilities_png(value)),
         said,
     )

@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar in a terminal or notebook, otherwise an occasional line."""
+"""Progress on standard error: a bar in a terminal or notebook, otherwise an occasional line of what has changed."""
 
 from __future__ import annotations
 
@@ -157,11 +157,14 @@ class _StageBars:
 
 
 class _TextProgress:
-    """A progress function that writes a line after two seconds, then every five, later every 5 % of the time passed."""
+    """A progress function that writes a changed report as a line: after two seconds, five more, later 5 % of the time.
+
+    A report that has not changed since the last line is not written again.
+    """
 
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()
-        self._said = False
+        self._said = ""
         self._now = _LastReport("getting ready", 0, 0, "")
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
@@ -169,15 +172,15 @@ class _TextProgress:
         self.refresh()
 
     def refresh(self) -> None:
-        """Write the last report as a line if the wait since the line before is over."""
+        """Write the last report as a line if it says something new and the wait since the line before is over."""
         now = time.monotonic()
         wait = max(_BETWEEN_LINES_S, _SHARE_OF_ALL * (now - self._began)) if self._said else _PATIENCE_S
-        if now - self._last < wait:
+        stage, done, total, note = self._now
+        text = f"{stage}{f', {done} of {total}' if total else ''}{f', {note}' if note else ''}"
+        if now - self._last < wait or text == self._said:
             return
-        self._last, self._said = now, True
-        said = self._now
-        count = f", {said.done} of {said.total}" if said.total else ""
-        sys.stderr.write(f"{said.stage}{count}{', ' + said.note if said.note else ''} ({now - self._began:.0f} s)\n")
+        self._last, self._said = now, text
+        sys.stderr.write(f"{text} ({now - self._began:.0f} s)\n")
         sys.stderr.flush()
 
     def close(self, *, ended: bool) -> None:

@@ -371,9 +371,11 @@ def explore(
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
     instrument = as_instrument(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")
     with instrument, progress_or_bar(progress) as told:
-        told("taking the first readings")
+        told(*("going through the journal", 0, len(taken)) if taken else ("taking the first readings",))
 
         def report_step(step: Step) -> None:
+            if step.replayed:
+                return told("going through the journal", step.number, len(taken))
             believed = f"widest sd {step.largest_sd_mm:.1f} mm, {step.bits:.1f} bits"
             told(f"reading {step.number} of at most {max_readings}", note=believed)
 

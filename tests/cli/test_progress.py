@@ -67,12 +67,25 @@ def test_lines_begin_after_two_seconds_and_come_every_five(clock, capsys):
 
 def test_hours_of_work_are_told_of_more_seldom(clock, capsys):
     lines = _progress._TextProgress()
-    for _ in range(3600):
-        lines("runs", note="a key")
+    for k in range(3600):
+        lines("runs", k, 3600, "a key")
         clock[0] += 1.0
     said = capsys.readouterr().err.splitlines()
-    assert said[0] == "runs, a key (2 s)"
+    assert said[0] == "runs, 2 of 3600, a key (2 s)"
     assert 50 < len(said) < 150
+
+
+def test_what_has_not_changed_is_not_told_again(clock, capsys):
+    lines = _progress._TextProgress()
+    for note in ("thinking about 23", "moving"):
+        lines("exploring", note=note)
+        for _ in range(150):
+            clock[0] += 1.0
+            lines.refresh()
+    assert capsys.readouterr().err.splitlines() == [
+        "exploring, thinking about 23 (2 s)",
+        "exploring, moving (150 s)",
+    ]
 
 
 def test_a_step_that_takes_long_is_heard_of_while_it_lasts(hurried, capsys):

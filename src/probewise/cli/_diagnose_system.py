@@ -55,11 +55,11 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
         figures, drawings = report.figure_drawers(diagnosis), Drawings(out)
         with staged_output(out, inputs=read, outdated=(*_OF_ONE_RUN, *figures, PAGE)) as stage:
             write_results(diagnosis, stage)
-        progress("drawing the figures")
         drawings.write_report(
             figures,
             lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed),
             inputs=read,
+            progress=progress,
         )
     for note in (*diagnosis.recording.notes, *notes_on_calls(diagnosis), *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from probewise._arrays import FloatArray
     from probewise.experiment import Exploration, Step
+    from probewise.progress import Progress
 
 _ANIMATION = "run.gif"
 
@@ -83,7 +84,9 @@ class Pictures:
             titled, readings, levels=inputs.black_and_white_readings, truth_mm=self.truth_mm
         )
 
-    def write_results(self, result: Exploration, *, seed: int, known: Mapping[str, float] | None) -> StagedFiles:
+    def write_results(
+        self, result: Exploration, *, seed: int, known: Mapping[str, float] | None, progress: Progress
+    ) -> StagedFiles:
         """Write result.json, posterior samples and sensor.json, then animation and report; return the former.
 
         The sensor is the one that the run was given, with the effect that the run found in it, if any; what a run with
@@ -107,6 +110,7 @@ class Pictures:
                 unit=self.inputs.sensor.instrumentation.unit,
             ),
             inputs=self.files,
+            progress=progress,
         )
         return stage
 

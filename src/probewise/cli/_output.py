@@ -20,6 +20,7 @@ from pathlib import Path
 from probewise._signals import defer_signals
 from probewise.cli._stopping import raise_if_stopped, reporting_what_is_kept
 from probewise.errors import FileError, ParameterError, ProbewiseError, shortened
+from probewise.progress import Progress, silent
 
 _FOLDER, _COMMIT = ".writing", "commit.json"
 PAGE = "report.html"
@@ -76,9 +77,12 @@ class Drawings:
 
     def draw(self, name: str, drawer: Callable[[], bytes]) -> bytes:
         """Return what `drawer` returns; b"" if it raises, which `raise_if_any_failed` tells."""
+        from probewise.report.plots import close_opened_figures  # imported here, since the help does not need it
+
         try:
             content = drawer()
         except Exception as error:  # whatever it is, the results are more than their pictures
+            close_opened_figures()
             self._failed[name], content = f"{type(error).__name__}: {shortened(' '.join(str(error).split()))}", b""
         raise_if_stopped()  # a signal may have damaged the picture
         return content
@@ -89,6 +93,7 @@ class Drawings:
         page: Callable[[Mapping[str, bytes]], str],
         *,
         inputs: Sequence[Path] = (),
+        progress: Progress = silent,
     ) -> None:
         """Draw figures and the page report.html into the directory of results, which are complete there.
 
@@ -100,13 +105,18 @@ class Drawings:
             Function that builds the HTML from the figures by name; b"" stands for one that could not be drawn.
         inputs
             Input files of this run, which nothing replaces.
+        progress
+            Told which drawing is being made.
         """
         kept = f"the results are in {self.out}, without figures and report"
+        drawn: dict[str, bytes] = {}
+        every = {**drawers, PAGE: lambda: page(drawn).encode()}
         with reporting_what_is_kept(lambda: kept, results=True), staged_output(self.out, inputs=inputs) as stage:
-            drawn = {name: self.draw(name, drawer) for name, drawer in drawers.items()}
-            for name, content in (*drawn.items(), (PAGE, self.draw(PAGE, lambda: page(drawn).encode()))):
-                if content:
-                    stage.write(name, content)
+            for name, drawer in every.items():
+                progress("drawing the report", len(drawn), len(every), name)
+                drawn[name] = self.draw(name, drawer)
+                if drawn[name]:
+                    stage.write(name, drawn[name])
 
     def raise_if_any_failed(self) -> None:
         """Raise NotDrawnError, in one line, if something could not be drawn."""

@@ -55,8 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
             audit = audit_plan(plan, sensor=sensor, progress=progress)
         drawings = None if out is None else Drawings(out)
-        progress("drawing the figures")
-        notes = [] if drawings is None else _write_results(audit, drawings, arguments.plan)
+        notes = [] if drawings is None else _write_results(audit, drawings, arguments.plan, progress)
     print_result(audit.summary(), quiet=arguments.quiet)
     for note in (*getattr(audit.plan, "notes", ()), *notes):
         print_result(f"note: {note}", quiet=arguments.quiet)
@@ -77,7 +76,7 @@ def _audit_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanA
     return audit_system(simulator, table)
 
 
-def _write_results(audit: PlanAudit, drawings: Drawings, plan: Path) -> list[str]:
+def _write_results(audit: PlanAudit, drawings: Drawings, plan: Path, progress: Progress) -> list[str]:
     from probewise.diagnosis import CURE_PLAN, audit_json
     from probewise.recordings import write_plan
     from probewise.report import audit as report
@@ -88,7 +87,9 @@ def _write_results(audit: PlanAudit, drawings: Drawings, plan: Path) -> list[str
         stage.write_json("audit.json", audit_json(audit))
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
-    drawings.write_report(figures, lambda drawn: report.page_html(audit, drawn, source=plan.name), inputs=read)
+    drawings.write_report(
+        figures, lambda drawn: report.page_html(audit, drawn, source=plan.name), inputs=read, progress=progress
+    )
     return stage.notes_on_renamed_inputs
 
 

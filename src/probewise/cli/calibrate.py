@@ -106,12 +106,12 @@ def run(arguments: argparse.Namespace) -> int:
         )
         with staged_output(out, inputs=read, outdated=(*figures, PAGE)) as stage:
             write_sensor(result.sensor, stage / "sensor.json")
-        progress("drawing the figures")
         drawings = Drawings(out)
         drawings.write_report(
             figures,
             lambda drawn: report.page_html(result, recording, prediction, drawn, seed=arguments.seed),
             inputs=read,
+            progress=progress,
         )
     for note in (*recording.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)

@@ -83,8 +83,11 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
         with staged_output(out, outdated=(PAGE,)) as stage:
             stage.write("table.csv", report.target_table_csv(rows))
-        progress("drawing the report")
-        drawings.write_report({}, lambda _: report.page_html(results, rows, command=command, systems=arguments.systems))
+        drawings.write_report(
+            {},
+            lambda _: report.page_html(results, rows, command=command, systems=arguments.systems),
+            progress=progress,
+        )
     print_result(report.summary_sentence(rows, len(results)), quiet=arguments.quiet)
     print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     drawings.raise_if_any_failed()

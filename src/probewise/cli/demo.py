@@ -60,6 +60,7 @@ def _run_demo(
     """Calibrate, search and diagnose, write all files, and return the lines to print."""
     import json
     import time
+    from concurrent.futures import as_completed
     from functools import partial
 
     from probewise.arm import read_geometry, shipped_geometry_path
@@ -77,7 +78,8 @@ def _run_demo(
     out = drawings.out
     truth = random_hidden_circle_mm(seed)
     with worker_pool(2) as pool:
-        progress("calibrating and diagnosing", 0, 8)
+        doing = "calibrating, searching and diagnosing"
+        progress(doing, 0, 8)
         diagnosing = pool.submit(_diagnose_shipped_recording, seed)
         calibration = _calibrate_shipped_recording(seed, arguments.full, pool)
         sensor = calibration.sensor
@@ -85,9 +87,10 @@ def _run_demo(
         starting = [pool.submit(search_from_reading_on_circle, sensor, model, truth, seed) for model in MODELS]
         searching = [pool.submit(_search_from_empty_field, sensor, model, truth, seed) for model in MODELS]
         parts: tuple[Future[Any], ...] = (diagnosing, *doubting, *starting, *searching)
-        for done, future in enumerate(parts, start=1):
-            progress("searching and diagnosing", done, 8)
+        progress(doing, 1, 8)
+        for done, future in enumerate(as_completed(parts), start=2):
             future.result()
+            progress(doing, done, 8)
     diagnosis, alike = diagnosing.result(), [future.result() for future in starting]
     runs = [future.result() for future in searching]
     recording = read_recording(shipped("paper"))
@@ -142,12 +145,12 @@ def _run_demo(
             seconds=seconds,
         )
 
-    progress("drawing the report")
     drawings_of_diagnosis.write_report(
         figures_of_diagnosis,
         lambda drawn: diagnosis_report.page_html(diagnosis, drawn, source="concealed.csv", seed=seed),
+        progress=progress,
     )
-    drawings.write_report(figures, page)
+    drawings.write_report(figures, page, progress=progress)
     return (
         *report.search_comparison_lines(searches),
         report.summary_sentence(started_alike),

@@ -99,12 +99,10 @@ def run(arguments: argparse.Namespace) -> int:
             write_results(diagnosis, stage, rng=files_rng)
 
         def page(drawn: Mapping[str, bytes]) -> str:
-            progress("auditing the plan")
             audit = None if null is not None else audit_plan_of_diagnosis(diagnosis, sensor=sensor)
             return report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
 
-        progress("drawing the figures")
-        drawings.write_report(figures, page, inputs=spared)
+        drawings.write_report(figures, page, inputs=spared, progress=progress)
     for note in (*joined.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

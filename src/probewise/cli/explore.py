@@ -191,7 +191,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     def report_activity(doing: str) -> None:
         believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
-        progress("exploring", note=f"reading {len(steps) + 1}, {doing}{believed}")
+        progress("exploring", note=f"reading {len(steps) + 1} of at most {arguments.max_readings}, {doing}{believed}")
+
+    def report_step() -> None:
+        n_before = 0 if before is None else len(before.entries)
+        if len(steps) < n_before:
+            progress("going through the journal", len(steps), n_before)
+        else:
+            report_activity("choosing its place")
 
     with (
         reporting_what_is_kept(kept_message),
@@ -217,17 +224,17 @@ def run(arguments: argparse.Namespace) -> int:
             )
         ) as own,
     ):
-        progress("exploring", note="choosing the first place")
+        report_step()
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
             under = posing.ArmReachAndTravel.from_instrument(site.arm, inputs.other.grid)
             pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.draw_and_write(step, shadow)
+            report_step()
     result = Exploration(inputs.experiment, tuple(steps))
     with reporting_what_is_kept(kept_message, results=True), progress_shown(quiet=arguments.quiet) as progress:
-        progress("drawing the report")
-        stage = pictures.write_results(result, seed=arguments.seed, known=site.known)
+        stage = pictures.write_results(result, seed=arguments.seed, known=site.known, progress=progress)
     for line in _closing_lines(result, inputs, site, journal):
         print_result(line, quiet=arguments.quiet)
     for note in stage.notes_on_renamed_inputs:

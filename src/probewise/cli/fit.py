@@ -49,8 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
             stage.write_json("fit.json", fit_json(fitted))
             write_fitted_system(fitted.fitted, stage / "fitted.json")
             stage.write("samples.csv", samples_csv(fitted.fitted))
-        progress("drawing the figures")
-        drawings.write_report(figures, lambda drawn: report.page_html(fitted, drawn, seed=arguments.seed), inputs=read)
+        drawings.write_report(
+            figures, lambda drawn: report.page_html(fitted, drawn, seed=arguments.seed), inputs=read, progress=progress
+        )
     for note in (*fitted.recording.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

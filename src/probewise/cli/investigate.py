@@ -171,13 +171,13 @@ def run(arguments: argparse.Namespace) -> int:
         with staged_output(out, inputs=spared, outdated=(*OF_ONE_RUN, *figures, PAGE)) as stage:
             write_results(diagnosis, stage, rng=np.random.default_rng(files_seed))
             write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
-        progress("drawing the report")
         drawings.write_report(
             figures,
             lambda drawn: report.page_html(
                 found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed
             ),
             inputs=spared,
+            progress=progress,
         )
     print_result(found.summary(), quiet=arguments.quiet)
     if concealed is not None:

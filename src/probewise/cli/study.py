@@ -104,8 +104,9 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
         with staged_output(out, outdated=(PAGE,)) as stage:
             stage.write("table.csv", report.table_csv(study))
-        progress("drawing the report")
-        drawings.write_report({}, lambda _: report.page_html(study, command=_command_line(arguments)))
+        drawings.write_report(
+            {}, lambda _: report.page_html(study, command=_command_line(arguments)), progress=progress
+        )
     print_result(report.summary_sentence(study), quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
     drawings.raise_if_any_failed()

@@ -38,6 +38,7 @@ __all__ += [
     "AxesGrid",
     "axes_or_grid",
     "axes_or_new",
+    "close_opened_figures",
     "grid_of_axes",
 ]
 __all__ += [
@@ -119,6 +120,12 @@ def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
     sheet = plt.figure(figsize=size_in, layout=layout)
     _OPENED.add(sheet)
     return sheet
+
+
+def close_opened_figures() -> None:
+    """Close the figures that plot functions opened: what raised in one has left it open."""
+    for sheet in list(_OPENED):
+        plt.close(sheet)
 
 
 def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True) -> bytes:

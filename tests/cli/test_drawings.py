@@ -1,0 +1,95 @@
+"""A figure that fails loses no result: what machines read is on disk before anything is drawn."""
+
+import numpy as np
+import pytest
+from heater import FILE, runs
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from probewise.cli import main
+from probewise.cli._output import Drawings, NotDrawnError
+from probewise.cli._stopping import Stopped
+from probewise.report.html import figure
+from probewise.systems import run_table_csv
+
+HEATER = ("--simulator", "heater.py")
+DIAGNOSIS = ("diagnosis.json", "sensor.json", "calibrated.json", "next_plan.csv", "next_plan.json", "report.html")
+# Of each command, the files that it leaves where no figure can be drawn.
+COMMANDS = {
+    "audit small.csv": ("audit.json", "cure_plan.csv", "cure_plan.json", "report.html"),
+    "audit data.csv --simulator heater.py": ("audit.json", "report.html"),
+    "fit data.csv --simulator heater.py": ("fit.json", "fitted.json", "samples.csv", "report.html"),
+    "explore --sensor sensor.json --truth 500,250,90 --max-readings 2 --live": (
+        *("journal.jsonl", "result.json", "samples.csv", "sensor.json"),
+    ),
+    "study --circles 2 --max-readings 2 --model naive --workers 1": ("trials.jsonl", "table.csv"),
+    "study --concealed --circles 1 --clean 1 --size gross --max-readings 2 --workers 1": (
+        "concealed.jsonl",
+        "concealed.csv",
+    ),
+    "challenge --cases 1 --workers 1": ("cases.jsonl", "table.csv"),
+    "calibrate small.csv --orders 1 --live 16": ("sensor.json", "report.html"),
+    "diagnose small.csv": DIAGNOSIS,
+    "diagnose data.csv --simulator heater.py": (
+        *("diagnosis.json", "repaired.json", "calibrated.json", "next.csv", "report.html"),
+    ),
+    "investigate --plan small.csv --truth nothing --rounds 1": (
+        *(*DIAGNOSIS, "recording.csv", "recording.json", "rounds/settings.json"),
+        *(f"rounds/{name}" for name in ("1.csv", "1.json", "1_plan.csv", "1_plan.json")),
+    ),
+    "demo": ("sensor.json", "answers.json", "report.html", *(f"diagnosis/{name}" for name in DIAGNOSIS)),
+}
+
+
+QUICK = ("audit data.csv", "explore", "study")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(words, marks=[] if words.startswith(QUICK) else pytest.mark.slow) for words in COMMANDS],
+)
+def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_1(
+    command, recording_file, sensor_file, tmp_path, monkeypatch, capsys
+):
+    def fail(*_, **__):
+        raise KeyError(0.0)
+
+    monkeypatch.setattr(Figure, "savefig", fail)
+    monkeypatch.setattr(FigureCanvasSVG, "print_svg", fail)
+    monkeypatch.setattr("webbrowser.open", lambda url: None)
+    (tmp_path / "heater.py").write_text(FILE)
+    (tmp_path / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))
+    monkeypatch.chdir(tmp_path)
+    verb, *words = command.split()
+    assert main([verb, *words, "--out", "out", "--quiet"]) == 1
+    *_, said = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"probewise {verb}: could not draw ")
+    assert "(KeyError: 0.0)" in said
+    out = tmp_path / "out"
+    assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == set(COMMANDS[command])
+
+
+def test_one_figure_that_fails_leaves_the_others(tmp_path):
+    drawings = Drawings(tmp_path)
+    drawers = {"first.svg": lambda: b"first", "second.svg": lambda: 1 // 0, "third.svg": lambda: b"third"}
+    drawings.write_report(drawers, lambda drawn: f"page with {sorted(drawn.values())}")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
+        "first.svg": "first",
+        "third.svg": "third",
+        "report.html": "page with [b'', b'first', b'third']",
+    }
+    with pytest.raises(NotDrawnError, match=r"^could not draw second\.svg \(ZeroDivisionError: .*\); everything else"):
+        drawings.raise_if_any_failed()
+
+
+def test_an_interruption_while_figures_are_drawn_says_where_the_results_are(tmp_path):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    with pytest.raises(Stopped, match=r"the results are in .*, without figures and report"):
+        Drawings(tmp_path).write_report({"first.svg": interrupt}, lambda drawn: "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_says_where_a_figure_is_missing():
+    assert "could not be drawn" in figure(b"", "Residuals.")

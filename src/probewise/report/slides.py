@@ -21,13 +21,15 @@ def join_side_by_side(left: Sequence[bytes], right: Sequence[bytes]) -> list[byt
 
     Returns
     -------
-    PNGs with a small palette, as many as the longer run has.
+    PNGs with a small palette, as many as the longer run has; b"" for a step without a picture (b"") of either.
     """
     pairs = zip_longest(left, right)
     return [_paste_side_by_side(a if a is not None else left[-1], b if b is not None else right[-1]) for a, b in pairs]
 
 
 def _paste_side_by_side(left: bytes, right: bytes) -> bytes:
+    if not (left and right):
+        return b""
     pictures = [Image.open(io.BytesIO(picture)).convert("RGB") for picture in (left, right)]
     sheet = Image.new("RGB", (sum(p.width for p in pictures), max(p.height for p in pictures)), "white")
     sheet.paste(pictures[0], (0, 0))

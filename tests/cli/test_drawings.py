@@ -1,12 +1,14 @@
 """A figure that fails loses no result: what machines read is on disk before anything is drawn."""
 
+from concurrent.futures import Executor, Future
+
 import numpy as np
 import pytest
 from heater import FILE, runs
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from probewise.cli import main
+from probewise.cli import demo, main
 from probewise.cli._output import Drawings, NotDrawnError
 from probewise.cli._stopping import Stopped
 from probewise.report.html import figure
@@ -41,9 +43,27 @@ COMMANDS = {
 }
 
 
+class InThisProcess(Executor):
+    """Workers that the changes of a test reach."""
+
+    def submit(self, work, *arguments, **keywords):
+        future = Future()
+        future.set_result(work(*arguments, **keywords))
+        return future
+
+
+@pytest.fixture
+def short_demo(monkeypatch):
+    """A demo of few readings."""
+    monkeypatch.setattr("probewise.cli._workers.worker_pool", lambda n: InThisProcess())
+    for name, n in (("N_LIVE", 40), ("N_LIVE_ROBOT", 40), ("MAX_READINGS", 3), ("MAX_READINGS_DOUBT", 2)):
+        monkeypatch.setattr(demo, name, n)
+
+
 QUICK = ("audit data.csv", "explore", "study")
 
 
+@pytest.mark.usefixtures("short_demo")
 @pytest.mark.parametrize(
     "command",
     [pytest.param(words, marks=[] if words.startswith(QUICK) else pytest.mark.slow) for words in COMMANDS],

@@ -23,7 +23,7 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def hurried(monkeypatch):
     """Let two seconds pass in a hundredth of one."""
-    for name in ("_PATIENCE_S", "_BEAT_S"):
+    for name in ("_PATIENCE_S", "_BETWEEN_LINES_S", "_BEAT_S"):
         monkeypatch.setattr(_progress, name, 0.01)
 
 

@@ -40,7 +40,7 @@ from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
-from probewise.effects.motion import candidate_scan_groups
+from probewise.effects.motion import candidate_scan_groups, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import (
     HalfPlane,
@@ -90,6 +90,16 @@ def test_an_effect_of_scans_of_which_one_has_no_usable_reading_is_located_in_the
     scans = Covariate("scan", kept.scan.astype(float), np.arange(len(kept)), groups=True)
     change = np.where(kept.scan == 1, 2.0, 0.0)
     assert [place.scan for place in placed(bound, change, change, kept, [scans])] == ["s2"]
+
+
+def test_where_nearly_all_readings_move_one_way_hysteresis_shows_in_those_at_rest():
+    """An offset of all that move is absorbed by the levels."""
+    plan = line().plan
+    kept = plan.take(np.r_[0:12, 12])  # of the second scan a single reading
+    effect = VOCABULARY["hysteresis"].for_extent(Extent(0.0, 1.0, kept))
+    change = 3.0 * sign_of_motion(kept)
+    (place,) = placed(effect, change, change, kept, [])
+    assert (place.covariate, place.start, place.end) == ("direction", 0.0, 0.0)
 
 
 @pytest.mark.parametrize("n_gaussians", [1, 2, 3])

@@ -77,7 +77,7 @@ class Drawings:
 
     def draw(self, name: str, drawer: Callable[[], bytes]) -> bytes:
         """Return what `drawer` returns; b"" if it raises, which `raise_if_any_failed` tells."""
-        from probewise.report.plots import close_opened_figures  # imported here, since the help does not need it
+        from probewise.report.plots.canvas import close_opened_figures  # imported here, since the help does not need it
 
         try:
             content = drawer()

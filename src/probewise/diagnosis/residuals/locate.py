@@ -216,8 +216,9 @@ def places_of_effect(
 ) -> list[Place]:
     """Locate a named effect: the interval of a covariate in which it is at least half its maximum.
 
-    In `level` a twentieth suffices; in `run`, it is the run of the largest change. The list holds one place, or, for an
-    effect bound to scans, one per scan in which it is a twentieth of its maximum or more.
+    In `level` a twentieth suffices; in `direction` its deviation from its mean counts; in `run`, it is the run of
+    the largest change. The list holds one place, or, for an effect bound to scans, one per scan in which it is a
+    twentieth of its maximum or more.
 
     Parameters
     ----------
@@ -248,7 +249,9 @@ def places_of_effect(
             Place("scan", scan, None, None, p_value, size, **curve)
             for scan in _scans_with_effect(effect.scans, change, plan)
         ]
-    strength = np.abs(change[covariate.rows])
+    there = change[covariate.rows]
+    # The levels absorb what all readings share: where nearly all move one way, those at rest stand out.
+    strength = np.abs(there - there.mean() if name == "direction" else there)
     # An effect with a threshold in level begins where it is first significant.
     significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
     values = covariate.values[significant]

@@ -12,15 +12,7 @@ and also: progress towards the target precision, results of a diagnosis, and dia
 from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
-from probewise.report.plots.canvas import (
-    PAGE_IN,
-    SMALL_PT,
-    AxesGrid,
-    grid_of_axes,
-    png,
-    stack_of_axes,
-    svg,
-)
+from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_axes, png, stack_of_axes, svg
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
 from probewise.report.plots.concealed import doubt_against_trust
 from probewise.report.plots.doubt import effect_probabilities_by_reading

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import probewise
 from probewise import _progress
 from probewise._progress import progress_or_bar, progress_shown
 from probewise.cli._arm import prompter_for_answer
@@ -162,3 +163,17 @@ def test_reading_a_file_tells_of_its_rows(recording_file):
     assert stage == "reading small.csv"
     assert done == len(recording) + 1 <= total
     assert np.all(np.diff([words[1] for words in told]) > 0)
+
+
+def test_a_run_that_is_resumed_tells_how_far_it_is_through_its_journal(sensor_file, tmp_path):
+    sensor, journal, told = probewise.read_sensor(sensor_file), tmp_path / "journal.jsonl", []
+
+    def tell(stage, done=0, total=0, note=""):
+        told.append((stage, done, total))
+
+    for n in (1, 2):
+        rng = np.random.default_rng(5)
+        probewise.explore(sensor, max_readings=n, rng=rng, journal=journal, progress=tell)
+    assert told[:2] == [("taking the first readings", 0, 0), ("reading 1 of at most 1", 0, 0)]
+    through = "going through the journal"
+    assert told[2:] == [(through, 0, 1), (through, 1, 1), ("reading 2 of at most 2", 0, 0)]

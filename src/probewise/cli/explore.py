@@ -193,12 +193,7 @@ def run(arguments: argparse.Namespace) -> int:
         believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
         progress("exploring", note=f"reading {len(steps) + 1} of at most {arguments.max_readings}, {doing}{believed}")
 
-    def report_step() -> None:
-        n_before = 0 if before is None else len(before.entries)
-        if len(steps) < n_before:
-            progress("going through the journal", len(steps), n_before)
-        else:
-            report_activity("choosing its place")
+    n_before = 0 if before is None else len(before.entries)
 
     with (
         reporting_what_is_kept(kept_message),
@@ -224,14 +219,18 @@ def run(arguments: argparse.Namespace) -> int:
             )
         ) as own,
     ):
-        report_step()
+        if n_before:
+            progress("going through the journal", 0, n_before)
+        else:
+            report_activity("choosing its place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
             under = posing.ArmReachAndTravel.from_instrument(site.arm, inputs.other.grid)
             pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.draw_and_write(step, shadow)
-            report_step()
+            if step.replayed:
+                progress("going through the journal", step.number, n_before)
     result = Exploration(inputs.experiment, tuple(steps))
     with reporting_what_is_kept(kept_message, results=True), progress_shown(quiet=arguments.quiet) as progress:
         stage = pictures.write_results(result, seed=arguments.seed, known=site.known, progress=progress)

@@ -60,7 +60,7 @@ def short_demo(monkeypatch):
         monkeypatch.setattr(demo, name, n)
 
 
-QUICK = ("audit data.csv", "explore", "study")
+QUICK = ("audit data.csv", "explore", "study --circles")
 
 
 @pytest.mark.usefixtures("short_demo")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from probewise._signals import defer_signals
 from probewise.cli._stopping import raise_if_stopped, reporting_what_is_kept
-from probewise.errors import FileError, ParameterError, ProbewiseError, shortened
+from probewise.errors import FileError, ParameterError, ProbewiseError, message_of
 from probewise.progress import Progress, silent
 
 _FOLDER, _COMMIT = ".writing", "commit.json"
@@ -83,7 +83,7 @@ class Drawings:
             content = drawer()
         except Exception as error:  # whatever it is, the results are more than their pictures
             close_opened_figures()
-            self._failed[name], content = f"{type(error).__name__}: {shortened(' '.join(str(error).split()))}", b""
+            self._failed[name], content = message_of(error), b""
         raise_if_stopped()  # a signal may have damaged the picture
         return content
 

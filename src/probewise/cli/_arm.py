@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Self
 
 from probewise._kinds import did_you_mean
-from probewise.cli._common import CommandError, add_path, print_warning
+from probewise.cli._common import CommandError, add_path, print_warning, write_to_terminal
 from probewise.cli._stopping import raise_if_stopped
 from probewise.errors import ParameterError
 
@@ -291,8 +291,7 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
         raise_if_stopped()  # an arm may have held the stop back until its reading was kept
         answers: queue.Queue[str] = queue.Queue()
         with tqdm.external_write_mode(file=sys.stderr):  # a progress bar would overwrite the question
-            sys.stderr.write(text)
-            sys.stderr.flush()
+            write_to_terminal(sys.stderr, text)
             # Reading a line cannot be interrupted, so it runs in a daemon thread.
             threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
             while True:

@@ -55,14 +55,12 @@ def _predict_by_simulator(arguments: argparse.Namespace) -> int:
         predict_system,
         read_fitted_system,
         read_run_table,
-        read_simulator,
         write_system_prediction,
     )
 
     out = checked_output_file(arguments.out, arguments.sensor, arguments.plan, arguments.simulator)
-    simulator = read_simulator(arguments.simulator)
-    fitted = read_fitted_system(arguments.sensor, simulator)
-    table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)
+    fitted = read_fitted_system(arguments.sensor, arguments.simulator)  # a file that was changed is not run
+    table = read_run_table(arguments.plan, time=fitted.simulator.time, run=fitted.simulator.run)
     with progress_shown(quiet=arguments.quiet) as progress:
         prediction = predict_system(fitted, table, rng=np.random.default_rng(arguments.seed), progress=progress)
     out.parent.mkdir(parents=True, exist_ok=True)

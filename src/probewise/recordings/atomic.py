@@ -20,11 +20,19 @@ if sys.platform != "win32":
 _WRITABLE = "a file in an existing, writable folder"
 
 
-def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None:
+def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, named: bool = True) -> None:
     """Replace the file at `path` by `content` atomically; its permissions stay.
 
     The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. Temporary files
-    that killed processes left are removed. A symbolic link is followed. A device or a named pipe is written to.
+    that killed processes left are removed.
+
+    Parameters
+    ----------
+    path, content
+        The file and its content.
+    named
+        Whether a person has named this very file: then a symbolic link is followed, and a device or a named pipe is
+        written to. One that stands where a further file goes is replaced.
 
     Raises
     ------
@@ -33,12 +41,12 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
     """
     path = Path(path)
     try:
-        mode = _mode_of(path)
-        if mode is not None and not stat.S_ISREG(mode):  # a folder cannot be opened
+        mode = _mode_of(path, follow_links=named)
+        if named and mode is not None and not stat.S_ISREG(mode):  # a folder cannot be opened
             with open(path, "wb", buffering=0) as file:
                 _write_all(file, content)
             return
-        target = Path(os.path.realpath(path))
+        target = Path(os.path.realpath(path)) if named else path
     except (OSError, ValueError) as error:
         raise _error_of_writing(path, error, _WRITABLE) from error
     for left in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
@@ -50,7 +58,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
                 with contextlib.suppress(OSError):  # a file system without locks: others may remove the file
                     _lock(file.fileno())
                 write_and_sync(file, path, content)
-            if mode is not None:
+            if mode is not None and stat.S_ISREG(mode):
                 os.chmod(temporary, stat.S_IMODE(mode))
             os.replace(temporary, target)
         except OSError as error:
@@ -60,9 +68,9 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
                 os.unlink(temporary)
 
 
-def write_text_atomically(path: str | os.PathLike[str], text: str) -> None:
+def write_text_atomically(path: str | os.PathLike[str], text: str, *, named: bool = True) -> None:
     """Replace the file at `path` by `text` in UTF-8, as `write_bytes_atomically` does, with line ends unchanged."""
-    write_bytes_atomically(path, text.encode("utf-8"))
+    write_bytes_atomically(path, text.encode("utf-8"), named=named)
 
 
 def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:
@@ -94,9 +102,9 @@ def is_device_or_pipe(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-def _mode_of(path: Path) -> int | None:
+def _mode_of(path: Path, *, follow_links: bool) -> int | None:
     try:
-        return path.stat().st_mode
+        return path.stat(follow_symlinks=follow_links).st_mode
     except FileNotFoundError:  # or a symbolic link to a file that is to be made
         return None
 

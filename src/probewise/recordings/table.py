@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 # On texts of these characters float() accepts exactly what _NUMBER does ('infinity' and '1_000' have others).
 _OF_NUMBERS = re.compile(r"[-+.0-9eE]*", re.ASCII)
 _OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs"}
+_BEGIN_FORMULA = ("=", "+", "-", "@")
 _CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
 
 
@@ -156,6 +158,7 @@ def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
     text = read_text(path, "a CSV file")
     n_lines = text.count("\n")
     separator = next(c for c in itertools.chain("\x1f\x1e", map(chr, range(0xE000, 0x110000))) if c not in text)
+    unescape = partial(re.compile(f"(?<![^{separator}])'(?='*[=+@-])").sub, "")  # see _not_as_formula
     header: list[str] | None = None
     columns: list[list[str]] = []
     rows: list[IntArray] = []
@@ -165,7 +168,7 @@ def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
         blank = [k for k in np.flatnonzero(lengths <= 1) if not any(cell.strip() for cell in records[k])]
         kept = np.delete(np.arange(len(records)), blank)
         if header is None and len(kept):
-            header = [cell.strip() for cell in records[kept[0]]]
+            header = [unescape(cell.strip()) for cell in records[kept[0]]]
             _require_commas(path, header, n_read + int(kept[0]) + 1)
             _require_distinct_columns(path, header, n_read + int(kept[0]) + 1)
             columns = [[] for _ in header]
@@ -185,7 +188,7 @@ def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
         progress(f"reading {path.name}", n_read, max(n_lines, n_read))
     if header is None:
         raise FileError(path, "the file is empty", "a header row and one row per reading")
-    joined = {name: separator.join(column) for name, column in zip(header, columns, strict=True)}
+    joined = {name: unescape(separator.join(column)) for name, column in zip(header, columns, strict=True)}
     return CSVTable(path, joined, separator, np.concatenate(rows))
 
 
@@ -235,15 +238,25 @@ def number_text(value: float) -> str:
     return str(int(value)) if value.is_integer() and abs(value) <= LARGEST else repr(value)
 
 
+def _not_as_formula(cell: object) -> object:
+    """Return a cell, in front of a text like "=1+1" or "'=1+1" one apostrophe more; numbers stay as they are."""
+    if isinstance(cell, str) and cell.lstrip("'")[:1] in _BEGIN_FORMULA and not _is_number(cell):
+        return f"'{cell}"
+    return cell
+
+
 def csv_text(columns: dict[str, Sequence[str]]) -> str:
     """Format columns of cells of equal length as CSV with a header row and LF line ends."""
     return csv_text_of_rows(columns, zip(*columns.values(), strict=True))
 
 
 def csv_text_of_rows(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Format rows as CSV with a header row and LF line ends."""
+    """Format rows as CSV with a header row and LF line ends.
+
+    A text that a spreadsheet would take for a formula gains an apostrophe in front, which `read_table` removes.
+    """
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerow(map(_not_as_formula, header))
+    writer.writerows(map(_not_as_formula, row) for row in rows)
     return out.getvalue()

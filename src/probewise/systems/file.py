@@ -45,7 +45,16 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
         If it cannot be read or run, or is inconsistent; the message names the line, if there is one.
     """
     path = checked_path("path", path, "the name of a Python file that describes a simulator")
-    text = read_text(path, "a Python file that describes a simulator")
+    return run_simulator_text(read_text(path, "a Python file that describes a simulator"), path)
+
+
+def fingerprint_of_text(text: str) -> str:
+    """Return the fingerprint of the text of a user's file."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def run_simulator_text(text: str, path: Path) -> Simulator:
+    """Run the text of a user's file, as `read_simulator` does."""
     said = run_python_text(text, path)
     try:
         return _build_simulator(said, path, text)
@@ -93,7 +102,7 @@ def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulato
         extra={name: _parse_extra(name, each) for name, each in _checked_mapping(said, "extra").items()},
         vectorized=bool(said.get("vectorized", False)),
         source=path.name,
-        fingerprint=hashlib.sha256(text.encode()).hexdigest()[:16],
+        fingerprint=fingerprint_of_text(text),
     )
 
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 ARMS = (
     "simulated; emulator, the LEGO arm in software, or emulator:TRUE.toml, built differently from --geometry; "
-    "nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, an instrument of your own"
+    "nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, an instrument of your own (a "
+    "program: run only those that you trust)"
 )
 """Names of arms, the same in every verb."""
 

@@ -63,8 +63,10 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     start_s = taken[-1].time_s if taken else 0.0
 
     def kept_message() -> str:
-        if at_end or not out.exists():
-            return "nothing was kept"
+        if not out.exists():
+            return "nothing was read"
+        if at_end:
+            return f"nothing was kept: {out} takes whole recordings"
         return message_to_resume(
             out, len(read_unfinished_recording(out)), "reading", arguments, "--resume", of=len(plan)
         )

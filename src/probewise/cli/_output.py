@@ -13,7 +13,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from probewise._signals import defer_signals
@@ -26,17 +26,7 @@ _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 
 
 class StagedFiles:
-    """Files written into an empty directory, and the new names of input files that they replace.
-
-    `staged_output` makes the directory and moves the files.
-
-    Attributes
-    ----------
-    folder
-        The directory.
-    kept
-        New path, by old path, of each input file that a result would have replaced.
-    """
+    """Files written into an empty directory, `folder`; `kept` has the new path of each input file that they replace."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -72,14 +62,12 @@ def checked_output_directory(path: Path, *entries: str) -> Path:
     `entries` are files and folders of it that the run writes as it goes. Raises ParameterError if a file is in the way,
     FileError if no directory can be made there, or one of the entries is a symbolic link.
     """
-    from probewise.recordings.atomic import refuse_links  # imported here, since the help does not need it
-
     if path.exists() and not path.is_dir():
         raise ParameterError("--out", str(path), "a directory, existing or new; this is a file")
     parent = next(p for p in (path, *path.absolute().parents) if p.exists())
     if not parent.is_dir():
         raise ParameterError("--out", str(path), f"a directory; {parent} is a file")
-    refuse_links(path, *entries)
+    _refuse_links(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
         os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=parent))
     except OSError as error:
@@ -126,24 +114,13 @@ def holds_readings(table: Path, column: str) -> bool:
 
 @contextlib.contextmanager
 def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[StagedFiles]:
-    """Yield an empty directory; move its files into `out` only if the block succeeds.
+    """Yield an empty directory; move its files into `out`, made if missing, only if the block succeeds.
 
-    An error or a signal before that leaves `out` as it was.
+    One of the `inputs` of this run that a result would replace is copied to another name. Files of an earlier run, of
+    the patterns `outdated`, are removed unless this run writes them.
 
-    Parameters
-    ----------
-    out
-        Where the results go; made if missing.
-    inputs
-        Input files of this run: one that a result would replace is copied to another name.
-    outdated
-        Patterns of an earlier run's files in `out`, which are removed unless this run writes them.
-
-    Raises
-    ------
-    FileError
-        If `out` cannot be made or written to, another process writes there for too long, a directory has the name of
-        a result, or a symbolic link that of a directory of results.
+    Raises FileError if `out` cannot be made or written to, another process writes there for too long, a directory has
+    the name of a result, or a symbolic link that of a directory of results.
     """
     from probewise.recordings import hold_lock  # imported here, since the help does not need it
 
@@ -180,7 +157,7 @@ def _complete(out: Path, stage: StagedFiles, inputs: Sequence[Path], outdated: S
     """
     names = _files_in(stage.folder)
     for name in names:
-        _refuse_link_to_directory(out, name)
+        _refuse_links((out / name).parents[: name.count("/")])
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
     own = {path.resolve() for path in inputs}
@@ -202,7 +179,7 @@ def _move_into_place(out: Path) -> None:
     complete = out / _COMPLETE
     try:
         for name in [] if complete.is_symlink() else _files_in(complete):
-            _refuse_link_to_directory(out, name)
+            _refuse_links((out / name).parents[: name.count("/")])
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             if name.endswith(_OUTDATED):
                 (out / name.removesuffix(_OUTDATED)).unlink(missing_ok=True)
@@ -224,10 +201,10 @@ def _files_in(folder: Path) -> list[str]:
     return sorted(file.relative_to(folder).as_posix() for file in files)
 
 
-def _refuse_link_to_directory(out: Path, name: str) -> None:
-    for parent in Path(name).parents[:-1]:
-        if (out / parent).is_symlink():
-            raise FileError(out / parent, "is a symbolic link, which may lead out of the folder", "another --out")
+def _refuse_links(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if path.is_symlink():
+            raise FileError(path, "is a symbolic link, which may lead out of the folder", "another --out, or no link")
 
 
 def _remove(path: Path) -> None:

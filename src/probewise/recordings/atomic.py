@@ -7,24 +7,21 @@ import glob
 import os
 import secrets
 import stat
-import sys
+import time
 from io import FileIO
 from pathlib import Path
 
 from probewise._signals import defer_signals
 from probewise.errors import FileError
 
-if sys.platform != "win32":
-    import fcntl
-
-_WRITABLE = "a file in an existing, writable folder"
+_ABANDONED_S = 3600.0  # age of a temporary file at which its writer must have been killed
 
 
 def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, named: bool = True) -> None:
     """Replace the file at `path` by `content` atomically; its permissions stay.
 
-    The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. Temporary files
-    that killed processes left are removed.
+    The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. What killed
+    processes left is removed an hour later.
 
     Parameters
     ----------
@@ -41,31 +38,27 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, name
     """
     path = Path(path)
     try:
-        mode = _mode_of(path, follow_links=named)
-        if named and mode is not None and not stat.S_ISREG(mode):  # a folder cannot be opened
+        if named and is_device_or_pipe(path):
             with open(path, "wb", buffering=0) as file:
                 _write_all(file, content)
             return
         target = Path(os.path.realpath(path)) if named else path
-    except (OSError, ValueError) as error:
-        raise _error_of_writing(path, error, _WRITABLE) from error
-    for left in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
-        _remove_unless_being_written(left)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
-    with defer_signals():
-        try:
-            with open(temporary, "xb", buffering=0) as file:
-                with contextlib.suppress(OSError):  # a file system without locks: others may remove the file
-                    _lock(file.fileno())
-                write_and_sync(file, path, content)
-            if mode is not None and stat.S_ISREG(mode):
-                os.chmod(temporary, stat.S_IMODE(mode))
-            os.replace(temporary, target)
-        except OSError as error:
-            raise _error_of_writing(path, error, _WRITABLE) from error
-        finally:
+        for left in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
             with contextlib.suppress(OSError):
-                os.unlink(temporary)
+                if time.time() - left.lstat().st_mtime > _ABANDONED_S:
+                    left.unlink()
+        temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+        with defer_signals(), contextlib.ExitStack() as stack:
+            with open(temporary, "xb", buffering=0) as file:
+                stack.callback(temporary.unlink, missing_ok=True)
+                write_and_sync(file, path, content)
+            if target.is_file() and not target.is_symlink():
+                os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
+            os.replace(temporary, target)
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise _error_of_writing(path, error, "a file in an existing, writable folder") from error
 
 
 def write_text_atomically(path: str | os.PathLike[str], text: str, *, named: bool = True) -> None:
@@ -88,25 +81,9 @@ def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:
         raise _error_of_writing(path, error, "a file on a disk with room") from error
 
 
-def refuse_links(folder: Path, *names: str) -> None:
-    """Raise FileError if one of these entries of a folder, or an entry of one, is a symbolic link: it may lead out."""
-    for named in (folder / name for name in names):
-        inner = named.iterdir() if named.is_dir() and not named.is_symlink() else ()
-        for entry in (named, *inner):
-            if entry.is_symlink():
-                raise FileError(entry, "is a symbolic link, which may lead out of the folder", "another --out, or none")
-
-
 def is_device_or_pipe(path: Path) -> bool:
-    """Return whether something is at `path` that is neither a file nor a folder."""
+    """Return whether something is at `path`, or where a symbolic link leads, that is neither a file nor a folder."""
     return path.exists() and not path.is_file() and not path.is_dir()
-
-
-def _mode_of(path: Path, *, follow_links: bool) -> int | None:
-    try:
-        return path.stat(follow_symlinks=follow_links).st_mode
-    except FileNotFoundError:  # or a symbolic link to a file that is to be made
-        return None
 
 
 def _write_all(file: FileIO, content: bytes) -> None:
@@ -117,22 +94,3 @@ def _write_all(file: FileIO, content: bytes) -> None:
 
 def _error_of_writing(path: Path, error: Exception, allowed: str) -> FileError:
     return FileError(path, f"cannot be written ({getattr(error, 'strerror', None) or error})", allowed)
-
-
-def _lock(handle: int) -> None:
-    """Mark an open file as being written, until it is closed; Windows lets nobody remove an open file anyway."""
-    if sys.platform != "win32":
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _remove_unless_being_written(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if sys.platform == "win32":
-            path.unlink()
-        elif stat.S_ISREG(path.lstat().st_mode):
-            handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-            try:
-                _lock(handle)
-                path.unlink()
-            finally:
-                os.close(handle)

@@ -79,7 +79,7 @@ def test_a_lock_file_that_is_a_symbolic_link_is_refused_and_where_it_leads_stays
         (tmp_path / ".a.lock").unlink(missing_ok=True)
         (tmp_path / ".a.lock").symlink_to(tmp_path / target)
         with (
-            pytest.raises(FileError, match=r"\.a\.lock: cannot be locked \(is a symbolic link\)"),
+            pytest.raises(FileError, match=r"\.a\.lock: cannot be locked \(is a sym"),
             hold_lock(tmp_path / "a"),
         ):
             pass

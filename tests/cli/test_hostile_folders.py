@@ -153,6 +153,24 @@ def test_a_link_where_a_run_would_write_is_refused_before_it_begins(verb, name, 
     assert (tmp_path / "victim").read_text() == "precious"
 
 
+@pytest.mark.parametrize(
+    ("verb", "name"),
+    [
+        ("explore", "journal.jsonl"),
+        ("explore", "frames/2.png"),
+        ("investigate", "rounds/1.csv"),
+        ("study", "trials.jsonl"),
+    ],
+)
+def test_a_pipe_where_a_run_would_read_or_write_is_not_waited_for(verb, name, sensor_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    os.mkfifo(out / name)
+    words = {"explore": ["--sensor", str(sensor_file), "--resume"], "investigate": ["--plan", "paper", "--resume"]}
+    assert main([verb, *words.get(verb, []), "--quiet", "--out", str(out)]) == 2
+    assert f"{out / name}: is a device or a pipe" in capsys.readouterr().err
+
+
 def predict(sensor_file, recording_file, out):
     return main(["predict", str(sensor_file), str(recording_file), "--quiet", "--out", str(out)])
 
@@ -266,3 +284,14 @@ def test_control_characters_of_names_do_not_reach_the_terminal(sensor_file, reco
         assert main([str(word) for word in words]) == status
         said = capsys.readouterr()
         assert all(line.isprintable() for line in (said.out + said.err).split("\n")), words
+
+
+def test_results_of_files_whose_names_are_no_utf_8_are_written_and_read_back(recording_file, tmp_path, capsys):
+    (tmp_path / "\udcff.csv").write_text("x,y\n" + "".join(f"{k},{2 * k + 0.1 * (k * 7 % 5)}\n" for k in range(24)))
+    (tmp_path / "\udcff.py").write_text(
+        'reading, unit, parameters = "y", "V", {"a": (0, 10)}\ndef simulate(p, data):\n    return p["a"] * data["x"]\n'
+    )
+    given = (tmp_path / "\udcff.csv", "--simulator", tmp_path / "\udcff.py", "--quiet", "--out")
+    assert main([str(word) for word in ("fit", *given, tmp_path / "out")]) == 0
+    assert main([str(word) for word in ("predict", tmp_path / "out" / "fitted.json", *given, tmp_path / "p.csv")]) == 0
+    assert "\\udcff.csv" in (tmp_path / "out" / "report.html").read_text()

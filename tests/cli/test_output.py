@@ -169,7 +169,7 @@ def killed_at(n, write, out):
         def dying(do):
             return lambda *a, **k: os.kill(os.getpid(), signal.SIGKILL) if next(calls) == n else do(*a, **k)
 
-        for name in ("replace", "unlink", "mkdir", "rmdir"):
+        for name in ("replace", "rename", "unlink", "mkdir", "rmdir"):
             setattr(os, name, dying(getattr(os, name)))
         write(out)
         os._exit(0)

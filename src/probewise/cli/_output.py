@@ -37,9 +37,12 @@ class StagedFiles:
 
     def write(self, name: str, content: str | bytes) -> None:
         """Write a file into the directory: bytes, or a text in UTF-8."""
-        from probewise.recordings import write_bytes_atomically  # imported here, since the help does not need it
+        from probewise.recordings import write_bytes_atomically, write_text_atomically  # not needed by the help
 
-        write_bytes_atomically(self / name, content.encode() if isinstance(content, str) else content)
+        if isinstance(content, str):
+            write_text_atomically(self / name, content)
+        else:
+            write_bytes_atomically(self / name, content)
 
     def write_json(self, name: str, document: object) -> None:
         """Write a document as strict JSON."""
@@ -60,14 +63,14 @@ def checked_output_directory(path: Path, *entries: str) -> Path:
     """Check before any work that results can be written there, and return the path.
 
     `entries` are files and folders of it that the run writes as it goes. Raises ParameterError if a file is in the way,
-    FileError if no directory can be made there, or one of the entries is a symbolic link.
+    FileError if no directory can be made there, or one of the entries is a symbolic link, a device or a pipe.
     """
     if path.exists() and not path.is_dir():
         raise ParameterError("--out", str(path), "a directory, existing or new; this is a file")
     parent = next(p for p in (path, *path.absolute().parents) if p.exists())
     if not parent.is_dir():
         raise ParameterError("--out", str(path), f"a directory; {parent} is a file")
-    _refuse_links(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
+    _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
         os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=parent))
     except OSError as error:
@@ -157,7 +160,7 @@ def _complete(out: Path, stage: StagedFiles, inputs: Sequence[Path], outdated: S
     """
     names = _files_in(stage.folder)
     for name in names:
-        _refuse_links((out / name).parents[: name.count("/")])
+        _require_ordinary((out / name).parents[: name.count("/")])
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
     own = {path.resolve() for path in inputs}
@@ -179,7 +182,7 @@ def _move_into_place(out: Path) -> None:
     complete = out / _COMPLETE
     try:
         for name in [] if complete.is_symlink() else _files_in(complete):
-            _refuse_links((out / name).parents[: name.count("/")])
+            _require_ordinary((out / name).parents[: name.count("/")])
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             if name.endswith(_OUTDATED):
                 (out / name.removesuffix(_OUTDATED)).unlink(missing_ok=True)
@@ -201,10 +204,13 @@ def _files_in(folder: Path) -> list[str]:
     return sorted(file.relative_to(folder).as_posix() for file in files)
 
 
-def _refuse_links(paths: Iterable[Path]) -> None:
+def _require_ordinary(paths: Iterable[Path]) -> None:
+    """Raise FileError if one of these is neither a file nor a directory, nor missing."""
     for path in paths:
-        if path.is_symlink():
-            raise FileError(path, "is a symbolic link, which may lead out of the folder", "another --out, or no link")
+        link = path.is_symlink()
+        if link or (path.exists() and not path.is_file() and not path.is_dir()):
+            found = "is a symbolic link, which may lead out of the folder" if link else "is a device or a pipe"
+            raise FileError(path, found, "another --out, or an ordinary file or folder there")
 
 
 def _remove(path: Path) -> None:

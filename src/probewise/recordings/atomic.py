@@ -62,8 +62,11 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, name
 
 
 def write_text_atomically(path: str | os.PathLike[str], text: str, *, named: bool = True) -> None:
-    """Replace the file at `path` by `text` in UTF-8, as `write_bytes_atomically` does, with line ends unchanged."""
-    write_bytes_atomically(path, text.encode("utf-8"), named=named)
+    """Replace the file at `path` by `text` in UTF-8, as `write_bytes_atomically` does, with line ends unchanged.
+
+    Bytes of a file's name that are no UTF-8, which Python reads as lone surrogates, are written as escapes.
+    """
+    write_bytes_atomically(path, text.encode("utf-8", "backslashreplace"), named=named)
 
 
 def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from probewise._kinds import checked_path
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, ParameterError, printable
 from probewise.recordings.python_file import error_on_one_line, run_python_text
 from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, parse_prior
@@ -101,7 +101,7 @@ def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulato
         noise=Noise.of(said.get("noise", {})),
         extra={name: _parse_extra(name, each) for name, each in _checked_mapping(said, "extra").items()},
         vectorized=bool(said.get("vectorized", False)),
-        source=path.name,
+        source=printable(path.name),
         fingerprint=fingerprint_of_text(text),
     )
 

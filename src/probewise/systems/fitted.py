@@ -23,7 +23,7 @@ from probewise._posterior_samples import (
 )
 from probewise._version import __version__
 from probewise.effects import EFFECTS, name_without_copy_suffix
-from probewise.errors import FileError, ParameterError, ProbewiseError
+from probewise.errors import FileError, ParameterError, ProbewiseError, printable
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
@@ -142,7 +142,7 @@ class FittedSystem(NamedSamples):
                 "max_step": self.max_step if math.isfinite(self.max_step) else None,
                 "stiff": self.stiff,
             },
-            "recording": {"fingerprint": self.recording, "source": self.source},
+            "recording": {"fingerprint": self.recording, "source": printable(self.source)},
             "parameters": [
                 {"name": n, "mean": mean[n], "median": median[n], "sd": sd[n], "interval95": list(interval[n])}
                 for n in self.names

@@ -63,13 +63,18 @@ def test_a_folder_that_is_missing_is_named(tmp_path):
         pass
 
 
-def test_what_a_killed_writer_left_is_removed_an_hour_later_and_what_a_living_one_writes_is_not(tmp_path):
-    for name in (".a.killed.part", ".a.living.part", ".b.other.part"):
-        (tmp_path / name).write_text("half")
-    for name in (".a.killed.part", ".b.other.part"):
-        os.utime(tmp_path / name, (0, 0))
-    write_bytes_atomically(tmp_path / "a", b"whole")
-    assert {p.name for p in tmp_path.iterdir()} == {"a", ".a.living.part", ".b.other.part"}
+def test_what_a_killed_writer_left_is_removed_by_the_next_and_what_a_living_one_holds_is_not(tmp_path):
+    (tmp_path / ".a.killed.part").write_text("half")
+    (tmp_path / ".b.other.part").write_text("of another name")
+    with (tmp_path / ".a.living.part").open("w") as living:
+        if os.name != "nt":
+            import fcntl
+
+            fcntl.flock(living, fcntl.LOCK_EX)
+        write_bytes_atomically(tmp_path / "a", b"whole")
+        assert {p.name for p in tmp_path.iterdir()} == {"a", ".a.living.part", ".b.other.part"}
+    write_bytes_atomically(tmp_path / "a", b"again")
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a": b"again", ".b.other.part": b"of another name"}
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has links for administrators only")

@@ -7,21 +7,19 @@ import glob
 import os
 import secrets
 import stat
-import time
+import sys
 from io import FileIO
 from pathlib import Path
 
 from probewise._signals import defer_signals
 from probewise.errors import FileError
 
-_ABANDONED_S = 3600.0  # age of a temporary file at which its writer must have been killed
-
 
 def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, named: bool = True) -> None:
     """Replace the file at `path` by `content` atomically; its permissions stay.
 
-    The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. What killed
-    processes left is removed an hour later.
+    The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. Temporary
+    files that killed processes left are removed.
 
     Parameters
     ----------
@@ -44,13 +42,13 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, name
             return
         target = Path(os.path.realpath(path)) if named else path
         for left in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
-            with contextlib.suppress(OSError):
-                if time.time() - left.lstat().st_mtime > _ABANDONED_S:
-                    left.unlink()
+            _remove_unless_being_written(left)
         temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
         with defer_signals(), contextlib.ExitStack() as stack:
             with open(temporary, "xb", buffering=0) as file:
                 stack.callback(temporary.unlink, missing_ok=True)
+                with contextlib.suppress(OSError):  # where files cannot be locked, nobody removes it
+                    _lock(file.fileno())
                 write_and_sync(file, path, content)
             if target.is_file() and not target.is_symlink():
                 os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
@@ -93,6 +91,21 @@ def _write_all(file: FileIO, content: bytes) -> None:
     left_over = memoryview(content)
     while left_over:
         left_over = left_over[file.write(left_over) :]
+
+
+def _lock(handle: int) -> None:
+    """Lock an open file until it is closed; raise OSError if another process has a lock on it, or without locks."""
+    if sys.platform != "win32":  # where nobody can remove an open file
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _remove_unless_being_written(path: Path) -> None:
+    with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+        if sys.platform != "win32" and path.is_file():  # a pipe would be waited for
+            _lock(stack.enter_context(open(path, "rb")).fileno())
+        path.unlink()
 
 
 def _error_of_writing(path: Path, error: Exception, allowed: str) -> FileError:

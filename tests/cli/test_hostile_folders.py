@@ -95,18 +95,20 @@ FOLDERS = {
     "a lock that is a link": linked(".results.lock", "../outside/victim.txt"),
     "a pipe": lambda out: os.mkfifo(out / ".complete"),
     "a pipe as a result": lambda out: os.mkfifo(out / "report.html"),
-    "nested": nested,
+    "a circle of links": lambda out: [linked("report.html", "report.html")(out), linked("a.svg", "a.svg")(out)],
 }
 
 
-@pytest.mark.parametrize("kind", FOLDERS)
-def test_nothing_outside_a_hostile_folder_changes_and_the_way_out_is_said(kind, tmp_path):
+@pytest.mark.parametrize(
+    "build", [*FOLDERS.values(), pytest.param(nested, marks=pytest.mark.slow)], ids=[*FOLDERS, "nested"]
+)
+def test_nothing_outside_a_hostile_folder_changes_and_the_way_out_is_said(build, tmp_path):
     """Either the results are written, or one line names what is in the way; without that they are written."""
     outside, out = tmp_path / "outside", tmp_path / "out"
     outside.mkdir()
     out.mkdir()
     (outside / "victim.txt").write_text("precious")
-    FOLDERS[kind](out)
+    build(out)
 
     def write():
         with staged_output(out, outdated=("*.svg",)) as stage:
@@ -187,7 +189,9 @@ def record(sensor_file, recording_file, out):
     return main(["arm", "record", str(recording_file), "--arm", "simulated", "--quiet", "--out", str(out)])
 
 
-@pytest.mark.parametrize("run", [predict, sheets, check, record])
+@pytest.mark.parametrize(
+    "run", [predict, check, *(pytest.param(each, marks=pytest.mark.slow) for each in (sheets, record))]
+)
 def test_a_pipe_and_a_device_are_written_to_a_link_is_followed_and_a_folder_is_refused(
     run, sensor_file, recording_file, tmp_path, capsys
 ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import webbrowser
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -104,8 +105,8 @@ def _remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
     """Remove the results of an earlier run from `out`, but none of `files`, so that two runs do not mix."""
     # Without a result.json, a sensor.json is none of these results, but perhaps somebody's calibration.
     of_machine = ("result.json", "samples.csv", "sensor.json") if (out / "result.json").exists() else ()
-    spared = {path.resolve() for path in files}
+    spared = {os.path.realpath(path) for path in files}
     for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png", *of_machine):
         for path in out.glob(pattern):
-            if path.resolve() not in spared:
+            if os.path.realpath(path) not in spared:
                 path.unlink()

@@ -163,13 +163,13 @@ def _complete(out: Path, stage: StagedFiles, inputs: Sequence[Path], outdated: S
         _require_ordinary((out / name).parents[: name.count("/")])
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
-    own = {path.resolve() for path in inputs}
-    kept = _new_names_of_kept(out, [name for name in names if (out / name).resolve() in own])
+    own = {os.path.realpath(path) for path in inputs}  # which, unlike resolve, follows no circle of links
+    kept = _new_names_of_kept(out, [name for name in names if os.path.realpath(out / name) in own])
     for name, new in kept.items():
         stage.write(new, (out / name).read_bytes())
         shutil.copystat(out / name, stage / new)
     for path in itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated):
-        if path.resolve() not in own and path.name not in names and not path.is_dir():
+        if os.path.realpath(path) not in own and path.name not in names and not path.is_dir():
             (stage / (path.name + _OUTDATED)).touch()
     return {out / name: out / new for name, new in kept.items()}
 

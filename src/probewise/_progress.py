@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, Never
 from tqdm import tqdm
 
 from probewise._kinds import require_progress
+from probewise.errors import printable
 from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
 
@@ -118,6 +119,7 @@ class _StageBars:
         self._bar: tqdm[Never] | None = None
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
+        stage, note = printable(stage), printable(note)
         with self._lock:
             if self._now is None or (stage, total) != (self._now.stage, self._now.total):
                 self._close_bar(ended=True)
@@ -168,7 +170,7 @@ class _TextProgress:
         self._now = _LastReport("getting ready", 0, 0, "")
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        self._now = _LastReport(stage, done, total, note)
+        self._now = _LastReport(printable(stage), done, total, printable(note))
         self.refresh()
 
     def refresh(self) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Final
 
@@ -18,40 +18,45 @@ SAME_S: Final = 1.0
 
 
 @contextlib.contextmanager
+def signals_handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[Callable[[], None]]:
+    """Let a function handle the signals that end the program, unless they are ignored; yield one that ends this early.
+
+    Outside the main thread, the only one that receives signals, it does nothing.
+    """
+    mine = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in ENDING} if mine else {}
+    before = {number: earlier for number, earlier in before.items() if earlier not in (None, signal.SIG_IGN)}
+
+    def restore() -> None:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+    try:
+        for number in before:
+            signal.signal(number, handler)
+        yield restore
+    finally:
+        restore()
+
+
+@contextlib.contextmanager
 def defer_signals() -> Iterator[None]:
     """Defer signals that end the program until the block ends; another signal more than a second later acts at once.
 
-    For blocks that must not be interrupted: stopping motors, putting files in place. Outside the main thread, the only
-    one that receives signals, it does nothing.
+    For blocks that must not be interrupted: stopping motors, putting files in place.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handlers = {number: signal.getsignal(number) for number in ENDING}
-    handlers = {number: handler for number, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
-    first: tuple[int, float] | None = None
+    first: list[tuple[int, float]] = []
 
     def remember_signal(number: int, frame: FrameType | None) -> None:
-        nonlocal first
-        now_s = time.monotonic()
-        if first is None:
-            first = number, now_s
-        elif now_s - first[1] > SAME_S:
+        first.append((number, time.monotonic()))
+        if first[-1][1] - first[0][1] > SAME_S:
+            first.clear()
             restore()
             signal.raise_signal(number)
 
-    def restore() -> None:
-        nonlocal first
-        first = None
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-
     try:
-        for number in handlers:
-            signal.signal(number, remember_signal)
-        yield
+        with signals_handled_by(remember_signal) as restore:
+            yield
     finally:
-        heard = first
-        restore()
-        if heard is not None:
-            signal.raise_signal(heard[0])
+        if first:
+            signal.raise_signal(first[0][0])

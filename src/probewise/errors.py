@@ -29,10 +29,15 @@ _LONGEST_PART = 400  # characters of each part of a message
 
 def shortened(text: str, most: int = _LONGEST_PART) -> str:
     """Return a text cut after `most` characters, with its full length then, and with control characters escaped."""
-    begun = text[:most]
-    if not begun.isprintable():
-        begun = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in begun)
+    begun = printable(text[:most])
     return begun if len(text) <= most else f"{begun}... ({len(text)} characters)"
+
+
+def printable(text: str, *, keep: str = "") -> str:
+    """Return a text with control characters escaped, which could command a terminal, but for those of `keep`."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text)
 
 
 def shown(value: object, most: int = _LONGEST_VALUE) -> str:
@@ -87,7 +92,7 @@ class FileError(ProbewiseError, ValueError):
         self, path: object, found: str, allowed: str, *, row: int | None = None, column: str | None = None
     ) -> None:
         self.path, self.found, self.allowed, self.row, self.column = str(path), found, allowed, row, column
-        where = str(path)
+        where = printable(str(path))
         if row is not None:
             where += f", {'row' if where.lower().endswith('.csv') else 'line'} {row}"
         if column is not None:

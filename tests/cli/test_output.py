@@ -20,7 +20,7 @@ def test_what_an_earlier_run_left_behind_goes_and_what_is_not_ours_stays(tmp_pat
         (tmp_path / name).write_text("old")
     with staged_output(tmp_path, outdated=("witness_*.svg",)) as stage:
         (stage / "witness_level.svg").write_text("new")
-    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"witness_level.svg": "new", "notes.txt": "old"}
+    assert contents(tmp_path) == {"witness_level.svg": "new", "notes.txt": "old"}
 
 
 def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_path):
@@ -59,7 +59,7 @@ def test_a_directory_in_the_way_leaves_everything_as_it_was(tmp_path):
 
     with pytest.raises(FileError, match="a directory of that name is in the way"):
         write()
-    assert [p.name for p in tmp_path.iterdir()] == ["b"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".results.lock", "b"]
 
 
 @pytest.mark.parametrize("verb", ["diagnose", "calibrate"])
@@ -136,7 +136,9 @@ DONE = {**NEW, "plan_kept.csv": "read", "plan_kept.json": "read"}
 
 
 def contents(folder):
-    return {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
+    """Return what files hold, by name, but for the lock file."""
+    files = [p for p in folder.rglob("*") if p.is_file() and p.name != ".results.lock"]
+    return {p.relative_to(folder).as_posix(): p.read_text() for p in files}
 
 
 def write_new(out):
@@ -167,7 +169,7 @@ def killed_at(n, write, out):
         def dying(do):
             return lambda *a, **k: os.kill(os.getpid(), signal.SIGKILL) if next(calls) == n else do(*a, **k)
 
-        for name in ("replace", "unlink", "mkdir", "rmdir"):
+        for name in ("replace", "rename", "unlink", "mkdir", "rmdir"):
             setattr(os, name, dying(getattr(os, name)))
         write(out)
         os._exit(0)

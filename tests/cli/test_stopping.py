@@ -208,7 +208,7 @@ def test_a_drawing_that_swallows_a_signal_stops_the_run_all_the_same(
     out = tmp_path / "out"
     assert main(command(sensor_file, out)) == 128 + signal.SIGTERM
     assert "keeps 1 reading; go on with" in capsys.readouterr().err
-    assert [p.name for p in out.iterdir()] == ["journal.jsonl"]
+    assert sorted(p.name for p in out.iterdir()) == [".journal.jsonl.lock", "journal.jsonl"]
 
 
 @pytest.mark.slow
@@ -230,7 +230,7 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
     (out / "journal.jsonl").unlink()
     (out / "notes.txt").write_text("mine")
     assert main(command(sensor_file, out)) == 0
-    names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and p.suffix != ".lock"}
     results = {"report.html", "run.gif", "result.json", "samples.csv", "sensor.json"}
     assert names == {"journal.jsonl", "frames/001.png", "notes.txt"} | results
 
@@ -253,7 +253,7 @@ def test_results_of_an_earlier_run_do_not_stand_beside_a_new_journal_when_it_is_
     (out / "sensor.json").write_text(sensor_file.read_text())
     words = command(out / "sensor.json" if is_input else sensor_file, out, "--max-readings", 2)
     assert main(words) == 128 + signal.SIGTERM
-    left = {p.name for p in out.iterdir()}
+    left = {p.name for p in out.iterdir() if p.suffix != ".lock"}
     assert left == {"journal.jsonl", "frames", "notes.txt"} | ({"sensor.json"} if is_input else set())
 
 

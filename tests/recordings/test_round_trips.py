@@ -1,5 +1,6 @@
 """What is written is what is read back, in full precision."""
 
+import csv
 import math
 from dataclasses import replace
 
@@ -32,6 +33,7 @@ from probewise.recordings import (
     write_recording,
 )
 from probewise.recordings.description import shortest_degrees
+from probewise.recordings.table import csv_text, read_table
 
 numbers = st.floats(-1e6, 1e6)
 lengths = st.floats(1e-6, 1e6)
@@ -274,3 +276,20 @@ def test_a_write_that_fails_leaves_the_old_file_whole(tmp_path, monkeypatch):
         write_plan(plan_of(5), path)
     assert path.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["plan.csv", "plan.json"]
+
+
+FORMULAS = ("=1+1", "+a", "-a", "@b", "'=x", "''@", "=", "-", "+", "-1.2.3", "'-1", "=a,b", '="q"')
+NO_FORMULAS = ("-5", "+1e3", "'a", "it's", "'", "a=b", "1")
+
+
+def test_texts_that_a_spreadsheet_would_compute_are_written_so_that_it_does_not_and_read_back_as_they_were(tmp_path):
+    cells = (*FORMULAS, *NO_FORMULAS)
+    path = tmp_path / "table.csv"
+    path.write_text(csv_text({"=column": cells, "n": ["-1.5"] * len(cells)}))
+    written = list(csv.reader(path.read_text().splitlines()))
+    assert written[0] == ["'=column", "n"]
+    assert [row[0] for row in written[1:]] == [*(f"'{cell}" for cell in FORMULAS), *NO_FORMULAS]
+    assert {row[1] for row in written[1:]} == {"-1.5"}
+    table = read_table(path)
+    assert list(table.columns) == ["=column", "n"]
+    assert table.cells("=column") == list(cells)

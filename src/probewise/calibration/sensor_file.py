@@ -27,7 +27,7 @@ from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
 from probewise.effects import EFFECTS, CountsFromOrigin, EdgeShadow, Origin
-from probewise.errors import FileError, ParameterError, ProbewiseError, shown
+from probewise.errors import FileError, ParameterError, ProbewiseError, printable, shown
 from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
@@ -280,7 +280,7 @@ class FittedSensor(NamedSamples):
         document = {
             "format": FORMAT,
             "version": self.version,
-            "recording": {"fingerprint": self.fingerprint, "source": self.source},
+            "recording": {"fingerprint": self.fingerprint, "source": printable(self.source)},
             "instrumentation": asdict(self.instrumentation),
             "n_gaussians": self.n_gaussians,
             "parameters": [

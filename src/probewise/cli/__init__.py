@@ -14,7 +14,6 @@ could not be drawn (the results are complete);
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import warnings
@@ -35,7 +34,7 @@ from probewise.cli import (
     sheets,
     study,
 )
-from probewise.cli._common import OneLineParser, Verb
+from probewise.cli._common import OneLineParser, Verb, print_complaint, print_warning
 from probewise.cli._output import NotDrawnError
 from probewise.cli._stopping import Stopped, stoppable
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
@@ -83,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Arguments without the program's name; None takes those of the process.
     """
     words = sys.argv[1:] if argv is None else list(argv)
+    _replace_closed_streams()
     try:
         arguments = parser().parse_args(words)
     except SystemExit as stop:  # argparse exits this way after --help, --version and errors
@@ -107,12 +107,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 1
         except (ProbewiseError, OSError) as error:
             _write_complaint(verb, _error_in_one_line(error))
+            _discard_unwritable_output()
             return 2
 
 
 def _write_complaint(verb: Verb, text: str) -> None:
-    with contextlib.suppress(OSError):  # the terminal was closed
-        sys.stderr.write(f"probewise {verb.name}: {text}\n")
+    print_complaint(f"probewise {verb.name}: {text}")
+
+
+def _replace_closed_streams() -> None:
+    """Open the null device in place of streams that the shell closed (>&-): the next file would take their number."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
 
 
 def _discard_unwritable_output() -> None:
@@ -139,4 +146,4 @@ def _write_warning(
 ) -> None:
     if issubclass(category, RuntimeWarning) and " encountered in " in str(message):
         return  # NumPy's, of arithmetic: whether a result can be used is checked, and said in our words
-    sys.stderr.write(f"warning: {' '.join(str(message).split())}\n")
+    print_warning(" ".join(str(message).split()))

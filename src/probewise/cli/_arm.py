@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Self
 
 from probewise._kinds import did_you_mean
-from probewise.cli._common import CommandError, add_path, print_warning
+from probewise.cli._common import CommandError, add_path, print_warning, write_to_terminal
 from probewise.cli._stopping import raise_if_stopped
 from probewise.errors import ParameterError
 
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 ARMS = (
     "simulated; emulator, the LEGO arm in software, or emulator:TRUE.toml, built differently from --geometry; "
-    "nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, an instrument of your own"
+    "nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, an instrument of your own (a "
+    "program: run only those that you trust)"
 )
 """Names of arms, the same in every verb."""
 
@@ -291,8 +292,7 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
         raise_if_stopped()  # an arm may have held the stop back until its reading was kept
         answers: queue.Queue[str] = queue.Queue()
         with tqdm.external_write_mode(file=sys.stderr):  # a progress bar would overwrite the question
-            sys.stderr.write(text)
-            sys.stderr.flush()
+            write_to_terminal(sys.stderr, text)
             # Reading a line cannot be interrupted, so it runs in a daemon thread.
             threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
             while True:

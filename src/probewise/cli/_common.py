@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import math
 import os
@@ -13,10 +14,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from probewise._kinds import did_you_mean
-from probewise.errors import ProbewiseError, shortened, shown
+from probewise.errors import ProbewiseError, printable, shortened, shown
 
 DEFAULT_SEED = 2013  # year of the paper; printed with every run
 MOST = 100_000
@@ -43,7 +44,7 @@ class OneLineParser(argparse.ArgumentParser):
     """An argument parser that reports errors in one line, with a suggestion for misspelt options."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {shortened(message)} (see {self.prog} --help)\n")
+        self.exit(2, f"{self.prog}: {printable(shortened(message))} (see {self.prog} --help)\n")
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -107,9 +108,10 @@ def add_out_directory(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_path(text: str) -> Path:
-    """Parse a path, for argparse; the empty string, such as an unset shell variable, is refused."""
-    if not text:
-        raise argparse.ArgumentTypeError("an empty text names no file or directory")
+    """Parse a path, for argparse; the empty string, such as an unset shell variable, and NUL are refused."""
+    if not text or "\0" in text:
+        kind = "a text with a NUL" if text else "an empty text"
+        raise argparse.ArgumentTypeError(f"{kind} names no file or directory")
     return Path(text)
 
 
@@ -148,17 +150,28 @@ def positive_number_parser(unit: str) -> Callable[[str], float]:
     return read
 
 
+def write_to_terminal(stream: TextIO, text: str) -> None:
+    """Write a text at once, with escapes for control characters, and for those that the stream cannot encode."""
+    encoding = stream.encoding or "utf-8"
+    stream.write(printable(text, keep="\n\u00a0").encode(encoding, "backslashreplace").decode(encoding))
+    stream.flush()
+
+
 def print_result(text: str, *, quiet: bool = False) -> None:
     """Write a line of the result to standard output, unless `quiet`."""
     if not quiet:
-        sys.stdout.write(text + "\n")
-        sys.stdout.flush()
+        write_to_terminal(sys.stdout, text + "\n")
+
+
+def print_complaint(text: str) -> None:
+    """Write a line to standard error, if that can still be written to."""
+    with contextlib.suppress(OSError):  # the terminal was closed
+        write_to_terminal(sys.stderr, text + "\n")
 
 
 def print_warning(text: str) -> None:
     """Write a warning to standard error, even with --quiet."""
-    sys.stderr.write(f"warning: {text}\n")
-    sys.stderr.flush()
+    print_complaint(f"warning: {text}")
 
 
 def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import webbrowser
 from dataclasses import dataclass, field
 from functools import partial
@@ -68,7 +69,9 @@ class Pictures:
 
     def _live_page(self, step: Step) -> bytes:
         trust = self.inputs.experiment.trust
-        return report.live_page_html(step, self.frames[-1], earlier=self.steps[:-1], trust=trust).encode()
+        return report.live_page_html(step, self.frames[-1], earlier=self.steps[:-1], trust=trust).encode(
+            "utf-8", "backslashreplace"
+        )
 
     def _draw_frame(self, step: Step, shadow: Step | None) -> bytes:
         inputs = self.inputs
@@ -119,8 +122,8 @@ def _remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
     """Remove the results of an earlier run from `out`, but none of `files`, so that two runs do not mix."""
     # Without a result.json, a sensor.json is none of these results, but perhaps somebody's calibration.
     of_machine = ("result.json", "samples.csv", "sensor.json") if (out / "result.json").exists() else ()
-    spared = {path.resolve() for path in files}
+    spared = {os.path.realpath(path) for path in files}
     for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png", *of_machine):
         for path in out.glob(pattern):
-            if path.resolve() not in spared:
+            if os.path.realpath(path) not in spared:
                 path.unlink()

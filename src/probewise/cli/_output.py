@@ -1,8 +1,8 @@
 """Output files: checked before any work, written all or none, without losing any input.
 
-The files of a command are written into a hidden folder inside `--out`. When all are complete, a file `commit.json`
-there lists them; only then are they moved. A process killed before that has changed nothing; after that, the next
-command with the same `--out` finds the list and moves the remaining files first.
+The files of a command are written into a hidden folder inside `--out`. When all are complete, that folder is renamed;
+only then are they moved. A process killed before that has changed nothing; after that, the next command with the same
+`--out` moves the remaining files first.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from probewise._signals import defer_signals
@@ -22,24 +21,15 @@ from probewise.cli._stopping import raise_if_stopped, reporting_what_is_kept
 from probewise.errors import FileError, ParameterError, ProbewiseError, message_of
 from probewise.progress import Progress, silent
 
-_FOLDER, _COMMIT = ".writing", "commit.json"
+_STAGED, _COMPLETE = ".writing", ".complete"
+_OUTDATED = ".outdated"  # ends the name of an empty file: the file of that name without it is to be removed
 PAGE = "report.html"
 _MOST_FAILED = 3  # drawings that a message names
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 
 
 class StagedFiles:
-    """Files written into an empty directory, and the input files that were renamed to make way for them.
-
-    `staged_output` makes the directory and moves the files.
-
-    Attributes
-    ----------
-    folder
-        The directory.
-    kept
-        New path, by old path, of each input file that a result would have replaced.
-    """
+    """Files written into an empty directory, `folder`; `kept` has the new path of each input file that they replace."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -50,9 +40,12 @@ class StagedFiles:
 
     def write(self, name: str, content: str | bytes) -> None:
         """Write a file into the directory: bytes, or a text in UTF-8."""
-        from probewise.recordings import write_bytes_atomically  # imported here, since the help does not need it
+        from probewise.recordings import write_bytes_atomically, write_text_atomically  # not needed by the help
 
-        write_bytes_atomically(self / name, content.encode() if isinstance(content, str) else content)
+        if isinstance(content, str):
+            write_text_atomically(self / name, content)
+        else:
+            write_bytes_atomically(self / name, content)
 
     def write_json(self, name: str, document: object) -> None:
         """Write a document as strict JSON."""
@@ -60,7 +53,7 @@ class StagedFiles:
 
     @property
     def notes_on_renamed_inputs(self) -> list[str]:
-        """A sentence for each input file that was renamed."""
+        """A sentence for each input file that a result has replaced."""
         return [f"what was {path} is now {now}" for path, now in self.kept.items()]
 
 
@@ -110,7 +103,7 @@ class Drawings:
         """
         kept = f"the results are in {self.out}, without figures and report"
         drawn: dict[str, bytes] = {}
-        every = {**drawers, PAGE: lambda: page(drawn).encode()}
+        every = {**drawers, PAGE: lambda: page(drawn).encode("utf-8", "backslashreplace")}
         with reporting_what_is_kept(lambda: kept, results=True), staged_output(self.out, inputs=inputs) as stage:
             for name, drawer in every.items():
                 progress("drawing the report", len(drawn), len(every), name)
@@ -127,16 +120,18 @@ class Drawings:
             raise NotDrawnError(f"could not draw {first}{rest}; everything else is complete in {self.out}")
 
 
-def checked_output_directory(path: Path) -> Path:
+def checked_output_directory(path: Path, *entries: str) -> Path:
     """Check before any work that results can be written there, and return the path.
 
-    Raises ParameterError if a file is in the way, FileError if no directory can be made there.
+    `entries` are files and folders of it that the run writes as it goes. Raises ParameterError if a file is in the way,
+    FileError if no directory can be made there, or one of the entries is a symbolic link, a device or a pipe.
     """
     if path.exists() and not path.is_dir():
         raise ParameterError("--out", str(path), "a directory, existing or new; this is a file")
     parent = next(p for p in (path, *path.absolute().parents) if p.exists())
     if not parent.is_dir():
         raise ParameterError("--out", str(path), f"a directory; {parent} is a file")
+    _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
         os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=parent))
     except OSError as error:
@@ -145,17 +140,20 @@ def checked_output_directory(path: Path) -> Path:
 
 
 def checked_output_file(path: Path, *inputs: Path) -> Path:
-    """Check before any work that a file can be written there, and return the path.
+    """Check before any work that a file, device or named pipe can be written there, and return the path.
 
     Raises ParameterError if it is a directory, an input or below a file, FileError if its directory cannot be written
     to.
     """
+    from probewise.recordings.atomic import is_device_or_pipe  # imported here, since the help does not need it
+
     if path.is_dir():
         raise ParameterError("--out", str(path), "a file name; this is a directory")
     for taken in inputs:
         if path.exists() and taken.exists() and path.samefile(taken):
             raise ParameterError("--out", str(path), f"another file than the input {taken}")
-    checked_output_directory(path.parent)
+    if not is_device_or_pipe(path):
+        checked_output_directory(Path(os.path.realpath(path)).parent)
     return path
 
 
@@ -169,121 +167,122 @@ def holds_readings(table: Path, column: str) -> bool:
     """Return whether a table has readings in this column, or cannot be read, so that it must not be replaced."""
     from probewise.recordings.table import read_table  # imported here, since the help does not need it
 
+    if not table.is_file():  # a named pipe would be waited for
+        return False
     try:
         rows = read_table(table, wanted=(column,))
     except FileError:
-        return table.is_file()
+        return True
     return column in rows.columns and any(rows.cells(column))
 
 
 @contextlib.contextmanager
 def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[StagedFiles]:
-    """Yield an empty directory; move its files into `out` only if the block succeeds.
+    """Yield an empty directory; move its files into `out`, made if missing, only if the block succeeds.
 
-    An error or a signal before that leaves `out` as it was.
+    One of the `inputs` of this run that a result would replace is copied to another name. Files of an earlier run, of
+    the patterns `outdated`, are removed unless this run writes them.
 
-    Parameters
-    ----------
-    out
-        Where the results go; made if missing.
-    inputs
-        Input files of this run: one that a result would replace is renamed.
-    outdated
-        Patterns of an earlier run's files in `out`, which are removed unless this run writes them.
-
-    Raises
-    ------
-    FileError
-        If `out` cannot be made or written to, another process writes there for too long, or a directory has the name of
-        a result.
+    Raises FileError if `out` cannot be made or written to, another process writes there for too long, a directory has
+    the name of a result, or a symbolic link that of a directory of results.
     """
-    from probewise.recordings import hold_lock, write_text_atomically  # imported here, since the help does not need it
+    from probewise.recordings import hold_lock  # imported here, since the help does not need it
 
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(out, f"cannot be made ({error.strerror})", "a directory you may write to") from error
-    folder = out / _FOLDER
+    folder = out / _STAGED
     with hold_lock(out / "results", patience_s=_PATIENCE_S):
+        _move_into_place(out)
+        _remove(folder)
+        folder.mkdir()
+        stage = StagedFiles(folder)
         try:
-            _finish_interrupted_commit(out)
-            folder.mkdir()
-            stage = StagedFiles(folder)
             yield stage
             raise_if_stopped()
             with defer_signals():
-                commit = _planned_commit(out, folder, inputs, outdated)
-                stage.kept = {out / name: out / kept for name, kept in commit.aside.items()}
-                write_text_atomically(folder / _COMMIT, json.dumps(asdict(commit)))
-                _finish_interrupted_commit(out)
+                stage.kept = _complete(out, stage, inputs, outdated)
+                os.rename(folder, out / _COMPLETE)
+                _move_into_place(out)
         except FileError as error:
             if not Path(error.path).is_relative_to(folder):
                 raise
             name = out / Path(error.path).relative_to(folder)
             raise FileError(name, error.found, error.allowed, row=error.row, column=error.column) from error
         finally:
-            if not (folder / _COMMIT).exists():
-                shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class _Commit:
-    """Changes to make in `out`, by relative names: rename `aside` (old to new), move `names` in, delete `remove`."""
+def _complete(out: Path, stage: StagedFiles, inputs: Sequence[Path], outdated: Sequence[str]) -> dict[Path, Path]:
+    """Add to the results copies of the inputs that they replace, which are returned, and marks of outdated files.
 
-    names: Sequence[str]
-    aside: Mapping[str, str]
-    remove: Sequence[str]
-
-
-def _planned_commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[str]) -> _Commit:
-    """Return the changes that move the files of `folder` into `out`, spare the inputs and remove outdated files.
-
-    Raises FileError if a directory has the name of a file.
+    Raises FileError if a directory has the name of a file, or a symbolic link that of a directory.
     """
-    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    names = _files_in(stage.folder)
     for name in names:
+        _require_ordinary((out / name).parents[: name.count("/")])
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
-    own = {path.resolve() for path in inputs}
-    aside = _new_names_of_kept(out, [name for name in names if (out / name).resolve() in own])
-    old = itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated)
-    gone = [path.relative_to(out).as_posix() for path in old if path.resolve() not in own]
-    return _Commit(names, aside, [name for name in gone if name not in names])
+    own = {os.path.realpath(path) for path in inputs}  # which, unlike resolve, follows no circle of links
+    kept = _new_names_of_kept(out, [name for name in names if os.path.realpath(out / name) in own])
+    for name, new in kept.items():
+        stage.write(new, (out / name).read_bytes())
+        shutil.copystat(out / name, stage / new)
+    for path in itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated):
+        if os.path.realpath(path) not in own and path.name not in names and not path.is_dir():
+            (stage / (path.name + _OUTDATED)).touch()
+    return {out / name: out / new for name, new in kept.items()}
 
 
-def _finish_interrupted_commit(out: Path) -> None:
-    """Complete the changes of an interrupted commit in `out`; discard incomplete results.
+def _move_into_place(out: Path) -> None:
+    """Move complete results, if there are any, into `out`; a process killed here leaves the rest to the next one.
 
-    Every step is idempotent, so that it does not matter where the earlier process was killed.
+    A stranger's folder may hold such results too: they can replace files of that folder only.
     """
-    folder = out / _FOLDER
-    if not folder.exists():
-        return
-    if (folder / _COMMIT).exists():
-        try:
-            _apply_commit(out, folder, _Commit(**json.loads((folder / _COMMIT).read_text(encoding="utf-8"))))
-        except OSError as error:
-            raise FileError(
-                error.filename2 or error.filename,
-                f"cannot be replaced ({error.strerror})",
-                f"a file that no other program holds; the next command with --out {out} puts the rest in place",
-            ) from error
-        (folder / _COMMIT).unlink()
-    shutil.rmtree(folder)
+    complete = out / _COMPLETE
+    try:
+        for name in [] if complete.is_symlink() else _files_in(complete):
+            _require_ordinary((out / name).parents[: name.count("/")])
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            if name.endswith(_OUTDATED):
+                (out / name.removesuffix(_OUTDATED)).unlink(missing_ok=True)
+            else:
+                os.replace(complete / name, out / name)
+    except (OSError, RecursionError) as error:
+        raise FileError(
+            getattr(error, "filename2", None) or getattr(error, "filename", None) or complete,
+            f"cannot be replaced ({getattr(error, 'strerror', None) or error})",
+            f"a file that no other program holds; the next command with --out {out} puts the rest in place, or remove "
+            f"{complete} to drop it",
+        ) from error
+    _remove(complete)
 
 
-def _apply_commit(out: Path, folder: Path, commit: _Commit) -> None:
-    """Make the changes of a commit; those already made are skipped."""
-    for name in commit.names:
-        new, target = folder / name, out / name
-        if not new.exists():
-            continue
-        if name in commit.aside and target.exists() and not (out / commit.aside[name]).exists():
-            os.replace(target, out / commit.aside[name])
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(new, target)
-    for name in commit.remove:
-        (out / name).unlink(missing_ok=True)
+def _files_in(folder: Path) -> list[str]:
+    """List the files in a directory and its directories, by relative name; symbolic links are not followed."""
+    files = (Path(at) / name for at, _, names in os.walk(folder) for name in names)
+    return sorted(file.relative_to(folder).as_posix() for file in files)
+
+
+def _require_ordinary(paths: Iterable[Path]) -> None:
+    """Raise FileError if one of these is neither a file nor a directory, nor missing."""
+    for path in paths:
+        link = path.is_symlink()
+        if link or (path.exists() and not path.is_file() and not path.is_dir()):
+            found = "is a symbolic link, which may lead out of the folder" if link else "is a device or a pipe"
+            raise FileError(path, found, "another --out, or an ordinary file or folder there")
+
+
+def _remove(path: Path) -> None:
+    """Remove a directory with its content, or a file or symbolic link, if it is there."""
+    try:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    except (OSError, RecursionError) as error:
+        raise FileError(path, f"cannot be removed ({getattr(error, 'strerror', None) or error})", "none") from error
 
 
 def _new_names_of_kept(out: Path, names: Sequence[str]) -> dict[str, str]:

@@ -20,7 +20,8 @@ def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead 
         parser,
         "--simulator",
         "FILE.py",
-        f"a simulator of your own{replaces}; the file says which columns of the table it reads",
+        f"a simulator of your own{replaces}; the file says which columns of the table it reads (it is a program: run "
+        "only those that you trust)",
     )
 
 

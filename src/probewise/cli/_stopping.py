@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from probewise._signals import ENDING, SAME_S
+from probewise._signals import SAME_S, signals_handled_by
 from probewise.errors import FileError, LinkError
 
 
@@ -44,28 +43,20 @@ _request = _LastStopRequest()
 
 @contextlib.contextmanager
 def stoppable() -> Iterator[None]:
-    """Let signals interrupt the block; any exception after a signal becomes `Stopped`.
+    """Let signals interrupt the block, but for those that are ignored, as under `nohup`.
 
-    A signal that is ignored, as under `nohup`, stays ignored.
+    Any exception after a signal becomes `Stopped`.
     """
     _request.number = None
-    mine = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in ENDING} if mine else {}
-    before = {number: handler for number, handler in before.items() if handler not in (None, signal.SIG_IGN)}
-    try:
-        for number in before:
-            signal.signal(number, _on_signal)
-        yield
-    except Stopped:
-        raise
-    except BaseException as error:
-        if (asked := _stopped_behind(error)) is None:
-            raise
-        raise asked from error
-    finally:
-        _request.number = None  # answered: what the process does next is not interrupted by it
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with signals_handled_by(_on_signal):
+        try:
+            yield
+        except BaseException as error:
+            if (stopped := _stopped_behind(error)) is None or stopped is error:
+                raise
+            raise stopped from error
+        finally:
+            _request.number = None  # answered: what the process does next is not interrupted by it
 
 
 def raise_if_stopped() -> None:

@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")
-    out = checked_output_directory(arguments.out)
+    out = checked_output_directory(arguments.out, "cases.jsonl")
     out.mkdir(parents=True, exist_ok=True)
     work, scored, of = run_case, score, ""
     if arguments.systems:

@@ -171,7 +171,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.cli._explore_pictures import Pictures
     from probewise.experiment import Exploration, explore, read_journal, shadow_run
 
-    out = checked_output_directory(arguments.out)
+    out = checked_output_directory(arguments.out, "journal.jsonl", "live.html", "frames")
     inputs = read_checked_inputs(arguments)
     journal = out / "journal.jsonl"
     before = _journal_to_resume(journal, resume=arguments.resume)

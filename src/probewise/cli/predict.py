@@ -54,15 +54,13 @@ def _predict_by_simulator(arguments: argparse.Namespace) -> int:
     from probewise.systems import (
         predict_system,
         read_fitted_system,
-        read_simulator,
         read_table_for,
         write_system_prediction,
     )
 
     out = checked_output_file(arguments.out, arguments.sensor, arguments.plan, arguments.simulator)
-    simulator = read_simulator(arguments.simulator)
-    fitted = read_fitted_system(arguments.sensor, simulator)
-    table = read_table_for(simulator, arguments.plan)
+    fitted = read_fitted_system(arguments.sensor, arguments.simulator)  # a file that was changed is not run
+    table = read_table_for(fitted.simulator, arguments.plan)
     with progress_shown(quiet=arguments.quiet) as progress:
         prediction = predict_system(fitted, table, rng=np.random.default_rng(arguments.seed), progress=progress)
     out.parent.mkdir(parents=True, exist_ok=True)

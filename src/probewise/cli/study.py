@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report import study as report
     from probewise.study import run_study
 
-    out = checked_output_directory(arguments.out)
+    out = checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
     if arguments.concealed:
         return _run_concealed(arguments, out)
     for name in ("seed", "size", "clean"):

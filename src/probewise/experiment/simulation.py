@@ -19,7 +19,7 @@ from probewise.arm import Geometry, Pose, Reach, Reading, ReadingScale, Simulate
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Estimated, Known
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, printable
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.digest import value_digest
 from probewise.experiment.pace import DescribedEffect, FromRest
@@ -76,7 +76,7 @@ class RandomStreams(NamedTuple):
 def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
     """Return a journal's entries for the sensor: the sha256 of its JSON, and the path of its file if given."""
     require_fitted_sensor(sensor)
-    named = {} if path is None else {"sensor_file": os.fspath(path)}
+    named = {} if path is None else {"sensor_file": printable(os.fspath(path))}
     return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
 
 

@@ -15,7 +15,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
-from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
+from probewise.recordings.atomic import is_device_or_pipe, write_bytes_atomically, write_text_atomically
 from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.columns import (
     A_SCAN,
@@ -192,9 +192,10 @@ def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) 
     images = _images_by_file(plan.patterns)
     contents = [(path.parent / file, image_bytes(image.albedo, Path(file).suffix)) for file, image in images.items()]
     # The CSV comes last: if it exists, everything it needs exists too.
-    for image_path, content in contents:
-        write_bytes_atomically(image_path, content)
-    write_text_atomically(path.with_suffix(".json"), text)
+    if not is_device_or_pipe(path):  # nothing lies beside one
+        for image_path, content in contents:
+            write_bytes_atomically(image_path, content, named=False)
+        write_text_atomically(path.with_suffix(".json"), text, named=False)
     write_text_atomically(path, csv_text(columns))
 
 

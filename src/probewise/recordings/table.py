@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,8 @@ from probewise.recordings.times import looks_like_time, require_unit_of_time, te
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
 
+_BEGIN_FORMULA = ("=", "+", "-", "@")
+_ESCAPED = r"^'(?='*[=+@-])"  # see _not_as_formula
 _CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
 _SAMPLE = 100_000  # characters from which the layout is found
 _N_LAST = 10  # rows at the end of these that show how many cells a row has
@@ -254,7 +257,7 @@ def _count_up(cells: Sequence[str]) -> bool:
 
 def _names(row: Sequence[str], wanted: Sequence[str], width: int) -> list[str]:
     """Return the names of a header: on one line, without the # of a comment if such a column is wanted."""
-    names = [re.sub(r"\s*[\r\n]\s*", " ", cell) for cell in row]
+    names = [re.sub(_ESCAPED, "", re.sub(r"\s*[\r\n]\s*", " ", cell)) for cell in row]
     if names[0] in ("#", "%") and len(names) == width + 1:
         return names[1:]
     bare = names[0].lstrip("#% ")
@@ -304,6 +307,7 @@ def read_table(
     _require_distinct_columns(path, header, layout.at + 1)
     n_lines = text.count("\n")
     separator = next(c for c in itertools.chain("\x1f\x1e", map(chr, range(0xE000, 0x110000))) if c not in text)
+    unescape = partial(re.compile(_ESCAPED.replace("^", f"(?<![^{separator}])")).sub, "")
     columns: list[list[str]] = [[] for _ in header]
     rows: list[IntArray] = []
     left_out: list[int] = []
@@ -335,7 +339,7 @@ def read_table(
     notes = layout.notes()
     if left_out:
         notes.append(f"{count_with_noun(len(left_out), 'row')} without readings left out (first: row {min(left_out)})")
-    joined = [separator.join(column) for column in columns]
+    joined = [unescape(separator.join(column)) for column in columns]
     unnamed = [cells for name, cells in zip(header, joined, strict=True) if not name]
     if n_filled := sum(bool(cells.strip(separator)) for cells in unnamed):
         if n_filled > 1:
@@ -419,15 +423,25 @@ def number_text(value: float) -> str:
     return str(int(value)) if value.is_integer() and abs(value) <= LARGEST else repr(value)
 
 
+def _not_as_formula(cell: object) -> object:
+    """Return a cell, in front of a text like "=1+1" or "'=1+1" one apostrophe more; numbers stay as they are."""
+    if isinstance(cell, str) and cell.lstrip("'")[:1] in _BEGIN_FORMULA and parsed_numbers([cell]) is None:
+        return f"'{cell}"
+    return cell
+
+
 def csv_text(columns: dict[str, Sequence[str]]) -> str:
     """Format columns of cells of equal length as CSV with a header row and LF line ends."""
     return csv_text_of_rows(columns, zip(*columns.values(), strict=True))
 
 
 def csv_text_of_rows(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Format rows as CSV with a header row and LF line ends."""
+    """Format rows as CSV with a header row and LF line ends.
+
+    A text that a spreadsheet would take for a formula gains an apostrophe in front, which `read_table` removes.
+    """
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerow(map(_not_as_formula, header))
+    writer.writerows(map(_not_as_formula, row) for row in rows)
     return out.getvalue()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from probewise._kinds import checked_path
-from probewise.errors import FileError, ParameterError, message_of, shown
+from probewise.errors import FileError, ParameterError, message_of, printable, shown
 from probewise.recordings.python_file import raising_exceptions, run_python_text
 from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, parse_prior
@@ -45,7 +45,16 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
         If it cannot be read or run, or is inconsistent; the message names the line, if there is one.
     """
     path = checked_path("path", path, "the name of a Python file that describes a simulator")
-    text = read_text(path, "a Python file that describes a simulator")
+    return run_simulator_text(read_text(path, "a Python file that describes a simulator"), path)
+
+
+def fingerprint_of_text(text: str) -> str:
+    """Return the fingerprint of the text of a user's file."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def run_simulator_text(text: str, path: Path) -> Simulator:
+    """Run the text of a user's file, as `read_simulator` does."""
     said = run_python_text(text, path)
     try:
         return _build_simulator(said, path, text)
@@ -92,8 +101,8 @@ def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulato
         noise=Noise.of(said.get("noise", {})),
         extra={name: _parse_extra(name, each) for name, each in _checked_mapping(said, "extra").items()},
         vectorized=bool(said.get("vectorized", False)),
-        source=path.name,
-        fingerprint=hashlib.sha256(text.encode()).hexdigest()[:16],
+        source=printable(path.name),
+        fingerprint=fingerprint_of_text(text),
     )
 
 

@@ -23,11 +23,12 @@ from probewise._posterior_samples import (
 )
 from probewise._version import __version__
 from probewise.effects import EFFECTS, name_without_copy_suffix
-from probewise.errors import FileError, ParameterError, message_of
+from probewise.errors import FileError, ParameterError, message_of, printable
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
 from probewise.sensor import Stage
+from probewise.systems.file import fingerprint_of_text, run_simulator_text
 from probewise.systems.forms.rebinding import StoredFit, counts_from_far_origin
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
@@ -144,7 +145,7 @@ class FittedSystem(NamedSamples):
                 "max_step": self.max_step if math.isfinite(self.max_step) else None,
                 "stiff": self.stiff,
             },
-            "recording": {"fingerprint": self.recording, "source": self.source},
+            "recording": {"fingerprint": self.recording, "source": printable(self.source)},
             "parameters": [
                 {"name": n, "mean": mean[n], "median": median[n], "sd": sd[n], "interval95": list(interval[n])}
                 for n in self.names
@@ -162,8 +163,12 @@ class FittedSystem(NamedSamples):
         return json.dumps(document, allow_nan=False) + "\n"
 
     @classmethod
-    def from_json(cls, text: str, simulator: Simulator, path: object = "repaired.json") -> FittedSystem:
+    def from_json(
+        cls, text: str, simulator: Simulator | str | os.PathLike[str], path: object = "repaired.json"
+    ) -> FittedSystem:
         """Parse the text from `to_json`; error messages name `path`.
+
+        A simulator given as its file, FILE.py, is run only if its fingerprint is that of the text.
 
         Raises
         ------
@@ -182,14 +187,12 @@ class FittedSystem(NamedSamples):
             raise FileError(path, f"format {found!r}", f"{FORMAT!r}: {_WHAT}")
         try:
             own = document["simulator"]
+            if not isinstance(simulator, Simulator):
+                simulator = _run_unchanged_file(Path(simulator), own, path)
             fitted_to, here = f"{own['reading']} ({own['unit']})", f"{simulator.reading} ({simulator.unit})"
             if fitted_to != here:  # simulators made in Python have no fingerprint
                 raise FileError(path, f"fitted to {fitted_to}", f"a model of {here}, as the simulator predicts")
-            if own["fingerprint"] != simulator.fingerprint:
-                raise FileError(
-                    path, f"fitted with {own['source']} of fingerprint {own['fingerprint']}",
-                    f"that file unchanged; {simulator.source} has {simulator.fingerprint}: diagnose or fit again",
-                )  # fmt: skip
+            _require_fingerprint(simulator.fingerprint, simulator.source, own, path)
             samples, known = np.array(document["samples"], dtype=np.float64), document["bound_about"]
             fitted = cls(
                 simulator,
@@ -232,8 +235,23 @@ class FittedSystem(NamedSamples):
             ) from error
 
 
-def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator) -> FittedSystem:
+def _run_unchanged_file(file: Path, own: Mapping[str, Any], path: object) -> Simulator:
+    text = read_text(file, "a Python file that describes a simulator")
+    _require_fingerprint(fingerprint_of_text(text), file.name, own, path)
+    return run_simulator_text(text, file)
+
+
+def _require_fingerprint(here: str, source: str, own: Mapping[str, Any], path: object) -> None:
+    """Raise FileError unless `here`, the fingerprint of `source`, is that of the simulator `own` in the file `path`."""
+    if own["fingerprint"] != here:
+        found = f"fitted with {own['source']} of fingerprint {own['fingerprint']}"
+        raise FileError(path, found, f"that file unchanged; {source} has {here}: diagnose or fit again")
+
+
+def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator | str | os.PathLike[str]) -> FittedSystem:
     """Read repaired.json, calibrated.json or fitted.json, for the simulator that it was made with.
+
+    A simulator given as its file, FILE.py, is run only if it is unchanged.
 
     Raises
     ------

@@ -26,6 +26,7 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
     from probewise.arm.geometry_file import read_geometry, text_with_fitted_values
     from probewise.arm.mark_file import read_turns_and_places
     from probewise.recordings import write_text_atomically
+    from probewise.recordings.atomic import is_device_or_pipe
 
     source = arguments.geometry or shipped_geometry_path()
     out = checked_output_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
@@ -35,6 +36,8 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
         raise CommandError(
             "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or fit existing marks, --marks MARKS.csv"
         )
+    if arguments.marks is None and is_device_or_pipe(out):
+        raise ParameterError("--out", str(out), "a file, beside which the marks are kept; or name them with --marks")
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
     if arguments.arm is not None:
         _touch_and_save_marks(arguments, geometry, checked_output_file(kept))
@@ -43,7 +46,8 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
     print_result(fitted.summary(), quiet=arguments.quiet)
     text = text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry)
     write_text_atomically(out, text)
-    read_geometry(out)  # check that edits by hand have not hidden a number
+    if not is_device_or_pipe(out):
+        read_geometry(out)  # check that edits by hand have not hidden a number
     print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
 
 

@@ -42,6 +42,7 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.cli._person import PersonAtBench, is_pty
     from probewise.cli._sheet_check import SheetCheck
     from probewise.recordings import write_recording
+    from probewise.recordings.atomic import is_device_or_pipe
 
     named = arguments.plan in SHIPPED
     out = checked_output_file(arguments.out, *([] if named else [Path(arguments.plan)]))
@@ -57,12 +58,15 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     width, height = (0.0, 0.0) if own else geometry.field_mm
     origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
     is_lego = arguments.arm is None or parse_arm(arguments.arm).is_lego
-    taken = [] if arguments.dry_run else earlier_readings(out, plan, resume=arguments.resume, is_lego=is_lego)
+    at_end = is_device_or_pipe(out)  # which takes the recording once
+    taken = [] if arguments.dry_run or at_end else earlier_readings(out, plan, resume=arguments.resume, is_lego=is_lego)
     start_s = taken[-1].time_s if taken else 0.0
 
     def kept_message() -> str:
         if not out.exists():
             return "nothing was read"
+        if at_end:
+            return f"nothing was kept: {out} takes whole recordings"
         return message_to_resume(
             out, len(read_unfinished_recording(out)), "reading", arguments, "--resume", of=len(plan)
         )
@@ -97,9 +101,11 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
                     print_warning(f"{wrong}; is the right sheet there, the right way round?")
                 taken.append(reading)
                 progress("readings", len(taken), len(plan))
-                if not arguments.dry_run:
+                if not arguments.dry_run and not at_end:
                     write_recording(recording_of_readings(plan, taken), out)
     if not arguments.dry_run:
+        if at_end:
+            write_recording(recording_of_readings(plan, taken), out)
         print_result(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 
 

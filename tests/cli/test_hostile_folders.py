@@ -1,0 +1,301 @@
+"""What lies outside the folder of its results is none of a command's business, whatever that folder holds."""
+
+import os
+import stat
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from heater import fitted
+
+from probewise.cli import main
+from probewise.cli._output import staged_output
+from probewise.errors import FileError
+from probewise.recordings import read_recording, write_bytes_atomically, write_recording
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no named pipes, and links for administrators only")
+
+
+def contents(folder):
+    """Return what is in a folder, by name, without following a link."""
+    found = {}
+    for at, folders, names in os.walk(folder):
+        for path in (Path(at, name) for name in (*folders, *names)):
+            name = path.relative_to(folder).as_posix()
+            found[name] = os.readlink(path) if path.is_symlink() else path.read_text() if path.is_file() else None
+    return found
+
+
+def commit_list(text):
+    """Build what versions before the complete folder left behind."""
+
+    def build(out):
+        (out / ".writing").mkdir()
+        (out / ".writing" / "commit.json").write_bytes(text if isinstance(text, bytes) else text.encode())
+
+    return build
+
+
+def nested(out):
+    """Folders in folders, 1,100 deep: too deep for a program that descends by calling itself."""
+    at = out / ".complete"
+    at.mkdir()
+    handle = os.open(at, os.O_RDONLY)
+    for _ in range(1100):
+        os.mkdir("d", dir_fd=handle)
+        inner = os.open("d", os.O_RDONLY, dir_fd=handle)
+        os.close(handle)
+        handle = inner
+    os.close(handle)
+
+
+def linked(name, target="../outside"):
+    def build(out):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).symlink_to(out / target)
+
+    return build
+
+
+def complete(*names):
+    def build(out):
+        for name in names:
+            (out / ".complete" / name).parent.mkdir(parents=True, exist_ok=True)
+            (out / ".complete" / name).write_text("x")
+
+    return build
+
+
+def through_link(out):
+    complete("sub/victim.txt")(out)
+    linked("sub")(out)
+
+
+FOLDERS = {
+    "removes beside it": commit_list('{"names": [], "aside": {}, "remove": ["../outside/victim.txt"]}'),
+    "moves out of it": commit_list('{"names": ["../outside/victim.txt"], "aside": {}, "remove": []}'),
+    "renames out of it": commit_list('{"names": ["a"], "aside": {"a": "../outside/victim.txt"}, "remove": []}'),
+    "an absolute path": commit_list('{"names": [], "aside": {}, "remove": ["/etc/none"]}'),
+    "cut short": commit_list('{"names": 3'),
+    "a list": commit_list("[]"),
+    "not UTF-8": commit_list(b"\xff\xfe"),
+    "deep": commit_list("[" * 100_000),
+    "a NUL": commit_list('{"names": ["a\\u0000b"], "aside": {}, "remove": []}'),
+    "staged in a link": linked(".writing"),
+    "complete in a link": linked(".complete"),
+    "a link among the complete": linked(".complete/d"),
+    "a link to a file among the complete": linked(".complete/report.html", "../outside/victim.txt"),
+    "a folder that is a link": through_link,
+    "only the ending": complete(".outdated"),
+    "an outdated folder": lambda out: [complete("sub.outdated")(out), (out / "sub").mkdir()],
+    "complete in itself": complete(".complete/a", ".writing/b", ".results.lock"),
+    "a result that is a link": linked("report.html", "../outside/victim.txt"),
+    "a lock that is a link": linked(".results.lock", "../outside/victim.txt"),
+    "a pipe": lambda out: os.mkfifo(out / ".complete"),
+    "a pipe as a result": lambda out: os.mkfifo(out / "report.html"),
+    "a circle of links": lambda out: [linked("report.html", "report.html")(out), linked("a.svg", "a.svg")(out)],
+}
+
+
+@pytest.mark.parametrize(
+    "build", [*FOLDERS.values(), pytest.param(nested, marks=pytest.mark.slow)], ids=[*FOLDERS, "nested"]
+)
+def test_nothing_outside_a_hostile_folder_changes_and_the_way_out_is_said(build, tmp_path):
+    """Either the results are written, or one line names what is in the way; without that they are written."""
+    outside, out = tmp_path / "outside", tmp_path / "out"
+    outside.mkdir()
+    out.mkdir()
+    (outside / "victim.txt").write_text("precious")
+    build(out)
+
+    def write():
+        with staged_output(out, outdated=("*.svg",)) as stage:
+            stage.write("report.html", "new")
+
+    refusal = None
+    try:
+        write()
+    except FileError as error:
+        refusal = error
+    if refusal is not None:
+        named = refusal.allowed.partition("or remove ")[2].partition(" to drop")[0] or refusal.path
+        assert named.startswith(f"{out}/")
+        subprocess.run(["rm", "-r", named], check=True)
+        write()
+    assert contents(outside) == {"victim.txt": "precious"}
+    assert (out / "report.html").read_text() == "new"
+    assert not (out / "report.html").is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("verb", "name"),
+    [
+        *(
+            ("explore", name)
+            for name in ("journal.jsonl", ".journal.jsonl.lock", "live.html", "frames", "frames/1.png")
+        ),
+        *(("investigate", name) for name in ("rounds", "rounds/1.csv")),
+        *(("study", name) for name in ("trials.jsonl", ".trials.jsonl.lock")),
+        *(("challenge", name) for name in ("cases.jsonl", ".cases.jsonl.lock")),
+    ],
+)
+def test_a_link_where_a_run_would_write_is_refused_before_it_begins(verb, name, sensor_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    (tmp_path / "victim").write_text("precious")
+    (out / name).symlink_to(tmp_path / "victim")
+    words = {"explore": ["--sensor", str(sensor_file)], "investigate": ["--plan", "paper", "--rounds", "1"]}
+    assert main([verb, *words.get(verb, []), "--quiet", "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{out / name}: " in said
+    assert "is a symbolic link" in said
+    assert (tmp_path / "victim").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("verb", "name"),
+    [
+        ("explore", "journal.jsonl"),
+        ("explore", "frames/2.png"),
+        ("investigate", "rounds/1.csv"),
+        ("study", "trials.jsonl"),
+    ],
+)
+def test_a_pipe_where_a_run_would_read_or_write_is_not_waited_for(verb, name, sensor_file, tmp_path, capsys):
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    os.mkfifo(out / name)
+    words = {"explore": ["--sensor", str(sensor_file), "--resume"], "investigate": ["--plan", "paper", "--resume"]}
+    assert main([verb, *words.get(verb, []), "--quiet", "--out", str(out)]) == 2
+    assert f"{out / name}: is a device or a pipe" in capsys.readouterr().err
+
+
+def predict(sensor_file, recording_file, out):
+    return main(["predict", str(sensor_file), str(recording_file), "--quiet", "--out", str(out)])
+
+
+def sheets(sensor_file, recording_file, out):
+    return main(["sheets", "marks", "--quiet", "--out", str(out)])
+
+
+def check(sensor_file, recording_file, out):
+    return main(["arm", "check", "--quiet", "--out", str(out)])
+
+
+def record(sensor_file, recording_file, out):
+    return main(["arm", "record", str(recording_file), "--arm", "simulated", "--quiet", "--out", str(out)])
+
+
+@pytest.mark.parametrize(
+    "run", [predict, check, *(pytest.param(each, marks=pytest.mark.slow) for each in (sheets, record))]
+)
+def test_a_pipe_and_a_device_are_written_to_a_link_is_followed_and_a_folder_is_refused(
+    run, sensor_file, recording_file, tmp_path, capsys
+):
+    plain, pipe, folder = tmp_path / "plain.csv", tmp_path / "pipe", tmp_path / "folder"
+    assert run(sensor_file, recording_file, plain) == 0
+    os.mkfifo(pipe)
+    heard = []
+    reader = threading.Thread(target=lambda: heard.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    assert run(sensor_file, recording_file, pipe) == 0
+    reader.join(10)
+    if run is not sheets:  # whose PDF has the time in it
+        assert heard == [plain.read_bytes()]
+    assert heard[0]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert not list(tmp_path.glob("pipe?*"))
+    (tmp_path / "link.csv").symlink_to("elsewhere.csv")
+    assert run(sensor_file, recording_file, tmp_path / "link.csv") == 0
+    assert (tmp_path / "link.csv").is_symlink()
+    assert len((tmp_path / "elsewhere.csv").read_bytes()) == len(heard[0])
+    folder.mkdir()
+    assert run(sensor_file, recording_file, folder) == 2
+    assert "this is a directory" in capsys.readouterr().err
+    try:
+        os.mknod(tmp_path / "null", stat.S_IFCHR | 0o666, os.makedev(1, 3))
+        (tmp_path / "null").open("wb").close()
+    except OSError:
+        return  # only root makes devices, and not on every file system
+    assert run(sensor_file, recording_file, tmp_path / "null") == 0
+    assert stat.S_ISCHR((tmp_path / "null").stat().st_mode)
+
+
+def test_a_file_keeps_its_permissions_and_a_new_one_has_those_of_any_new_file(tmp_path):
+    (tmp_path / "ordinary").touch()
+    write_bytes_atomically(tmp_path / "new", b"1")
+    assert (tmp_path / "new").stat().st_mode == (tmp_path / "ordinary").stat().st_mode
+    (tmp_path / "new").chmod(0o640)
+    write_bytes_atomically(tmp_path / "new", b"2")
+    assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o640
+
+
+def test_files_beside_the_named_one_follow_no_link(recording_file, tmp_path):
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "rec.json").symlink_to(tmp_path / "victim")
+    write_recording(read_recording(recording_file), tmp_path / "rec.csv")
+    assert (tmp_path / "victim").read_text() == "precious"
+    assert len(read_recording(tmp_path / "rec.csv")) > 0
+
+
+def test_a_changed_simulator_is_refused_and_not_run(tmp_path, capsys):
+    (tmp_path / "fitted.json").write_text(fitted().to_json())
+    (tmp_path / "heater.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    (tmp_path / "table.csv").write_text("time_s\n1\n")
+    words = ["predict", tmp_path / "fitted.json", tmp_path / "table.csv", "--simulator", tmp_path / "heater.py"]
+    assert main([str(word) for word in (*words, "--out", tmp_path / "p.csv")]) == 2
+    assert "fingerprint abc; allowed: that file unchanged" in capsys.readouterr().err
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("closed", "given", "status"),
+    [(">&-", "", 0), ("2>&-", "", 0), ("<&- >&- 2>&-", "", 0), ("2>&-", "--seed x", 2), ("2>&-", "--simulator a", 2)],
+)
+def test_closed_streams_change_neither_the_file_nor_the_status(
+    closed, given, status, sensor_file, recording_file, tmp_path
+):
+    command = f"{sys.executable} -m probewise predict {sensor_file} {recording_file} --out {tmp_path}/p.csv {given}"
+    done = subprocess.run(["sh", "-c", f"{command} {closed}"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, "")
+    assert (tmp_path / "p.csv").exists() is (status == 0)
+
+
+def test_a_nul_in_a_path_is_refused_in_one_line(sensor_file, recording_file, tmp_path, capsys):
+    assert predict(sensor_file, recording_file, f"{tmp_path}/a\0b") == 2
+    assert "a text with a NUL names no file" in capsys.readouterr().err
+    with pytest.raises(FileError, match="null byte"):
+        write_bytes_atomically(f"{tmp_path}/a\0b", b"")
+
+
+def test_control_characters_of_names_do_not_reach_the_terminal(sensor_file, recording_file, tmp_path, capsys):
+    name = "\x1b[2J\x07\x9b31m\udcffa\rb"
+    folder = tmp_path / name
+    folder.mkdir()
+    for path in (recording_file, recording_file.with_suffix(".json")):
+        path.rename(folder / path.name)
+    recording = folder / recording_file.name
+    for status, words in [
+        (0, ("predict", sensor_file, recording, "--out", folder / "p.csv")),
+        (2, ("predict", folder / "none.json", recording, "--out", folder / "p.csv")),
+        (2, ("predict", sensor_file, recording, "--out", folder / "p.csv", name)),
+        (2, ("explore", "--sensor", sensor_file, "--arm", f"{name}.py", "--out", folder / "out")),
+        (0, ("audit", recording)),
+    ]:
+        assert main([str(word) for word in words]) == status
+        said = capsys.readouterr()
+        assert all(line.isprintable() for line in (said.out + said.err).split("\n")), words
+
+
+def test_results_of_files_whose_names_are_no_utf_8_are_written_and_read_back(recording_file, tmp_path, capsys):
+    (tmp_path / "\udcff.csv").write_text("x,y\n" + "".join(f"{k},{2 * k + 0.1 * (k * 7 % 5)}\n" for k in range(24)))
+    (tmp_path / "\udcff.py").write_text(
+        'reading, unit, parameters = "y", "V", {"a": (0, 10)}\ndef simulate(p, data):\n    return p["a"] * data["x"]\n'
+    )
+    given = (tmp_path / "\udcff.csv", "--simulator", tmp_path / "\udcff.py", "--quiet", "--out")
+    assert main([str(word) for word in ("fit", *given, tmp_path / "out")]) == 0
+    assert main([str(word) for word in ("predict", tmp_path / "out" / "fitted.json", *given, tmp_path / "p.csv")]) == 0
+    assert "\\udcff.csv" in (tmp_path / "out" / "report.html").read_text()

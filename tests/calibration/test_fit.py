@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import ks_2samp
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, SSFPrior, calibrate, default_prior, paper_prior, predict, problem_for
@@ -236,25 +237,41 @@ def test_orders_run_elsewhere_give_the_same_result(recording):
 
 
 def test_the_papers_priors_are_uniform_within_the_usual_bounds(recording: Recording) -> None:
-    """A quarter of each unit interval is a quarter of each range; C fills what A and B leave it."""
+    """A quarter of each unit interval is a quarter of the range of a, u, v and the levels."""
     usual, paper = default_prior(recording, 1), paper_prior(recording, 1)
     ends = np.array([[0.0] * 8, [1.0] * 8])
     lower, upper = paper.from_unit_cube(ends)
     quarter = paper.from_unit_cube(np.full((1, 8), 0.25))[0]
-    flat = [0, 1, 2, 3, 4, 6, 7]
+    flat = [0, 1, 2, 6, 7]
     np.testing.assert_allclose(quarter[flat], (0.75 * lower + 0.25 * upper)[flat])
     np.testing.assert_allclose([lower[1:5], upper[1:5]], usual.from_unit_cube(ends)[:, 1:5])
-    assert quarter[5] == pytest.approx(-0.5 * 0.98 * np.sqrt(quarter[3] * quarter[4]))
-    inside = paper.log_prob(np.array([quarter, quarter * [2, 1, 1, 1, 1, 1, 1, 1]]))
-    assert inside[0] == inside[1]
+
+
+def test_the_papers_prior_is_flat_over_the_matrices_that_rejection_leaves(recording: Recording) -> None:
+    """Uniform A, B and C, drawn in a box and kept where abs(C) < 0.98 sqrt(A B): the same volume, quantiles, density."""
+    paper = paper_prior(recording, 1)
+    rng = np.random.default_rng(1)
+    low, high = paper.precision.low, paper.precision.high
+    box = rng.uniform([low, low, -high], high, (400_000, 3))
+    kept = box[np.abs(box[:, 2]) < 0.98 * np.sqrt(box[:, 0] * box[:, 1])]
+    drawn = paper.from_unit_cube(rng.random((40_000, 8)))
+    for column in (kept.T, (kept[:, 0] * kept[:, 1] - kept[:, 2] ** 2)[None]):
+        theirs = drawn[:, 3:6].T if len(column) == 3 else (drawn[:, 3] * drawn[:, 4] - drawn[:, 5] ** 2)[None]
+        assert all(ks_2samp(*pair).pvalue > 1e-4 for pair in zip(column, theirs, strict=True))
+    density = paper.log_prob(drawn)
+    np.testing.assert_allclose(density, density[0])
+    others = np.ptp(paper.from_unit_cube(np.array([[0.0] * 8, [1.0] * 8]))[:, [0, 1, 2, 6, 7]], axis=0)
+    volume = 2 * high * (high - low) ** 2 * len(kept) / len(box)
+    assert density[0] == pytest.approx(-np.log(others).sum() - np.log(volume), abs=0.01)
 
 
 @pytest.mark.slow
 def test_the_papers_evidence_is_that_of_importance_sampling_under_the_same_prior(recording: Recording) -> None:
     """Two routes to one number: nested sampling to a change of 1e-8, and importance sampling from another run."""
-    common = {"orders": [1], "n_live": 100, "prior": paper_prior}
-    paper = calibrate(recording, rng=np.random.default_rng(1), stop=EvidenceChange(1e-8), refined=False, **common)
-    other = calibrate(recording, rng=np.random.default_rng(2), **common)
+    common = {"orders": [1], "prior": paper_prior}
+    rng, other_rng = map(np.random.default_rng, (1, 2))
+    paper = calibrate(recording, rng=rng, n_live=100, stop=EvidenceChange(1e-8), refined=False, **common)
+    other = calibrate(recording, rng=other_rng, n_live=300, **common)
     (nested,), (refined,) = paper.fits, other.fits
     assert nested.found.refined is None
     assert refined.found.refined.sound

@@ -26,11 +26,19 @@ from probewise.experiment import (
 from probewise.inference import Naive
 from probewise.inquiry import InformationGain, ReadingEntropy
 from probewise.nested import EvidenceChange, RemainingEvidence
-from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording
+from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Recording
 from probewise.recordings import Uniform as UniformPattern
-from probewise.scene import AnyOf, Circle, Field
+from probewise.scene import AnyOf, Circle, Field, KnownScene
 from probewise.scene.shapes import Rectangle
-from probewise.sensor import FixedLevels, footprint_of, mean_ssf_field
+from probewise.sensor import (
+    Chain,
+    DiscreteSSF,
+    FixedLevels,
+    FreeMixture,
+    footprint_of,
+    mean_ssf_field,
+    merged_mean_mixture,
+)
 from probewise.world import Blob, World, gaussian_spot
 
 STUDENT = OneScan(0.3, 50.0)
@@ -210,6 +218,31 @@ def test_the_paper_experiment_is_posed_as_the_paper_says():
     assert naive.likelihood is LEVELS
     assert naive.method.stop == RemainingEvidence(0.05)
     assert naive.doubt_p == 0
+
+
+def test_the_papers_robot_has_the_mean_of_the_sampled_fields():
+    """Over an edge and a disc: the mean response of all samples, and the paper's sum over pixels of the mean field.
+
+    The samples' sds differ by a third; one Gaussian of the same mean and covariance errs five times as much.
+    """
+    uncertain = sensor()
+    samples = uncertain.samples.copy()
+    samples[:, 1:5] *= np.exp(0.6 * rng(5).standard_normal((len(samples), 4)))
+    axis = np.arange(-60.0, 60.5, 0.5)
+    field = mean_ssf_field(footprint_of(samples[:, :6], 1), u_mm=axis, v_mm=axis)
+    posed = paper_experiment(replace(uncertain, samples=samples, field=field), Circle(), Field())
+    x_mm = np.linspace(-12.0, 12.0, 49)
+    for pattern in (HalfPlane(0.3, 0.0), Disc((0.0, 0.0), 9.0)):
+        plan = Plan.from_arrays(x_mm=x_mm, y_mm=0.4 * x_mm, patterns={"only": pattern}, unit="LEGO")
+        scene, none = KnownScene({"only": pattern}), np.empty((1, 0))
+        levels = FixedLevels(0.0, 1.0)
+        seen = Chain(posed.model.ssf, levels, scene).predict(none, plan)[0]
+        each = Chain(FreeMixture(1), levels, scene).predict(samples[:, :6], plan)
+        pixels = Chain(DiscreteSSF(field), levels, scene).predict(none, plan)[0]
+        merged = Chain(merged_mean_mixture(footprint_of(samples[:, :6], 1)), levels, scene).predict(none, plan)[0]
+        np.testing.assert_allclose(seen, each.mean(axis=0), atol=2.5e-3)
+        np.testing.assert_allclose(seen, pixels, atol=2.5e-3)
+        assert np.abs(merged - each.mean(axis=0)).max() > 5 * np.abs(seen - each.mean(axis=0)).max()
 
 
 @pytest.mark.parametrize(

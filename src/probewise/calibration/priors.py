@@ -5,7 +5,7 @@ footprints narrower than a few steps (sd = (2 A)^(-1/2), so half of a uniform A 
 sd), and the evidence of an order then depends on the bounds. Here the order of magnitude of a width is unknown, so A
 and B are log-uniform, with bounds from what the scans can resolve and contain. Likewise, with a uniform amplitude a, a
 narrow Gaussian has almost no mass, so a superfluous Gaussian can be narrow at little cost in evidence; here the mass of
-a Gaussian, a pi / sqrt(A B - C^2), is uniform. `paper_prior` is uniform in A, B and a.
+a Gaussian, a pi / sqrt(A B - C^2), is uniform. `paper_prior` is uniform in a and in (A, B, C).
 """
 
 from __future__ import annotations
@@ -29,6 +29,37 @@ _SAME_AXIS = 0.01  # chord of the doubled angle; it equals 0.3 degrees
 _TINY = float(np.finfo(float).tiny)
 _AMPLITUDE = Uniform(0.0, 1.0)
 _PER_GAUSSIAN = ("a", "u", "v", "A", "B", "C")
+
+
+@dataclass(frozen=True)
+class SquareRoot:
+    """Density proportional to the square root of the value, from `low` >= 0 to `high`.
+
+    With C uniform on (-r sqrt(A B), r sqrt(A B)), it makes (A, B, C) uniform over the volume that they leave to C.
+    """
+
+    low: float
+    high: float
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        """Evaluate the quantile function, any shape."""
+        low, high = self.low**1.5, self.high**1.5
+        return np.asarray((low + (high - low) * u) ** (2 / 3))
+
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Evaluate the cumulative distribution function, any shape."""
+        low, high = self.low**1.5, self.high**1.5
+        return np.asarray((np.clip(value, self.low, self.high) ** 1.5 - low) / (high - low))
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        """Return the natural log of the density, any shape; -inf outside the bounds."""
+        inside = (value >= self.low) & (value <= self.high)
+        safe = np.where(inside, value, self.high)
+        constant = math.log(1.5 / (self.high**1.5 - self.low**1.5))
+        return np.where(inside, 0.5 * np.log(safe) + constant, -np.inf)
+
+    def __str__(self) -> str:
+        return f"{self.low:g} to {self.high:g}, density proportional to the square root"
 
 
 @dataclass(frozen=True)
@@ -303,9 +334,10 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
 
 
 def paper_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
-    """Make the paper's prior: uniform in each a, u, v, A, B, C and level, within the bounds of `default_prior`.
+    """Make the paper's prior: uniform in a, u, v, (A, B, C) and the levels, within the bounds of `default_prior`.
 
-    The paper prints no bounds. C is uniform where A and B leave the Gaussian positive definite.
+    The paper prints no bounds. (A, B, C) is uniform over the volume where A and B are within their bounds and C leaves
+    the correlation within its own.
 
     Raises
     ------
@@ -316,9 +348,10 @@ def paper_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
     bounds = usual.precision
     if not isinstance(bounds, LogUniform):
         raise TypeError("default_prior spreads the precisions evenly over orders of magnitude")
-    reasons = {**dict(usual.reasons), "precision": "as in the paper, which prints no bounds; these are the usual ones"}
+    why = "with C_n, uniform over their volume, as in the paper, which prints no bounds; these are the usual ones"
+    reasons = {**dict(usual.reasons), "precision": why}
     return replace(
-        usual, precision=Uniform(bounds.low, bounds.high), unit_mass_mm2=None, reasons=tuple(reasons.items())
+        usual, precision=SquareRoot(bounds.low, bounds.high), unit_mass_mm2=None, reasons=tuple(reasons.items())
     )
 
 

@@ -204,12 +204,16 @@ class FittedSensor(NamedSamples):
         """Whether its SSF is a free form (`probewise.sensor.free_form`) rather than a mixture of a few Gaussians."""
         return is_free_form(self.samples[:, : 6 * self.n_gaussians])
 
-    def mean_mixture(self) -> FixedMixture:
-        """Return the mean SSF as a `FixedMixture` of `n_gaussians` positive Gaussians; of four for a free form."""
+    def mean_mixture(self, n_gaussians: int | None = None) -> FixedMixture:
+        """Return the mean SSF as a `FixedMixture` of at most `n_gaussians` Gaussians, merged from all samples.
+
+        By default one for N = 1, else 4 N; of a free form always four, fitted to its field.
+        """
+        n = self.n_gaussians
         if self.is_free_form:
             return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
-        n = self.n_gaussians
-        return merged_mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
+        most = (1 if n == 1 else 4 * n) if n_gaussians is None else n_gaussians
+        return merged_mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=most)
 
     def with_leading_effects(self) -> FittedSensor:
         """Return the sensor with the most probable combination of effects, where a diagnosis left several possible.

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray, read_only_floats, require_finite
+from probewise._arrays import FloatArray, IntArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_whole
 from probewise.errors import ParameterError, ShapeError
@@ -290,15 +290,22 @@ def merged_mean_mixture(
 ) -> FixedMixture:
     """Merge the mean of sampled mixtures, arrays (n_samples, 1, n), into one mixture of at most `n_gaussians`.
 
-    `weights` are the samples', (n_samples,), equal when None. The mean over the samples is a large mixture; its
-    components are merged by the law of total covariance, so mean and covariance of the mean field are exact.
+    `weights` are the samples', (n_samples,), equal when None. The mean over the samples is a large mixture. Similar
+    Gaussians of it are merged by the law of total covariance, so mean and covariance of the mean field are exact.
     """
+    if n_gaussians < 1:
+        raise ParameterError("n_gaussians", n_gaussians, "1 or more")
     arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
     n_samples, _, n = arrays[0].shape
     shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
     w, u, v, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
-    covs = np.stack([var_u, cov, cov, var_v], axis=-1).reshape(-1, 2, 2)
-    return _merge_gaussians(w * np.repeat(shares, n), np.stack([u, v], axis=-1), covs, n_gaussians)
+    w = w * np.repeat(shares, n)
+    w = w / w.sum()
+    means, covs = np.stack([u, v], axis=-1), np.stack([var_u, cov, cov, var_v], axis=-1)
+    sd_u, sd_v = np.sqrt(var_u), np.sqrt(var_v)
+    places = np.stack([u, v, sd_u, sd_v, cov / np.sqrt(sd_u * sd_v)], axis=-1)  # all in mm
+    merged = [_mass_mean_covariance(w[g], means[g], covs[g]) for g in _similar_groups(w, places, n_gaussians)]
+    return FixedMixture(*(np.array(part) for part in zip(*merged, strict=True)))
 
 
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
@@ -322,21 +329,45 @@ def _quadratic_form(off: FloatArray, matrix: FloatArray) -> FloatArray:
     return np.asarray(matrix[0, 0] * x * x + matrix[1, 1] * y * y + 2 * matrix[0, 1] * x * y)
 
 
+def _similar_groups(w: FloatArray, places: FloatArray, n_groups: int) -> list[IntArray]:
+    """Split rows of weights `w`, (n,), and `places`, (n, n_axes), into at most `n_groups` groups of near rows.
+
+    Each split halves the group with the largest weighted scatter along one axis, across that axis at the mean.
+    """
+
+    def along_main_axis(group: IntArray) -> tuple[float, FloatArray]:
+        off = places[group] - w[group] @ places[group] / w[group].sum()
+        scatter, axes = np.linalg.eigh((w[group][:, None] * off).T @ off)
+        return float(scatter[-1]), off @ axes[:, -1]
+
+    groups = [np.arange(len(w))]
+    spread = [along_main_axis(groups[0])]
+    while len(groups) < n_groups:
+        widest = max(range(len(groups)), key=lambda k: spread[k][0])
+        group, (_, along) = groups.pop(widest), spread.pop(widest)
+        parts = [part for part in (group[along <= 0], group[along > 0]) if len(part)]
+        groups += parts
+        spread += [along_main_axis(part) for part in parts]
+        if len(parts) == 1:  # all rows alike
+            break
+    return groups
+
+
+def _mass_mean_covariance(w: FloatArray, means: FloatArray, covs: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return mass, mean (2,) and covariance (2, 2) of Gaussians: weights (n,), means (n, 2), covariances (n, 4)."""
+    mass = float(w.sum())
+    mean = w @ means / mass
+    off = means - mean
+    return mass, mean, (w @ covs).reshape(2, 2) / mass + (w[:, None] * off).T @ off / mass
+
+
 def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
     """Merge weighted Gaussians (points: covariance 0) into at most `n_gaussians`, by expectation-maximisation."""
     if n_gaussians < 1:
         raise ParameterError("n_gaussians", n_gaussians, "1 or more")
     w = w / w.sum()
     flat_covs = covs.reshape(len(w), 4)
-
-    def mass_mean_covariance(share: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        mass = float(share.sum())
-        mean = share @ means / mass
-        off = means - mean
-        cov = (share @ flat_covs).reshape(2, 2) / mass + (share[:, None] * off).T @ off / mass
-        return mass, mean, cov
-
-    _, mean, cov = mass_mean_covariance(w)
+    _, mean, cov = _mass_mean_covariance(w, means, flat_covs)
     if n_gaussians == 1:
         return FixedMixture(np.ones(1), mean[None], cov[None])
     # Start from Gaussians of increasing width, spread along the principal axis.
@@ -361,7 +392,7 @@ def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gauss
         alive = shares.sum(axis=0) > 1e-9
         shares = shares[:, alive]
         n_gaussians = int(alive.sum())
-        fitted = [mass_mean_covariance(shares[:, k]) for k in range(n_gaussians)]
+        fitted = [_mass_mean_covariance(shares[:, k], means, flat_covs) for k in range(n_gaussians)]
         weights = np.array([f[0] for f in fitted])
         centers = np.array([f[1] for f in fitted])
         shapes = np.array([f[2] for f in fitted]) + floor

@@ -70,6 +70,17 @@ def test_the_led_is_on_unless_it_was_switched_off(brick, paper_brick):
     assert paper_brick.input[:2] == [5, 0]
 
 
+def test_a_flash_gives_a_reading_and_leaves_the_led_off_even_where_the_reading_fails(brick, paper_brick, clock):
+    light = brick.light_sensor(1)
+    assert [light.flash().raw_counts for _ in range(2)] == [500, 500]
+    set_types = [body[3] for body in paper_brick.commands if body[1] == 0x05]
+    assert set_types == [5, 0, 5, 0]
+    paper_brick.raw_counts = 1024
+    with pytest.raises(TelegramError):
+        light.flash()
+    assert paper_brick.input[0] == 0
+
+
 def test_a_sensor_that_a_program_has_reset_is_set_up_again(brick, paper_brick, clock):
     light = brick.light_sensor(1)
     light.set_led(False)

@@ -78,12 +78,14 @@ def test_a_reading_is_taken_at_its_place_and_height(bench):
     def watched(opcode, body):
         if opcode == 0x07:
             seen.append(bench.sensor_mm)
+            assert bench.paper.input[:2] == [5, 0]  # its LED is on
         return carry_out(opcode, body)
 
     bench.paper.carry_out = watched
     with bench.arm as arm:
         for place in PLACES:
             reading = arm.measure(bench.pose(*place))
+            assert bench.paper.input[0] == 0  # and off again: it flashes, as in the paper
             np.testing.assert_allclose(seen[-1], [*place, 14.0], atol=2.0)
             assert reading.value == 56  # 500 counts of the converter: 56.9 %
             assert reading.covariates == {"height_mm": 14.0, "battery_mv": 7412}

@@ -33,7 +33,7 @@ def bricks(monkeypatch, make_paper_brick):
         opened.append(paper)
 
         def mortal(opcode, body):
-            if opcode == 0x07:
+            if opcode == 0x07 and paper.clock.now_s >= paper.input[2]:  # a valid reading
                 asked.append(opcode)
                 if len(asked) == death:
                     paper.is_cut = True

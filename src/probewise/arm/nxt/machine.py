@@ -43,7 +43,6 @@ class BrickMachine:
             for joint, motor in enumerate(self._motors):
                 # An earlier session that lost its connection may have left a motor turning.
                 self.limits.record_present_count(joint, motor.stop_and_settle())
-            self._light.set_led()
         except BaseException as error:
             self.brick.__exit__(type(error), error, error.__traceback__)
             raise
@@ -91,8 +90,8 @@ class BrickMachine:
             self.limits.record_present_count(joint, 0)
 
     def read_percent(self) -> float:
-        """Read the light sensor with the LED on: 0 to 100, with fractions."""
-        return self._light.read().fine_percent
+        """Flash the light sensor's LED and read: 0 to 100, with fractions."""
+        return self._light.flash().fine_percent
 
     def battery_mv(self) -> float:
         """Read the battery's voltage, in mV."""

@@ -31,7 +31,7 @@ N_STEPS_DOWN = 5  # steps of the first lowering
 N_TRIED = 361  # angles tried for the path up
 SAME_TURN_RAD = math.radians(1.0)
 # Duration of a measurement, measured on the emulator: joints move one after another, and each takes time to stop.
-COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.6
+COUNTS_S, STOP_S, READ_S = 500.0, 0.9, 4.7
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,11 @@ def plan_for_own_instrument(
 
 
 def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
-    """Return the plan for the LEGO arm: in LEGO units, 0 to 100, at its reading height; no measured covariates."""
+    """Return the plan for the LEGO arm: in LEGO units, 1 to 100, at its reading height; no measured covariates."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
         unit="LEGO",
-        min=0.0,
+        min=1.0,
         max=100.0,
         step=1.0 if geometry.whole_percent else None,
         sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",

@@ -68,7 +68,8 @@ def true_world(name: str) -> World:
 def regenerate_recording(name: str) -> Recording:
     """Regenerate the shipped recording `name`, "paper" or "concealed".
 
-    Readings are rounded to 0.001, far below the noise, so that floating-point differences between machines vanish.
+    Those of "paper" are what the LEGO arm records: whole LEGO units from 1 to 100. Those of "concealed" are rounded to
+    0.001, far below the noise, so that floating-point differences between machines vanish.
 
     Raises ParameterError if there is no recording of that name.
     """
@@ -76,6 +77,9 @@ def regenerate_recording(name: str) -> Recording:
     plan = paper_plan() if name == "paper" else two_way_plan()
     plan = replace(plan, instrumentation=replace(plan.instrumentation, description=_DESCRIPTIONS[name]))
     recording = true_world(name).simulate(with_jittered_times(plan, rng=times), rng=noise)
+    if name == "paper":
+        plan = replace(recording.plan, instrumentation=replace(recording.plan.instrumentation, min=1.0, step=1.0))
+        return replace(recording, plan=plan, readings=np.clip(np.round(recording.readings), 1.0, 100.0))
     return replace(recording, readings=np.round(recording.readings, 3))
 
 

@@ -23,9 +23,9 @@ from probewise.emulator import read_geometry as read_numbers
 from probewise.recordings import Disc
 from probewise.world.shipped import true_world
 
-LEAST = 10
-"""Telegrams that a measurement takes at least: a command and a look for base, shoulder, elbow and the way up, a
-reading, the battery."""
+LEAST = 12
+"""Telegrams that a measurement takes at least: a command and a look for base, shoulder, elbow and the way up,
+LED on and off, a reading, the battery."""
 
 
 class AnySide(BrickMachine):

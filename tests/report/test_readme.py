@@ -108,6 +108,13 @@ def test_a_word_of_the_trade_is_explained_where_it_first_stands(page, word, mean
     assert meaning in prose[max(first.start() - 120, 0) : first.end() + 330]
 
 
+def test_no_notebook_shows_evidences_that_do_not_decide():
+    """An example that says "too close to call" teaches nothing about the number of Gaussians."""
+    shown = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.ipynb")}
+    assert "ln(Z1 / Z2) = " in shown["calibrate.ipynb"]
+    assert [name for name, text in shown.items() if "too close to call" in text] == []
+
+
 def test_no_line_installs_from_an_index_that_does_not_have_this_package():
     """It is not published: extras are installed from a clone (`-e ".[nxt]"`), packages by their own names."""
     read = [README, *(p.read_text(encoding="utf-8") for p in ROOT.glob("*.md"))]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from probewise.errors import ShapeError
 from probewise.recordings import patterns as kinds
@@ -48,6 +49,19 @@ def test_the_two_routes_agree_to_a_thousandth_at_one_millimetre(name):
     region, poses = region_of(PATTERNS[name]), poses_about(12)
     found = mean_albedo_by_pixels(region, pixels(1.0), poses)
     assert np.abs(found - closed(region, poses)).max() < 1e-3
+
+
+@pytest.mark.parametrize(("sd_mm", "pixel_mm", "error"), [(2.3, 1.0, 0.0038), (2.4, 1.0, 0.0034), (2.4, 0.5, 0.0009)])
+def test_pixels_err_over_an_edge_as_the_page_says(sd_mm, pixel_mm, error):
+    """docs/explanation/ssf.md: 0.242 / 12 times (pixel / sd)^2, the trapezoidal rule's error at the steepest slope."""
+    narrow = FixedMixture([1.0], [[0.0, 0.0]], [[[sd_mm**2, 0.0], [0.0, 16.0]]])
+    axis = np.arange(-30, 30.01, pixel_mm)
+    field = mean_ssf_field(narrow.footprint(np.zeros((1, 0))), u_mm=axis, v_mm=axis)
+    x_mm = np.linspace(-10, 10, 401)
+    found = mean_albedo_by_pixels(region_of(kinds.HalfPlane(0.0, 0.0)), field, Poses(x_mm[None], *np.zeros((2, 1, 1))))
+    worst = np.abs(found - ndtr(x_mm / sd_mm)).max()
+    assert worst == pytest.approx(error, abs=5e-5)
+    assert worst < 0.0202 * (pixel_mm / sd_mm) ** 2 * 1.01
 
 
 @pytest.mark.parametrize("name", ["half_plane", "quadrant", "disc"])

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from probewise.arm import ReadingScale, read_geometry, shipped_geometry_path
+from probewise.cli._plans import plan_for_lego_arm
 from probewise.errors import ParameterError
-from probewise.recordings import shipped, two_way_plan
+from probewise.recordings import paper_plan, read_recording, shipped, two_way_plan
 from probewise.world import Blob, CorrelatedNoise, World, gaussian_spot
 from probewise.world.shipped import BLACK, BLOB, CANDIDATES, NOISE_SD, WHITE, main, regenerate_recording, true_world
 
@@ -25,6 +27,16 @@ def test_the_shipped_files_are_made_again_byte_for_byte(made_again, name, suffix
 def test_the_files_do_not_tell_what_they_conceal():
     text = shipped("concealed").with_suffix(".json").read_text()
     assert not any(effect.name in text for effect in CANDIDATES)
+
+
+def test_the_paper_recording_is_what_the_arm_records():
+    """Whole LEGO units from 1 to 100, declared as the arm declares them."""
+    recording = read_recording(shipped("paper"))
+    scale = ReadingScale()
+    np.testing.assert_array_equal(recording.readings, [scale.clip_and_round(r) for r in recording.readings])
+    of_arm = plan_for_lego_arm(paper_plan(), read_geometry(shipped_geometry_path())).instrumentation
+    ours = recording.plan.instrumentation
+    assert (ours.min, ours.max, ours.step) == (of_arm.min, of_arm.max, of_arm.step) == (1.0, 100.0, 1.0)
 
 
 def test_a_recording_that_does_not_ship_cannot_be_made():

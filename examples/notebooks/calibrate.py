@@ -12,7 +12,7 @@ recording = read_recording(shipped("paper"))
 recording
 
 # %%
-# How many Gaussians does the recording ask for? (Two hundred live points: seconds, and errors far below the difference.)
+# How many Gaussians does the recording ask for? (With 200 live points the error is well below the difference.)
 calibration = calibrate(recording, orders=(1, 2), n_live=200, rng=np.random.default_rng(seed))
 one, two = calibration.orders
 print(f"ln(Z1 / Z2) = {one.log_z - two.log_z:.1f} ± {np.hypot(one.log_z_error, two.log_z_error):.1f}")

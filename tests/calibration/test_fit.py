@@ -248,7 +248,7 @@ def test_the_papers_priors_are_uniform_within_the_usual_bounds(recording: Record
 
 
 def test_the_papers_prior_is_flat_over_the_matrices_that_rejection_leaves(recording: Recording) -> None:
-    """Uniform A, B and C, drawn in a box and kept where abs(C) < 0.98 sqrt(A B): the same volume, quantiles, density."""
+    """Uniform A, B and C, drawn in a box, kept where abs(C) < 0.98 sqrt(A B): same volume, quantiles, density."""
     paper = paper_prior(recording, 1)
     rng = np.random.default_rng(1)
     low, high = paper.precision.low, paper.precision.high

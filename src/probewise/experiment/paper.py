@@ -1,8 +1,8 @@
 """The paper's experiment: a nested sampling run after every reading, fifty samples, entropy of their predictions.
 
 Paper, "The Machine Learning System" and "Models Describing a Light Sensor". Ambiguities and errors of the paper are
-resolved as in the rest of the package (docs/explanation/errata.md): the Student-t's sigma has proper bounds, the SSF is the
-mean of the sampled fields, as a mixture of Gaussians in closed form rather than a sum over pixels of 1 mm.
+resolved as in the rest of the package (docs/explanation/errata.md): the Student-t's sigma has proper bounds, the SSF is
+the mean of the sampled fields, as a mixture of Gaussians in closed form rather than a sum over pixels of 1 mm.
 """
 
 from __future__ import annotations

@@ -80,7 +80,6 @@ class LightSensor:
         self._type = SensorType.LIGHT_ACTIVE if lit else SensorType.LIGHT_INACTIVE
         self._link.ask(SetInputMode(self.port, self._type, SensorMode.RAW))
 
-
     def flash(self) -> LightReading:
         """Light the LED for one reading, as in the paper: it is at the same temperature in all of them.
 

@@ -300,8 +300,8 @@ class Plan:
 class Recording(ShowsItself):
     """A plan and its readings, shape (n_points,), NaN where missing.
 
-    `usable` is False where a reading is missing or outside the declared range; such rows
-    stay in the plan (lag and backlash need them) and are left out of every likelihood.
+    `usable` is False where a reading is missing, outside the declared range, or in a row of `left_out` (numbers from
+    0); such rows stay in the plan (lag and backlash need them) and are left out of every likelihood.
     """
 
     least_share_of_span: ClassVar[float] = 1e-3
@@ -311,6 +311,7 @@ class Recording(ShowsItself):
     readings: FloatArray
     source: str = ""
     notes: tuple[str, ...] = ()
+    left_out: tuple[int, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         self._require_plan()
@@ -499,6 +500,7 @@ class Recording(ShowsItself):
         """Rows whose reading is present and within the declared range, shape (n_points,)."""
         inst = self.plan.instrumentation
         ok = np.isfinite(self.readings)
+        ok[list(self.left_out)] = False
         with np.errstate(invalid="ignore"):
             if inst.min is not None:
                 ok &= self.readings >= inst.min
@@ -534,7 +536,8 @@ class Recording(ShowsItself):
     def take(self, rows: ArrayLike | slice) -> Self:
         """Select rows (numbers, truth values or a slice), in the given order."""
         rows = selected_row_numbers(rows, len(self))
-        return replace(self, plan=self.plan.take(rows), readings=self.readings[rows])
+        left_out = tuple(np.flatnonzero(np.isin(rows, self.left_out)).tolist())
+        return replace(self, plan=self.plan.take(rows), readings=self.readings[rows], left_out=left_out)
 
 
 def require_plan(plan: object) -> None:

@@ -91,11 +91,14 @@ class SimulatorApparatus:
     finer
         The system with a finer integration step, if the leading hypotheses were refitted with one. Effects keep the
         scales and origins of `about`.
+    lost
+        The effect that lost readings which were left out, if any.
     """
 
     about: ReferenceFit
     stop: MeterStop | None = None
     finer: System | None = None
+    lost: Dropouts | None = None
 
     @property
     def system(self) -> System:
@@ -141,8 +144,8 @@ class SimulatorApparatus:
             kinds.remove(RandomWalk)
         on_noise = [effect for kind in kinds if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
-        stops = {} if self.stop is None else {self.stop.name: self.stop}
-        return forms | {effect.name: effect for effect in on_noise} | stops
+        known = {effect.name: effect for effect in (self.stop, self.lost) if effect is not None}
+        return forms | {effect.name: effect for effect in on_noise} | known
 
     def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
         """Return formulas for effects out of vocabulary, by name: short expressions of columns and states."""

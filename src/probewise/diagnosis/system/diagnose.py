@@ -13,6 +13,7 @@ from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
 from probewise.diagnosis.noise.law import white_noise_of_recording
 from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.residuals.outlying import find_lost_readings
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.system.finer_step import finer_step_for_repair, searched_at_step
@@ -30,7 +31,7 @@ from probewise.diagnosis.system.prior_conflict import notes_on_declared_noise, n
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
-from probewise.systems import ProgressWithCallCount, RunTable, Simulator, System, table_for
+from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, table_for
 from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.sorted_rows import sorting_column
@@ -143,7 +144,21 @@ def prepare_system(
     told("fitting the simulator")
     if stop is None:
         recording, stop = without_readings_at_scattered_stop(system, recording)
-    system, found, sd = fit_system(system, recording)
+    plain = system
+    system, found, sd = fit_system(plain, recording)
+    first = SimulatorApparatus(ReferenceFit(system, table, found.z, sd))
+    lost = find_lost_readings(
+        found.model,
+        recording,
+        found,
+        system.starts,
+        lambda fitted: first.covariates_and_predicted_slope(fitted, recording)[0],
+    )
+    effect = None if lost is None else lost.effect(recording)
+    if lost is not None:
+        told("fitting the simulator without lost readings")
+        recording = cast(RunRecording, lost.left_out_of(recording))
+        system, found, sd = fit_system(plain, recording)
     near_ends = readings_near_ends(system, found, sd, recording)
     if near_ends.any():
         recording = without_readings_near_ends(system, recording, near_ends)
@@ -153,7 +168,7 @@ def prepare_system(
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
     recording = replace(recording, notes=(*recording.notes, *conflicts))
-    apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop)
+    apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop, lost=effect)
     sorting = sorting_column(apparatus.about)
     if sorting is not None:
         note = f"rows are sorted by {sorting}: what jumps or wanders from row to row may change with {sorting} instead"

@@ -20,7 +20,7 @@ from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, noise_ef
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.verdict_report.words import substitute_reading_unit
-from probewise.effects import NamedEffect, NoiseEffect, is_out_of_vocabulary
+from probewise.effects import Dropouts, NamedEffect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples
 from probewise.recordings.plan import Plan
 
@@ -186,6 +186,8 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     if name in prepared.noise_effect_names and cast(NoiseEffect, effect).changes_the_mean:
         everywhere = found.model.predict(found.z[None, :])[0]
         return float(np.linalg.norm(cast(NoiseEffect, effect).change_of_readings(everywhere))) / found.sd
+    if isinstance(effect, Dropouts) and effect.lost:
+        return effect.distance
     if name in searched.certain:
         step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of_effect(name)]
         return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(law.n_kept)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
 
@@ -12,6 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
+from probewise.diagnosis.fitting.fit import Fit, Model, fit_each_start
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.sensor_prior import (
     SensorPrior,
@@ -20,11 +21,18 @@ from probewise.diagnosis.fitting.sensor_prior import (
     sensor_from_samples,
 )
 from probewise.diagnosis.joining import join
+from probewise.diagnosis.noise.law import white_noise_of_recording
+from probewise.diagnosis.noise.models import rough_sd
+from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.diagnosis.residuals.outlying import LostReadings, find_lost_readings
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import NamedEffect, NoiseEffect
+from probewise.effects.faults import LARGEST_SIZE
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording, require_patterns_described
 from probewise.sensor import Stage
+
+_WILD = 5.0  # spans of the middle 80 % of the readings from their median: no scale of a prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +96,12 @@ class Prepared:
 
     @property
     def has_too_little_data(self) -> bool:
-        """Whether the readings are too few for a verdict, or all equal; those at an end of the range do not count."""
+        """Whether the readings are too few for a verdict, or all equal; those at an end of the range do not count.
+
+        Those left out as lost do: which they are, the others tell.
+        """
         n_informative = len(self.usable_rows) - int(self.recording.censored[self.usable_rows].sum())
+        n_informative += len(self.recording.left_out)
         return n_informative < self.least_readings or self.has_only_equal_readings
 
     def expand_usable_to_all_rows(self, values: FloatArray) -> FloatArray:
@@ -119,5 +131,39 @@ def prepare(
         null = sensor_from_samples(sensor)
     rows = rows_to_diagnose(everything)
     recording = everything if len(rows) == len(everything) else everything.take(rows)
-    effects = apparatus.effects(recording, null)
+    lost = _lost_readings(recording, null, apparatus) if recording.usable.sum() >= LEAST_READINGS else None
+    if lost is None:
+        return Prepared(recording, apparatus.effects(recording, null), null, apparatus, everything)
+    effect = lost.effect(recording)
+    everything = replace(lost, rows=rows[lost.rows]).left_out_of(everything)
+    recording = everything if len(rows) == len(everything) else everything.take(rows)
+    effects = {**apparatus.effects(recording, null), effect.name: effect}
     return Prepared(recording, effects, null, apparatus, everything)
+
+
+def _lost_readings(recording: Recording, null: Null | None, apparatus: Apparatus) -> LostReadings | None:
+    """Find lost readings about the null, or about one Gaussian with a prior scaled to readings that are not far out.
+
+    Nothing is fitted unless a reading differs from the two before or after it by more than widest outliers do.
+    """
+    rough, readings = rough_sd(recording), recording.readings
+    usable = np.flatnonzero(recording.usable)
+    if np.abs(np.diff(readings[usable], 2)).max() <= LARGEST_SIZE * rough:
+        return None
+    low, middle, high = np.quantile(readings[usable], [0.1, 0.5, 0.9])
+    wild = np.flatnonzero(recording.usable & (np.abs(readings - middle) > _WILD * (high - low)))
+    if null is None:
+        kept = replace(recording, left_out=(*recording.left_out, *wild.tolist()))
+        null, starts = apparatus.null_forms(kept).one_gaussian_and_starts()
+    else:
+        starts = null.starts
+    model = Model(null, (), recording.plan)
+    law = replace(white_noise_of_recording(recording), lost=np.isin(usable, wild))
+    first = min(fit_each_start(model, recording, list(starts), law), key=lambda found: found.objective)
+    if not np.isfinite(first.objective):
+        return None
+
+    def covariates(found: Fit) -> Sequence[Covariate]:
+        return apparatus.covariates_and_predicted_slope(found, recording)[0]
+
+    return find_lost_readings(model, recording, first, [], covariates, sd=rough)

@@ -328,6 +328,15 @@ class Recording(ShowsItself):
         """Declared noise sd of each reading relative to the median, (n_points,): here 1; a subclass may differ."""
         return np.ones(len(self.plan))
 
+    @property
+    def weighting_in_words(self) -> str:
+        """The sds by which `rms` weights residuals, as written after its unit: here ""; a subclass may differ."""
+        return ""
+
+    def rms(self, residuals: FloatArray) -> float:
+        """Return the rms of the usable readings' residuals, (n_usable,), as if all had the median of declared sds."""
+        return float(np.sqrt(np.mean((residuals / self.relative_sd[self.usable]) ** 2)))
+
     @cached_property
     def censored(self) -> BoolArray:
         """Mask of the readings that only say that the signal is at or beyond an end, (n_points,): here none."""

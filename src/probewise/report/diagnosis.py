@@ -171,6 +171,7 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         )
     if diagnosis.repair.changes_predictions:
         beside = " (beside the random walk of the zero)" if diagnosis.repair.after.has_walk else ""
+        beside = f"{diagnosis.recording.weighting_in_words}{beside}"
         left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after{beside}"
         model = diagnosis.apparatus.words.model
         only_here = f". The unknown part is corrected in these readings only; {model} does not contain it"
@@ -439,6 +440,7 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
         if "gain.svg" in drawn
         else (paragraph(_why_nothing_held_out(diagnosis)),)
     )
+    unit = f"{unit}{diagnosis.recording.weighting_in_words}"
     held = f"{_signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)} per reading"
     rms = f"{gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} {unit} after the repair"
     repaired = (("log evidence gained", f"{number_text(gain.log_evidence, 1)} nats"), ("rms of the residuals", rms))

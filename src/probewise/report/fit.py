@@ -22,7 +22,8 @@ def summary_sentence(fit: SystemFit) -> str:
     """Summarise a fit of a simulator in one sentence: number of readings, and rms of the residuals."""
     unit = unit_name(fit.recording.plan.instrumentation.unit)
     n = int(fit.recording.usable.sum())
-    return f"The simulator fits {n} readings with residuals of {fit.rms:.3g} {unit} (rms)."
+    rms = f"{fit.rms:.3g} {unit} (rms){fit.recording.weighting_in_words}"
+    return f"The simulator fits {n} readings with residuals of {rms}."
 
 
 def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:

@@ -225,6 +225,11 @@ class RunRecording(Recording):
         table = cast(RunTable, self.plan)
         return relative_sds_of_column(table, self.sd_column)
 
+    @property
+    def weighting_in_words(self) -> str:
+        """The column of sds by which `rms` weights residuals, as written after its unit; "" without one."""
+        return f" (weighted by {self.sd_column})" if self.sd_column else ""
+
     @cached_property
     def usable(self) -> BoolArray:
         """Rows whose reading is present and within the declared range or at its ends, rounded, (n_points,)."""

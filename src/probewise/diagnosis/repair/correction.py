@@ -130,7 +130,7 @@ def improvement_and_correction(
             heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
             heldout_sd=math.hypot(gain.heldout_sd, held.sd),
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
-            rms_after=float(np.sqrt(np.mean(residuals_beside_walk(found.residuals, problem.law) ** 2))),
+            rms_after=searched.prepared.recording.rms(residuals_beside_walk(found.residuals, problem.law)),
             p_value_after=bayes_factor_p_value(
                 problem,
                 searched.template_banks_for_global_test(best.fit.found),

@@ -24,8 +24,8 @@ class Improvement:
     """The gain of the repaired model over the null.
 
     `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading,
-    `heldout_by_scan` the mean by part; rms residuals in the unit of the readings, beside a random walk if the noise has
-    one; `p_value_after` of the global test of the repaired model.
+    `heldout_by_scan` the mean by part; rms residuals (`Recording.rms`) in the unit of the readings, beside a random walk
+    if the noise has one; `p_value_after` of the global test of the repaired model.
     """
 
     log_evidence: float
@@ -62,7 +62,7 @@ def improvement_of(
     """
     null = test.null
     law = best.evidence[noise].likeliest_law
-    rms = [float(np.sqrt(np.mean(residuals_beside_walk(found.residuals, law) ** 2))) for found in shown]
+    rms = [searched.prepared.recording.rms(residuals_beside_walk(found.residuals, law)) for found in shown]
     log_evidence = best.evidence[noise].log_z - null.evidence[searched.certain].log_z
     if best is null:
         return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value_after=test.p_value)

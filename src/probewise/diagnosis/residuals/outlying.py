@@ -31,6 +31,8 @@ FAR_OUT = ", far out"
 
 _BY_CHANCE = 0.05  # probability that noise alone has such a reading in a recording
 _CLUSTERED = 3.0  # nats for a share of outlying readings that depends on a covariate
+_NO_CHANCE = 1e-6  # the same, of a reading of which a note is worth while
+_BENT = 2.0  # noise sds: rms of the residuals from which single readings may have bent a fit
 _N_BLOCKS = 5
 _C_STEPS = 4
 _RARELY = 0.1  # share of successive readings that are equal, above which equal ones are no sign of a lost value
@@ -86,16 +88,13 @@ class LostReadings:
 
     def left_out_of(self, recording: Recording) -> Recording:
         """Return the recording with these readings left out, and a note that says so."""
-        first = ", ".join(f"row {row + 2} ({recording.readings[row]:.6g})" for row in self.rows[:3].tolist())
-        more = f" and {len(self.rows) - 3} more" if len(self.rows) > 3 else ""
+        n, far = len(self.rows), _rounded(float(self.in_sds.min()))
         note = (
-            f"{count_with_noun(len(self.rows), 'reading')} left out as lost: {first}{more}, {self.in_sds.min():.3g} noise "
-            f"sds or more from what the others say; {_percent(self.share)} of the sum of squared residuals would be "
-            "theirs; correct or empty such cells"
+            f"{count_with_noun(n, 'reading')} left out as lost: {rows_in_words(recording, self.rows)}, {far} noise sds "
+            f"{'or more ' if n > 1 else ''}from a fit to the others, with {_percent(self.share)} of the squared residuals; "
+            "correct such cells or empty them"
         )
-        return replace(
-            recording, left_out=(*recording.left_out, *self.rows.tolist()), notes=(*recording.notes, note)
-        )
+        return replace(recording, left_out=(*recording.left_out, *self.rows.tolist()), notes=(*recording.notes, note))
 
     def effect(self, recording: Recording) -> Dropouts:
         """Return the effect on the noise that lost them."""
@@ -104,11 +103,11 @@ class LostReadings:
         return Dropouts.of_lost_readings(recording.readings[self.rows], n, distance, unit)
 
 
-def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float) -> IntArray:
+def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float = _BY_CHANCE) -> IntArray:
     """Return the residuals, by number, that are improbable among so many if the others tell mean and noise.
 
     Each is the largest by its deletion residual (a Student t, to first order exact at any leverage) when those before
-    it are left out; at most a fifth of all. `chance` is the probability of any under white noise.
+    it are left out; at most a fifth of all. `chance` is that of any under white noise.
     """
     residual, slopes = law(found.residuals), law(found.slopes)
     if not (np.isfinite(residual).all() and np.isfinite(slopes).all()):
@@ -140,13 +139,15 @@ def find_lost_readings(
     first: Fit,
     starts: Sequence[FloatArray],
     covariates: Callable[[Fit], Sequence[Covariate]],
+    *,
+    sd: float = math.inf,
 ) -> LostReadings | None:
     """Find single readings so far from a fit to the others that even the widest outlying noise is improbable.
 
     The fit is one of least trimmed squares (Rousseeuw 1984), which a fifth of the readings cannot bend, however far out
     they are. A reading is lost if it also stands out from its neighbours in the run, so that neither a jump nor a bend
     explains it, and if such readings do not cluster in a covariate (`covariates` of a fit). Nothing is fitted unless a
-    residual of the fit `first`, to all readings, is improbable.
+    residual of the fit `first`, to all readings, is improbable, or their rms is over twice a noise sd known without it.
 
     Returns
     -------
@@ -154,8 +155,8 @@ def find_lost_readings(
     """
     law, usable = white_noise_of_recording(recording), np.flatnonzero(recording.usable)
     n_most, size = int(MOST_OUTLYING * len(usable)), np.abs(law(first.residuals))
-    far_out = size.max(initial=0.0) > LARGEST_SIZE * np.median(size) / 0.6745
-    if not far_out and not improbable_rows(first, law, chance=_BY_CHANCE).size:
+    may_be_bent = float(np.sqrt(np.mean(size**2))) > _BENT * sd or size.max() > LARGEST_SIZE * np.median(size) / 0.6745
+    if not may_be_bent and not improbable_rows(first, law).size:
         return None
     found = _least_trimmed_fit(model, recording, [first.z, *starts], law, n_most)
     if found is None:
@@ -165,7 +166,9 @@ def find_lost_readings(
     known = replace(law, lost=aside)
     apart = np.diff(residual)[(np.diff(run) == 0) & ~aside[1:] & ~aside[:-1]]
     spread = [np.median(np.abs(residual))] + ([np.median(np.abs(apart)) / math.sqrt(2)] if apart.size > 2 else [])
-    kept = recording.with_readings(np.where(np.isin(np.arange(len(recording)), usable[~aside]), recording.readings, np.nan))
+    kept = recording.with_readings(
+        np.where(np.isin(np.arange(len(recording)), usable[~aside]), recording.readings, np.nan)
+    )
     sd = max(float(min(spread)) / 0.6745, sd_floor(kept))
     slopes = known(found.slopes) / sd
     told = np.linalg.solve(slopes.T @ slopes + np.eye(slopes.shape[1]), (found.slopes / law.sd[:, None] / sd).T)
@@ -248,5 +251,30 @@ def _row_order(run: IntArray) -> list[Covariate]:
     return [Covariate("row", everything.astype(np.float64), everything), *([within] if n_runs > 1 else [])]
 
 
+def note_on_improbable_rows(found: Fit, recording: Recording) -> tuple[str, ...]:
+    """Say in one note which single rows carry the residuals of a fit, if readings so far out are no noise."""
+    law, usable = white_noise_of_recording(recording), np.flatnonzero(recording.usable)
+    at = improbable_rows(found, law, chance=_NO_CHANCE)
+    if not at.size:
+        return ()
+    squares = (found.residuals / law.sd) ** 2
+    carry, bend = ("carries", "bends") if len(at) == 1 else ("carry", "bend")
+    return (
+        f"{rows_in_words(recording, usable[at])} {carry} {_percent(float(squares[at].sum() / squares.sum()))} of the "
+        f"squared residuals and {bend} the fit; correct or empty cells that hold no reading; probewise diagnose tells "
+        "outlying readings from effects",
+    )
+
+
+def rows_in_words(recording: Recording, rows: IntArray) -> str:
+    """Write rows (counted from 0) as a table counts them, its header being row 1, with their readings."""
+    first = ", ".join(f"row {row + 2} ({recording.readings[row]:.6g})" for row in rows[:3].tolist())
+    return first + (f" and {len(rows) - 3} more" if len(rows) > 3 else "")
+
+
 def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
+    return f"{100 * share:.0f} %" if share < 0.995 else "nearly all"
+
+
+def _rounded(number: float) -> str:
+    return f"{number:,.0f}" if number < 1e6 else f"{number:.1g}"

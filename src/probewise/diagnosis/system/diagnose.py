@@ -151,8 +151,9 @@ def prepare_system(
         found.model,
         recording,
         found,
-        system.starts,
+        list(system.starts),
         lambda fitted: first.covariates_and_predicted_slope(fitted, recording)[0],
+        sd=sd,
     )
     effect = None if lost is None else lost.effect(recording)
     if lost is not None:

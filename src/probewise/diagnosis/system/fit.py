@@ -21,6 +21,7 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node, sample_model
+from probewise.diagnosis.residuals.outlying import note_on_improbable_rows
 from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls, noise_sd_about_given_null
 from probewise.diagnosis.search.refits import Refits
@@ -81,8 +82,8 @@ class SystemFit(ShowsItself):
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals, in the unit of the readings."""
-        return float(np.sqrt(np.nanmean(self.residuals**2)))
+        """Root mean square of the residuals, in the unit of the readings; weighted where a column holds their sds."""
+        return self.recording.rms(self.residuals[self.recording.usable])
 
     def summary(self) -> str:
         """Describe the fit in plain text."""
@@ -90,7 +91,8 @@ class SystemFit(ShowsItself):
         how = f" ({self.evidence.reason})" if self.evidence.reason else ""
         error = f" ± {self.evidence.error:.2f}" if self.evidence.error else ""
         lines = [
-            f"{int(self.recording.usable.sum())} readings, rms of the residuals {self.rms:.4g} {unit}",
+            f"{int(self.recording.usable.sum())} readings, rms of the residuals {self.rms:.4g} {unit}"
+            f"{self.recording.weighting_in_words}",
             f"log evidence {self.evidence.log_z:.2f}{error} nats by {self.evidence.method}{how}",
             f"noise sd of a reading {np.median(own.noise_sd):.4g} {unit}",
         ]
@@ -160,9 +162,11 @@ def fit_simulator(
             prepared, null, noise, samples, evidence, rng=rng, progress=progress
         )
     recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
-    recording = replace(
-        recording, notes=(*recording.notes, *notes_on_declared_noise(simulator, np.asarray(samples.noise_sd)))
+    notes = (
+        *note_on_improbable_rows(null.found, recording),
+        *notes_on_declared_noise(simulator, np.asarray(samples.noise_sd)),
     )
+    recording = replace(recording, notes=(*recording.notes, *notes))
     predicted = samples.chain.predict(samples.theta, recording.plan)
     sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2) * recording.relative_sd**2)
     known = recorded_table_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)

@@ -129,6 +129,7 @@ class Diagnosis(ShowsItself):
             if e.probability > 0.05 and e.sentence.lower() not in self.reason.lower()
         ]
         gain, unit = self.improvement, self.recording.plan.instrumentation.unit_after_number
+        unit = f"{unit}{self.recording.weighting_in_words}"
         if self.repair.changes_predictions:
             held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats per held-out reading"
             tested = held if gain.heldout_by_scan else "no reading could be held out"

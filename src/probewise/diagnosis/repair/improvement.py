@@ -24,8 +24,8 @@ class Improvement:
     """The gain of the repaired model over the null.
 
     `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading,
-    `heldout_by_scan` the mean by part; rms residuals (`Recording.rms`) in the unit of the readings, beside a random walk
-    if the noise has one; `p_value_after` of the global test of the repaired model.
+    `heldout_by_scan` the mean by part; rms residuals (`Recording.rms`) in the unit of the readings, beside a random
+    walk if the noise has one; `p_value_after` of the global test of the repaired model.
     """
 
     log_evidence: float

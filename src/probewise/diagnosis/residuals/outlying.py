@@ -91,8 +91,8 @@ class LostReadings:
         n, far = len(self.rows), _rounded(float(self.in_sds.min()))
         note = (
             f"{count_with_noun(n, 'reading')} left out as lost: {rows_in_words(recording, self.rows)}, {far} noise sds "
-            f"{'or more ' if n > 1 else ''}from a fit to the others, with {_percent(self.share)} of the squared residuals; "
-            "correct such cells or empty them"
+            f"{'or more ' if n > 1 else ''}from a fit to the others, with {_percent(self.share)} of the squared "
+            "residuals; correct such cells or empty them"
         )
         return replace(recording, left_out=(*recording.left_out, *self.rows.tolist()), notes=(*recording.notes, note))
 

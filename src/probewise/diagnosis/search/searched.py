@@ -18,6 +18,7 @@ from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
+from probewise.diagnosis.residuals.outlying import outlier_probabilities
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.weighed_fit import (
@@ -27,9 +28,10 @@ from probewise.diagnosis.search.weighed_fit import (
     noise_effects_in_vocabulary,
     or_impossible,
 )
-from probewise.effects import PROPOSAL, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects import PROPOSAL, Outliers, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
 
+_BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
 _NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, as a smaller misfit beside it would
 
 
@@ -125,6 +127,27 @@ class Evidences:
                     alone[not effects_out_of_vocabulary(names)].append(evidence.log_z)
         return max(alone[True], default=-math.inf) > max(alone[False], default=math.inf)
 
+    def only_outlying_readings_differ(self, prior: PriorOdds, certain: Names) -> bool:
+        """Return whether effects on the mean that beat outlying readings change no other readings than those.
+
+        Outlying readings are beyond doubt then without an effect. Jumps before the last reading, or delays past the
+        first, are many ways to say the same; the others differ by less than the three nats that tell aliases apart.
+        """
+        noise = tuple(sorted({Outliers.name, *certain}))
+        nulls = [fit for (_, names), fit in self.fits.items() if not names and {noise, certain} <= fit.evidence.keys()]
+        if not nulls:
+            return False
+        null = max(nulls, key=lambda fit: fit.evidence[noise].log_z)
+        least, law = null.evidence[noise].log_z, null.evidence[noise].likeliest_law
+        odds = prior.log_prior_on_noise((Outliers.name,), alone=True) - prior.log_prior_on_noise((), alone=True)
+        rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
+        if not rivals or not least - max(fit.evidence[certain].log_z for fit in nulls) + odds > _BEYOND_DOUBT:
+            return False
+        narrow = 1 - outlier_probabilities(null.found.residuals, law)
+        sd = float(law.likeliest_sigma(law(null.found.residuals)[:, None])[0])
+        apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
+        return all(0.5 * float(narrow @ change**2) < ALIASED_NATS for change in apart)
+
     @property
     def _simplest_noise(self) -> Names:
         """Names of the noise model with the fewest effects."""
@@ -182,17 +205,22 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
     n_forms
         Number of fitted SSF orders, with equal prior probability.
     """
+    outlying = evidences.only_outlying_readings_differ(prior, certain)
     log_z: dict[tuple[Names, Names], float] = {}
     for (_, names), fit in evidences.fits.items():
+        if names and outlying:
+            continue
         for noise, evidence in fit.evidence.items():
             log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), or_impossible(evidence.log_z)))
     log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
+        if names and outlying:
+            continue
         # A named effect remains named if a smaller unknown one is left.
         key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
         value = or_impossible(value) + prior.log_prior_with_unknown(names)
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
-    for (names, noise), value in evidences.screened.items():
+    for (names, noise), value in evidences.screened.items() if not outlying else ():
         log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
 
     def log_prior_on_noise(noise: Names, *, alone: bool) -> float:

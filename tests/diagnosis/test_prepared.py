@@ -13,11 +13,12 @@ from probewise.diagnosis.prepared import prepare
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
-from probewise.recordings import Recording, paper_plan
+from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import Circle
 from probewise.sensor import SSFField, mixture_parameter_names
 
 SENSOR: Apparatus = LightSensorApparatus()
+RNG = np.random.default_rng(4)
 
 
 def recording(n=408):
@@ -33,6 +34,22 @@ def test_effects_are_those_that_could_show_here():
     assert "orientation_error" not in prepared.effects  # the SSF takes it up
     assert prepared.noise_effect_names >= {"outliers", "drifting_noise"}
     assert not prepared.is_thinned
+
+
+@pytest.mark.parametrize("lost", [{}, {31: 999.0}, {0: -1000.0, 50: 1e9}])
+@pytest.mark.parametrize("step", [1, 7])
+def test_readings_too_far_out_for_noise_are_left_out_and_scale_nothing(lost, step):
+    """Of 408 readings, or of about 60 with seven times the distance between them."""
+    plan = replace(paper_plan().take(np.arange(0, 408, step)), instrumentation=Instrumentation())
+    readings = 40 + 15 * np.tanh(plan.x_mm / 9) * np.cos(plan.orientation_rad) + 0.4 * RNG.standard_normal(len(plan))
+    bare = prepare(Recording(plan, readings), apparatus=SENSOR)
+    readings[list(lost)] = list(lost.values())
+    prepared = prepare(Recording(plan, readings), apparatus=SENSOR)
+    assert prepared.recording.left_out == tuple(lost)
+    assert prepared.everything.readings[list(lost)].tolist() == list(lost.values())
+    assert Extent.of(prepared.recording).span == pytest.approx(Extent.of(bare.recording).span, rel=0.2)
+    known = getattr(prepared.effects["dropouts"], "lost", ())
+    assert known == tuple(lost.values())
 
 
 def test_too_little_is_few_readings_or_equal_ones():

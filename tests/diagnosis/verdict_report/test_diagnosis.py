@@ -40,7 +40,9 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
     )
     found = replace(
         FOUND,
-        recording=SimpleNamespace(plan=SimpleNamespace(instrumentation=SimpleNamespace(unit_after_number="V"))),
+        recording=SimpleNamespace(
+            plan=SimpleNamespace(instrumentation=SimpleNamespace(unit_after_number="V")), weighting_in_words=""
+        ),
         report=replace(FOUND.report, effects=effects),
         repair=repair,
     )

@@ -77,7 +77,9 @@ def test_lost_readings_at_the_end_of_the_range_are_no_stop():
     lost = np.random.default_rng(6).random(_N) < 0.08
     prepared = _prepared(lambda y: np.where(lost, 9.0, y))
     assert prepared.apparatus.stop is None
-    assert prepared.recording.usable.all()
+    assert prepared.apparatus.lost is not None
+    assert {*prepared.apparatus.lost.lost} == {9.0}
+    assert len(prepared.recording.left_out) == lost.sum()
 
 
 @pytest.mark.slow

@@ -146,8 +146,9 @@ def find_lost_readings(
 
     The fit is one of least trimmed squares (Rousseeuw 1984), which a fifth of the readings cannot bend, however far out
     they are. A reading is lost if it also stands out from its neighbours in the run, so that neither a jump nor a bend
-    explains it, and if such readings do not cluster in a covariate (`covariates` of a fit). Nothing is fitted unless a
-    residual of the fit `first`, to all readings, is improbable, or their rms is over twice a noise sd known without it.
+    explains it, or has the very value of one that is; and if such readings do not cluster in a covariate (`covariates`
+    of a fit). Nothing is fitted unless a residual of the fit `first`, to all readings, is improbable, or their rms is
+    over twice a noise sd that is known without it.
 
     Returns
     -------
@@ -174,7 +175,10 @@ def find_lost_readings(
     told = np.linalg.solve(slopes.T @ slopes + np.eye(slopes.shape[1]), (found.slopes / law.sd[:, None] / sd).T)
     unknown = np.sqrt(1 + np.einsum("ij,ji->i", found.slopes / law.sd[:, None] / sd, told))
     size = np.abs(_beyond_neighbours(residual, run, aside)) / (sd * unknown)
-    far = aside & (size > -LARGEST_SIZE * ndtri(0.5 * _BY_CHANCE / len(usable)))
+    by_chance = -ndtri(0.5 * _BY_CHANCE / len(usable))
+    far = aside & (size > LARGEST_SIZE * by_chance)
+    readings = recording.readings[usable]
+    far |= aside & (size > by_chance) & np.isin(readings, readings[far])  # lost to one value, nearer to what was there
     if not far.any() or _cluster(far, recording, [*covariates(found), *_row_order(run)]):
         return None
     squares = residual**2

@@ -138,11 +138,12 @@ class Evidences:
         if not nulls:
             return False
         null = max(nulls, key=lambda fit: fit.evidence[noise].log_z)
-        least, law = null.evidence[noise].log_z, null.evidence[noise].likeliest_law
+        least = null.evidence[noise].log_z
         odds = prior.log_prior_on_noise((Outliers.name,), alone=True) - prior.log_prior_on_noise((), alone=True)
         rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
         if not rivals or not least - max(fit.evidence[certain].log_z for fit in nulls) + odds > _BEYOND_DOUBT:
             return False
+        law = null.evidence[noise].likeliest_law
         narrow = 1 - outlier_probabilities(null.found.residuals, law)
         sd = float(law.likeliest_sigma(law(null.found.residuals)[:, None])[0])
         apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)

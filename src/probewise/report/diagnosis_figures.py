@@ -220,6 +220,7 @@ def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) 
         lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * float(chance.sd.mean()))
         lost &= np.abs(residuals) > _LOST * float(chance.sd.mean())
         residuals[lost] = np.nan
+        lost[list(recording.left_out)] = True
         if name == "dropouts":
             return lambda ax: lost_readings_against_predicted(
                 diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax

@@ -139,6 +139,10 @@ class Apparatus(Protocol):
         """
         ...
 
+    def settings_of(self, plan: Plan) -> FloatArray:
+        """Return what a person sets, and so may repeat, of each row of a plan, (n_points, n_settings): no readings."""
+        ...
+
     @property
     def takes_one_measurement_at_a_time(self) -> bool:
         """Whether a plan holds one of the candidate measurements only, since its file would not keep two apart."""

@@ -15,7 +15,7 @@ import numpy as np
 from probewise._arrays import own_arithmetic
 from probewise._kinds import require_like, require_progress, require_rng
 from probewise.diagnosis.advice.next_scans import NextMeasurement
-from probewise.diagnosis.advice.rivals import choose_next_measurement
+from probewise.diagnosis.advice.rivals import choose_next_measurement, is_settled
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
@@ -143,7 +143,8 @@ def diagnosis_of_search(
         improvement, change = improvement_and_correction(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
     progress("choosing the next readings")
-    asked = choose_next_measurement(searched, test.null)
+    unknown_shows_in = next(iter(where), None) if judged.verdict == "unknown" else None
+    asked = choose_next_measurement(searched, test.null, unknown_shows_in=unknown_shows_in)
     noise = noise_found(searched, best, drawn.best, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)
@@ -161,7 +162,7 @@ def diagnosis_of_search(
         repair=repair_of(prepared, best, drawn, change),
         where=where,
         next_measurement=asked,
-        report=VerdictReport(reason, found, noise, weighings, remainder, formula),
+        report=VerdictReport(reason, found, noise, weighings, remainder, formula, is_settled=is_settled(searched)),
         apparatus=prepared.apparatus,
     )
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from probewise._display import ShowsItself
-from probewise.diagnosis import Diagnosis
+from probewise.diagnosis import SETTLED, Diagnosis
 from probewise.recordings.plan import Recording
 
-SURE = 0.95  # probability from which a hypothesis is settled
+SURE = SETTLED
+"""Probability from which a hypothesis is settled."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from probewise.diagnosis import (
     ALARM,
     MOST_READINGS,
     TO_SEPARATE,
-    WORTHWHILE_NATS,
     Alias,
     Diagnosis,
     EffectFound,
@@ -271,18 +270,15 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if plan is None and diagnosis.judged.too_little:
         cure = diagnosis.apparatus.words.find_signal
         return f"{cure[:1].upper()}{cure[1:]}, and take more readings."
+    if plan is None and diagnosis.report.is_settled:
+        return "Nothing more is needed."
     if plan is None:
-        return "No measurement that this apparatus can take would tell more."
+        return "No readings that can be taken here would settle what is open."
     told = plan.expected_log_bayes_factor
     asked = count_with_noun(len(plan.plan), "reading")
     if not isinstance(diagnosis.apparatus, SimulatorApparatus) or diagnosis.apparatus.tells_duration:
         asked += f", about {duration_text(plan.minutes)}"
     description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
-    if told < WORTHWHILE_NATS:
-        return (
-            f"Nothing that is worth the time: the best plan of up to {MOST_READINGS} readings has an expected log "
-            f"Bayes factor of {number_text(told, 1)} nats. It is in {file}: {description} ({asked})."
-        )
     said = f"{description}: {asked}, {file}."
     rivals = [_hypothesis_label_in_words(label, _names_by_spoken_name(diagnosis)) for label in plan.between]
     classes = [join_lists([rivals[k] for k in own], "or") for own in plan.classes_among(plan.effects)]

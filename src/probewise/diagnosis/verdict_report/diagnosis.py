@@ -26,7 +26,8 @@ class VerdictReport:
     """The verdict in words and numbers: reason, effects, noise, log evidences, and what named effects do not explain.
 
     `weighings` are log evidences by Laplace's approximation and by nested sampling, if they were computed. `remainder`
-    (a misfit after the repair) and `formula` are None if there is none.
+    (a misfit after the repair) and `formula` are None if there is none. `is_settled`: whether one hypothesis on the mean
+    has a probability of .95 or more.
     """
 
     reason: str
@@ -35,6 +36,7 @@ class VerdictReport:
     weighings: tuple[Weighing, ...] = ()
     remainder: Remainder | None = None
     formula: Formula | None = None
+    is_settled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,7 @@ class Diagnosis(ShowsItself):
     where
         Places (ranges of covariates) of the repair's effects, largest first, then of other significant residuals.
     next_measurement
-        The next measurement to make; None if none would be informative.
+        The next measurement to make; None if no question is open, or no readings would answer it.
     report
         The verdict in words, and the numbers of effects and noise.
     apparatus

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from probewise._words import count_with_noun
+from probewise._words import count_with_noun, unit_after_number, value_with_sd
 from probewise.diagnosis import (
     ALARM,
     MOST_READINGS,
@@ -25,7 +25,6 @@ from probewise.diagnosis.repair.repair import Repair
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import name_without_copy_suffix, spoken_name
-from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import covariate_in_words_and_unit, term_family_in_words
 from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
@@ -49,7 +48,6 @@ from probewise.report.words import (
     range_text,
     rounded_count_text,
     typeset_numbers,
-    unit_name,
 )
 
 __all__ = ["encoded_figures", "page_html", "sections", "summary_sentence"]
@@ -153,7 +151,7 @@ def _walk_note(diagnosis: Diagnosis) -> str:
 
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """List pairs of a reader's question and its answer in words: what to measure next, what was found, ..."""
-    gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
+    gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
         ("What was found", _as_sentence(diagnosis, _reason_in_words(diagnosis))),
@@ -422,7 +420,7 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
 
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
+    gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
     shown = (
         (
             figure(
@@ -469,7 +467,7 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
     rows = (
-        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value_and_interval_texts(p))
+        (p.name.replace("_", " "), "" if p.unit == "1" else unit_after_number(p.unit), *_value_and_interval_texts(p))
         for p in noise.parameters
     )
     beside = ", the random walk aside" if diagnosis.repair.after.has_walk else ""
@@ -533,7 +531,7 @@ def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> t
 
 
 def _unit_text(found: ParameterFound) -> str:
-    return "" if found.unit == "1" else unit_name(found.unit)
+    return "" if found.unit == "1" else unit_after_number(found.unit)
 
 
 def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:

@@ -194,9 +194,7 @@ def measurement_at_place(
     plan, apparatus
         The plan already measured, and the apparatus that can measure more.
     """
-    commands = apparatus.candidate_measurements(
-        plan, strides=_STRIDES, level=null.model.predict(null.z[None, :])[0]
-    )
+    commands = apparatus.candidate_measurements(plan, strides=_STRIDES, level=null.model.predict(null.z[None, :])[0])
     if not commands or place.values is None:
         return None
     usable = np.flatnonzero(everything.usable)

@@ -81,9 +81,7 @@ def _if_enough(asked: NextMeasurement | None) -> NextMeasurement | None:
     return asked if asked is not None and asked.expected_log_bayes_factor >= ENOUGH_NATS else None
 
 
-def _fits_of_open_hypotheses(
-    searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]
-) -> list[WeighedFit]:
+def _fits_of_open_hypotheses(searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]) -> list[WeighedFit]:
     """Return the refits of the fewest hypotheses on the mean that hold .95, at most five, the most probable first."""
     found: list[WeighedFit] = []
     held = 0.0

@@ -26,8 +26,8 @@ class VerdictReport:
     """The verdict in words and numbers: reason, effects, noise, log evidences, and what named effects do not explain.
 
     `weighings` are log evidences by Laplace's approximation and by nested sampling, if they were computed. `remainder`
-    (a misfit after the repair) and `formula` are None if there is none. `is_settled`: whether one hypothesis on the mean
-    has a probability of .95 or more.
+    (a misfit after the repair) and `formula` are None if there is none. `is_settled`: whether one hypothesis on the
+    mean has a probability of .95 or more.
     """
 
     reason: str

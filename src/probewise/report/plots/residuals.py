@@ -27,7 +27,7 @@ from probewise.report.plots.canvas import (
     stack_of_axes,
 )
 from probewise.report.residual_means import ResidualMeans, running_mean_curve
-from probewise.report.words import number_text, number_unsigned_zero, unit_name
+from probewise.report.words import number_text, number_unsigned_zero
 
 BEFORE, AFTER = "as calibrated", "repaired"
 _CROWDED = 500  # number of dots from which they are paler
@@ -146,7 +146,7 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)
     ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)
-    label_axes(ax, x="reading number", y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
+    label_axes(ax, x="reading number", y=f"reading ({recording.plan.instrumentation.unit_after_number})")
     set_plain_tick_labels(ax)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return ax

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import EffectFound, Hypothesis
+from probewise.diagnosis.effect_words import EFFECTS_IN_WORDS, effect_in_words
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.effects import EFFECTS, NUISANCES, VOCABULARY
 from probewise.recordings import Instrumentation
-from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words
 from probewise.report.headline import MOST_WORDS, headline
 
 NAMES = sorted(VOCABULARY)
@@ -86,7 +86,7 @@ def test_a_headline_has_twenty_words_at_most_and_no_name_of_code():
 
 def test_every_effect_has_words_of_its_own():
     for name in (*EFFECTS, *NUISANCES):
-        assert name in EFFECTS_IN_WORDS, f"say {name} in words in report/effect_words.py"
+        assert name in EFFECTS_IN_WORDS, f"say {name} in words in diagnosis/effect_words.py"
     assert len(set(EFFECTS_IN_WORDS.values())) == len(EFFECTS_IN_WORDS)
 
 

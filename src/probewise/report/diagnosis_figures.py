@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, IntArray
 from probewise._words import unit_after_number
 from probewise.diagnosis import Diagnosis, Place
+from probewise.diagnosis.effect_words import hypothesis_in_words
 from probewise.recordings import Plan
 from probewise.report.covariate import axis_label, covariate_values_by_place
 from probewise.report.covariate_view import (
@@ -20,7 +21,6 @@ from probewise.report.covariate_view import (
     view_along_place_covariate,
     view_along_scan,
 )
-from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
     heldout_gain_by_scan,
     hypothesis_probabilities,
@@ -36,7 +36,7 @@ from probewise.report.plots import (
     stack_of_axes,
     svg,
 )
-from probewise.report.plots.residuals import AFTER, BEFORE
+from probewise.report.plots.residuals import BEFORE
 from probewise.report.plots.verdict import n_further_lines
 from probewise.systems import RunTable
 
@@ -141,6 +141,7 @@ def _draw_means_along(
         each=(at, diagnosis.repair.before.residuals) if each else None,
         window=view.window,
         names=names,
+        after=diagnosis.repair.after_in_words,
         ax=ax,
     )
 
@@ -165,7 +166,8 @@ def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     walking = ", with the walk" if after.has_walk else ""
-    models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in ((BEFORE, before), (AFTER, after))]
+    named = ((BEFORE, before), (diagnosis.repair.after_in_words, after))
+    models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in named]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = plan.instrumentation.unit_after_number
     models = models if diagnosis.repair.changes_predictions else models[:1]
@@ -190,7 +192,10 @@ def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
-    models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
+    models = [
+        (BEFORE, diagnosis.repair.before.residuals),
+        (diagnosis.repair.after_in_words, diagnosis.repair.after.residuals),
+    ]
     time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
     covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.repair.before.readings))
     return svg(

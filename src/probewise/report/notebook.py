@@ -10,6 +10,7 @@ from probewise._display import render_html
 from probewise._words import count_with_noun, unit_after_number, unit_of_name
 from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
+from probewise.diagnosis.effect_words import effect_in_words, hypothesis_in_words
 from probewise.experiment import Exploration, Step
 from probewise.investigation import Investigation
 from probewise.nested import NestedResult, Weighted
@@ -20,7 +21,6 @@ from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
 from probewise.report import fit as fit_report
 from probewise.report import investigation as investigation_report
-from probewise.report.effect_words import effect_in_words, hypothesis_in_words
 from probewise.report.html import Markup, element, figure, paragraph, table
 from probewise.report.plots import (
     corner_plot,

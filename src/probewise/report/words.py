@@ -55,10 +55,13 @@ def digits_of_range(low: float, high: float, least: int) -> int:
     return min(max(math.floor(math.log10(largest)) - math.floor(math.log10(width)) + 2, least), 15)
 
 
-def range_text(low: float, high: float) -> str:
-    """Write the ends of a range to four significant digits, or as many as tell them apart; one number if equal."""
-    if math.isclose(low, high, rel_tol=1e-12):
-        return f"{low:.4g}"
+def range_text(low: float, high: float, scale: float = 0.0) -> str:
+    """Write the ends of a range to four significant digits, or as many as tell them apart; one number if equal.
+
+    Ends within a thousandth of `scale`, the spread of all values, are equal.
+    """
+    if high - low <= max(1e-3 * scale, 1e-12 * max(abs(low), abs(high))):
+        return f"{low:.{digits_of_range(low, low + 0.01 * scale, 4)}g}"
     digits = digits_of_range(low, high, 4)
     return f"{low:.{digits}g} to {high:.{digits}g}"
 

@@ -16,6 +16,7 @@ from probewise.diagnosis.advice.next_scans import (
     measurement_separating_rivals,
 )
 from probewise.diagnosis.apparatus import Apparatus
+from probewise.diagnosis.effect_words import effect_in_words, hypothesis_in_words
 from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
 from probewise.diagnosis.fitting.fit import residual_degrees_of_freedom
 from probewise.diagnosis.names import Names
@@ -23,7 +24,6 @@ from probewise.diagnosis.residuals.locate import Place
 from probewise.diagnosis.scheduling import ENOUGH_NATS, SETTLED
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
-from probewise.effects import spoken_name
 
 _MOST_RIVALS = 5
 _TRIED = 3  # insignificant effects to try as a rival, until some reading could detect one
@@ -96,7 +96,7 @@ def _fits_of_open_hypotheses(searched: Searched, null: WeighedFit, ranked: Mappi
 
 
 def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> Rival:
-    label = " with ".join(map(spoken_name, candidate.names)) or as_calibrated
+    label = hypothesis_in_words(candidate.names, nothing=as_calibrated)
     return Rival(label, candidate.found.model, candidate.found.z, _covariance_root_of_fit(candidate), probability)
 
 
@@ -127,7 +127,7 @@ def _rival_with_undetected_effect(searched: Searched, null: WeighedFit, name: st
         if np.linalg.norm(prediction_change(z)) <= _LEFT * _UNDETECTED * null.whitened_sd:
             root = np.zeros((len(z), len(z)))  # its size is fixed
             root[: len(found.z), : len(found.z)] = _covariance_root_of_fit(null)
-            return Rival(f"{spoken_name(name)} too weak to be detected so far", model, z, root, 0.0)
+            return Rival(f"{effect_in_words(name)}, too weak to be detected so far", model, z, root, 0.0)
         setting[amplitudes] /= 4
     return None
 

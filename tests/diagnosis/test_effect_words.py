@@ -2,7 +2,7 @@
 
 import pytest
 
-from probewise.report.effect_words import effects_in_words, hypothesis_in_words, join_lists
+from probewise.diagnosis.effect_words import effects_in_words, hypothesis_in_words, join_lists
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ def found(
         p_value=p_value,
         improvement=SimpleNamespace(p_value_after=after),
         effects=tuple(named) if combination != ("unknown",) else (),
+        where=(),
         hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
         judged=SimpleNamespace(
             unknown_shares=shares or {},
@@ -165,3 +166,12 @@ def test_equal_readings_are_no_signal():
     diagnosis = found("cannot_tell", few=True)
     diagnosis.recording.readings[:] = 7.0
     assert headline(diagnosis) == "All 408 readings are equal: there is no signal to diagnose."
+
+
+def test_a_headline_has_the_size_and_the_date_where_they_fit():
+    diagnosis = found("named", ("ambient_step",))
+    sentence = "the reading rises by -247 ± 28 at 1898 ± 1 year"
+    diagnosis.effects = (EffectFound("ambient_step", 0.9, 9.0, sentence, ()),)
+    assert headline(diagnosis) == "The reading rises by −247 ± 28 at 1898 ± 1 year."
+    diagnosis.effects = (EffectFound("ambient_step", 0.9, 9.0, " ".join([sentence] * 3), ()),)
+    assert headline(diagnosis).startswith("The model leaves out")

@@ -252,7 +252,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     said = f"{description}: {asked}, {file}."
     classes = [join_lists([plan.between[k] for k in own], "or") for own in plan.classes_among(plan.effects)]
     separated = " from ".join(classes) if len(classes) == 2 else join_lists(classes)
-    nats = number_text(told, 0 if told >= 10 else 1)
+    nats = "more than 100" if told > 100 else number_text(told, 0 if told >= 10 else 1)  # no one needs more
     return f"{said[:1].upper()}{said[1:]} Expected to separate {separated} by {nats} nats."
 
 

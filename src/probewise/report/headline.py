@@ -16,6 +16,7 @@ from probewise.diagnosis.effect_words import (
     join_names,
 )
 from probewise.diagnosis.residuals.bases import MEMORY, PRODUCTS, SCAN_ENDS
+from probewise.diagnosis.verdict_report.reason import covariate_of_unknown
 from probewise.effects import PROPOSAL, RARE_EFFECTS
 from probewise.report.covariate import covariate_in_words_and_unit
 from probewise.report.words import typeset_numbers
@@ -90,7 +91,9 @@ def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
 def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
-    covariate = _covariate_with_article(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
+    family = top.partition(", ")[0].removesuffix(" within scans")
+    shows_in = covariate_of_unknown(top, [place.covariate for place in diagnosis.where])
+    covariate = _covariate_with_article(diagnosis, shows_in if family in ("time", "row") and shows_in else family)
     known = effects_in_words([e.name for e in diagnosis.effects if e.probability >= _SURE])
     short = "Something is missing that no known effect explains"
     plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short
@@ -100,6 +103,8 @@ def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
         said = [f"Outlying readings cluster in {covariate}: something is missing there that no known effect explains."]
     else:
         said = [f"{plain}; it depends most on {covariate}."] if top else []
+    if shows_in:
+        said += [f"{one}; it shows most in {_covariate_with_article(diagnosis, shows_in)}." for one in (plain, short)]
     return [*said, f"{plain}.", f"{short}."]
 
 

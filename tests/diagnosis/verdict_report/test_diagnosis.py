@@ -7,6 +7,7 @@ import pytest
 
 from probewise.diagnosis import Diagnosis, Judged, VerdictReport
 from probewise.diagnosis.judgement.judged import Hypothesis
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.verdict_report.document import _weighing_json
 from probewise.diagnosis.verdict_report.findings import EffectFound
@@ -34,8 +35,9 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
         changes_predictions=False,
         by_rows=False,
         improvement=None,
+        after_in_words="repaired",
         combination_shares={twice: 1.0},
-        effects_in_all_samples=("lag",),
+        shares_in_words="two waves in the readings",
         unstated_effects=lambda stated: (),
     )
     found = replace(
@@ -43,8 +45,6 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
         recording=SimpleNamespace(plan=SimpleNamespace(instrumentation=SimpleNamespace(unit_after_number="V"))),
         report=replace(FOUND.report, effects=effects),
         repair=repair,
+        apparatus=LightSensorApparatus(),
     )
     assert "again" not in found.summary()
-    assert "samples of the repaired model: lag in all, beside that interference with interference in 100%" in (
-        found.summary()
-    )

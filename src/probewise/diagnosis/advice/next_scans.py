@@ -13,7 +13,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial import KDTree
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
@@ -194,18 +193,15 @@ def measurement_at_place(
     plan, apparatus
         The plan already measured, and the apparatus that can measure more.
     """
+    from scipy.spatial import KDTree  # a tenth of a second, which few diagnoses need
+
     commands = apparatus.candidate_measurements(plan, strides=_STRIDES, level=null.model.predict(null.z[None, :])[0])
     if not commands or place.values is None:
         return None
     usable = np.flatnonzero(everything.usable)
-    recorded = everything.plan.take(usable)
-    inside = np.isfinite(place.values)
-    if place.scan is not None:
-        inside &= np.array(recorded.scan_names)[recorded.scan] == place.scan
-    if place.start is not None and place.end is not None:
-        inside &= (place.values >= place.start) & (place.values <= place.end)
+    inside = place.rows_among(everything.plan, usable)
     shown = np.where(inside, np.interp(place.values, place.curve_at, place.curve_mean) / sd, 0.0)
-    known = apparatus.settings_of(recorded)
+    known = apparatus.settings_of(everything.plan.take(usable))
     scale = np.ptp(known, axis=0)
     varies = scale > 0
     planned = apparatus.settings_of(apparatus.plan_of_alternatives(commands, plan))[:, varies] / scale[varies]

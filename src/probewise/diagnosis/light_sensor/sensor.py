@@ -91,6 +91,7 @@ class LightSensorApparatus:
         """Return no covariates: what an arm logs beside the readings is not known to act by products."""
         return ()
 
+    controls: ClassVar[Sequence[str]] = ()  # an arm's places are its covariates
     takes_one_measurement_at_a_time = False  # a plan names its scans
     prior_odds = staticmethod(PriorOdds.for_effects)
     covariate_of_effect = staticmethod(covariate_of_effect)

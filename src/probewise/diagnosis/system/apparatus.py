@@ -130,6 +130,11 @@ class SimulatorApparatus:
         )
 
     @property
+    def controls(self) -> tuple[str, ...]:
+        """The columns that the simulator's file declares as controls."""
+        return self.system.simulator.controls
+
+    @property
     def tells_duration(self) -> bool:
         """Whether the table says how long a measurement takes: it has a time, in a known unit."""
         return is_known_duration(self.about.table, self.system.simulator.time_unit)

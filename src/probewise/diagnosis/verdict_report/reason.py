@@ -131,13 +131,21 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
         covariate = grounds.words.covariate_in_words(grounds.family.removesuffix(FAR_OUT))
         tail = f"a test of the mean alone, which takes them for heavy-tailed noise, gives {p}"
         return f"Outlying readings cluster in {covariate}: something is missing there ({tail})."
-    likeliest = grounds.family.partition(",")[0].removesuffix(" within scans")
-    most = likeliest if likeliest in grounds.shows_in else next(iter(grounds.shows_in), "")
+    most = covariate_of_unknown(grounds.family, grounds.shows_in)
     place = f"; it shows most in {grounds.words.covariate_in_words(most)}" if most else ""
     if grounds.family == PRODUCTS:
         place = "; it varies as a product of two columns"
     what = f"Beside {join_names(effects_in_words(grounds.beside))}, something" if grounds.beside else "Something"
     return f"{what} is missing ({p}) that no named effect explains{place}."
+
+
+def covariate_of_unknown(family: str, shows_in: Sequence[str]) -> str:
+    """Return the covariate in which an unknown effect shows most: that of its most probable form, if it shows there.
+
+    If that is the time, it is the first of the covariates `shows_in`, which a control is where both say the same.
+    """
+    likeliest, first = family.partition(",")[0].removesuffix(" within scans"), next(iter(shows_in), "")
+    return likeliest if likeliest in shows_in and likeliest not in ("time", "row") else first
 
 
 def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:

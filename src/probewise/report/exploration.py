@@ -20,6 +20,7 @@ from probewise.experiment import (
     left_out_after_step,
     probability_of_length_off,
 )
+from probewise.experiment.state import stop_reason_with_checks
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
     draw_field_legend,
@@ -124,7 +125,8 @@ def live_page_html(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), 
     `picture` is a PNG. If `trust` in the sensor model is below 1, the probabilities of its possible faults follow,
     after each of the `earlier` steps and this one.
     """
-    state = "The robot works" if step.stop_reason is None else f"The robot has stopped: {step.stop_reason}"
+    reason = stop_reason_with_checks((*earlier, step))
+    state = "The robot works" if reason is None else f"The robot has stopped: {reason}"
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
     found = figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1

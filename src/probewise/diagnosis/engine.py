@@ -151,8 +151,9 @@ def diagnosis_of_search(
         improvement, change = improvement_and_correction(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
     progress("choosing the next readings")
-    unknown_shows_in = next(iter(where), None) if judged.verdict == "unknown" else None
-    asked = choose_next_measurement(searched, test.null, unknown_shows_in=unknown_shows_in)
+    asked = choose_next_measurement(
+        searched, test.null, unknown_shows_in=next(iter(where), None), is_unknown=judged.verdict == "unknown"
+    )
     noise = noise_found(searched, best, drawn.best, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)

@@ -294,7 +294,7 @@ def test_readings_are_advised_only_where_a_question_is_open(lag, play, advised):
     plan = paper_plan()
     fits = {("lag",): refit("lag", [0.5], plan), ("backlash",): refit("backlash", [0.84], plan)}
     found = searched({("lag",): lag, ("backlash",): play}, plan, fits)
-    asked = choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None)
+    asked = choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None, is_unknown=False)
     assert is_settled(found) is not advised
     assert (asked is not None) is advised
     assert asked is None or asked.expected_log_bayes_factor >= ENOUGH_NATS
@@ -305,7 +305,7 @@ def test_aliases_that_no_reading_tells_apart_leave_nothing_to_advise():
     fits = {("lag",): refit("lag", [0.5], plan), ("twin",): refit("lag", [0.5], plan)}
     fits["twin",].names = ("twin",)
     found = searched({("lag",): 0.49, ("twin",): 0.49, (): 0.02}, plan, fits)
-    assert choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None) is None
+    assert choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None, is_unknown=False) is None
 
 
 def test_the_next_readings_of_an_unknown_effect_go_where_its_residuals_lie():
@@ -327,8 +327,8 @@ def test_the_next_readings_of_an_unknown_effect_go_where_its_residuals_lie():
     )
     null = refit("lag", [0.0], plan)
     found = searched({("unknown",): 1.0}, plan, {})
-    asked = choose_next_measurement(found, null, unknown_shows_in=shown)
+    asked = choose_next_measurement(found, null, unknown_shows_in=shown, is_unknown=True)
     assert asked is not None
     assert f"scan {scan} " in asked.description + " "
     faint = replace(shown, curve_mean=np.full(2, 1e-3))
-    assert choose_next_measurement(found, null, unknown_shows_in=faint) is None
+    assert choose_next_measurement(found, null, unknown_shows_in=faint, is_unknown=True) is None

@@ -41,7 +41,7 @@ def test_what_samples_lack_is_left_open_in_its_share():
 def test_the_samples_are_told_in_words_with_their_shares():
     marks = {"lag": np.array([False, False, True, False])}
     assert repair(marks).shares_in_words == (
-        "step and outlying readings; beside that a sensor that follows slowly (75%) and nothing more (25%)"
+        "step and outlying readings; beside that a sensor that follows slowly (75 %) and nothing more (25 %)"
     )
 
 
@@ -52,7 +52,7 @@ def test_a_model_with_a_formula_in_half_of_its_samples_is_not_said_to_lack_the_c
     own = repair(marks)
     model = SimpleNamespace(absent=marks, effects=("lag", formula))
     said = replace(own, model=model).not_in_model("repaired.json")
-    assert said == "of the samples in repaired.json, 50% contain a formula for it instead"
+    assert said == "of the samples in repaired.json, 50 % contain a formula for it instead"
 
 
 def test_what_is_corrected_row_by_row_is_not_called_repaired():

@@ -89,7 +89,7 @@ class Repair:
         marks = [self.model.absent.get(name, np.zeros(1, dtype=np.bool_)) for name in named]
         share = 1.0 - float(np.mean(np.logical_and.reduce(np.broadcast_arrays(*marks)))) if marks else 0.0
         if share:
-            return f"of the samples in {model}, {share:.0%} contain a formula for it instead"
+            return f"of the samples in {model}, {100 * share:.0f} % contain a formula for it instead"
         return f"{model} does not contain it"
 
     @property
@@ -117,7 +117,7 @@ class Repair:
         if everywhere:
             opening, nothing = f"{join_names(effects_in_words(everywhere))}; beside that ", "nothing more"
         held = (
-            f"{hypothesis_in_words(names, nothing=nothing)} ({share:.0%})"
+            f"{hypothesis_in_words(names, nothing=nothing)} ({100 * share:.0f} %)"
             for names, share in self.combination_shares.items()
         )
         return opening + join_lists([*held])

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_mapping
-from probewise._words import unit_after_number, value_with_sd
+from probewise._words import unit_after_number
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.errors import ParameterError

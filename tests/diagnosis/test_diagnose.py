@@ -183,7 +183,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()
-    assert "backlash fits these readings best" in found.reason
+    assert "backlash (play) of the arm fits these readings best" in found.reason
     assert found.repaired.effects == ()
     assert found.hypotheses[0].probability > 0.7
 

@@ -78,7 +78,7 @@ def test_a_recording_without_effects_is_clean():
     assert found.combination == ()
     assert found.p_value > 0.01
     assert found.repaired.theta.shape == (500, 8)
-    assert document["next_measurement"]["readings"] >= 1
+    assert document["next_measurement"] is None  # no other hypothesis has a probability worth a reading
     assert found.report.noise.parameters[0].interval95[0] < NOISE_SD < found.report.noise.parameters[0].interval95[1]
 
 
@@ -183,7 +183,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()
-    assert "backlash fits these readings best" in found.reason
+    assert "backlash (play) of the arm fits these readings best" in found.reason
     assert found.repaired.effects == ()
     assert found.hypotheses[0].probability > 0.7
 
@@ -459,26 +459,3 @@ def test_all_that_is_likely_is_a_rival_in_the_noise_of_the_first(monkeypatch):
     assert len(rivals) >= min(len(likely), 5)
     assert sd == pytest.approx(NOISE_SD, rel=0.1)
     assert np.std(found.repair.before.residuals) > 1.2 * NOISE_SD
-
-
-@pytest.mark.slow
-def test_where_nothing_is_found_a_rival_is_imagined_that_would_have_been_seen_here(monkeypatch):
-    (null, imagined), _, found = asked_about(monkeypatch, recording("paper", seed=2))
-    assert found.verdict == "clean"
-    assert null.model.names == ()
-    assert len(imagined.model.names) == 1
-    assert imagined.probability == 0.0
-    apart = (imagined.model.predict(imagined.z[None, :]) - null.model.predict(null.z[None, :]))[0] / NOISE_SD
-    assert 1.5 < np.linalg.norm(apart) < 6.0
-
-
-@pytest.mark.slow
-def test_what_is_imagined_is_not_ruled_out_by_the_readings_taken(monkeypatch):
-    """One edge in little noise: the sensor takes up nearly all, and what takes it up is no straight line."""
-    edge = noise_free("paper")
-    edge = edge.take(np.flatnonzero(edge.plan.scan == 0))
-    noise = 0.005 * np.random.default_rng(3).standard_normal(len(edge))
-    rivals, sd, _ = asked_about(monkeypatch, dataclasses.replace(edge, readings=edge.readings + noise))
-    null, imagined = (rival.model.predict(rival.z[None, :])[0] for rival in rivals)
-    assert rivals[1].label.endswith("too weak to be detected so far")
-    assert 0.5 < np.linalg.norm(imagined - null) / sd < 6.5

@@ -9,6 +9,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from probewise._words import value_with_sd
 from probewise.diagnosis.verdict_report.findings import parameters_found
 from probewise.effects import (
     RARE_EFFECTS,
@@ -47,7 +48,7 @@ from probewise.effects import (
 from probewise.effects.motion import orientation_deg, sign_of_motion
 from probewise.effects.origin import CountsFromOrigin, Origin
 from probewise.effects.patches import distinct_scan_lines
-from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples, value_with_sd
+from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times

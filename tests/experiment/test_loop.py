@@ -704,3 +704,13 @@ def test_an_only_place_that_tells_nothing_is_refused(small):
     with pytest.raises(ParameterError, match="no reading within reach is expected to tell anything"):
         run(arm, small.experiment(shape=far, grid=ONE_PLACE), rng=rng())
     assert arm.poses == []
+
+
+def test_a_run_that_went_on_to_check_its_sensor_says_both(found):
+    whole, _ = found
+    steps = [replace(step, checks_sensor=k >= len(whole.steps) - 3) for k, step in enumerate(whole.steps)]
+    steps[-1] = replace(steps[-1], checks_sensor=False)
+    assert replace(whole, steps=tuple(steps)).stop_reason == (
+        "every length is known to better than 4 mm; 2 readings were taken with that known, to check what the sensor "
+        "model may leave out"
+    )

@@ -503,6 +503,7 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     ]
     known = [step.number for step in steps if step.largest_sd_mm < 4.0 and step.chance_off < 0.01]
     assert known[0] < steps[-1].number
+    assert [step.number for step in steps if step.checks_sensor] == known[:-1]
     assert steps[-1].map.label == NAMES
     assert steps[-1].map.highest_utility < ENOUGH_BITS
     assert left_out_after_step(steps[-1], 0.9).credible_set == ("ambient_step",)

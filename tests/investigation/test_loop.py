@@ -60,7 +60,7 @@ def test_it_ends_as_soon_as_one_hypothesis_is_settled(diagnosed):
     calls = diagnosed(diagnosis(0.6), diagnosis(0.97))
     rounds = rounds_of()
     assert [each.settled for each in rounds] == [False, True]
-    assert rounds[-1].stop_reason == "lag has probability 0.970"
+    assert rounds[-1].stop_reason == "a sensor that follows slowly: probability 0.970"
     assert [len(recordings) for recordings, _ in calls] == [1, 2]
     assert rounds[1].reason_for_readings == "take it again"
 

@@ -10,8 +10,6 @@ from mixtures import fixed_mixture
 
 from probewise.diagnosis import (
     EffectFound,
-    Hypothesis,
-    Judged,
     ParameterFound,
     Place,
     audit_plan_of_diagnosis,
@@ -291,13 +289,13 @@ def test_a_held_out_part_is_called_a_run_only_if_it_is_one():
     assert called("part 1 of 5", "part 2 of 5") == "part"
 
 
-def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():
-    plan = SimpleNamespace(plan=range(8), minutes=1.2, description="scan again", expected_log_bayes_factor=0.04)
-    words = SimpleNamespace(next_plan="next_plan.csv")
-    found = SimpleNamespace(next_measurement=plan, apparatus=SimpleNamespace(words=words))
-    said = page._next_readings_in_words(found)
-    assert said.startswith("Nothing that is worth the time: the best plan of up to")
-    assert "factor of 0.0 nats. It is in next_plan.csv: scan again (8 readings, about 1 minute)." in said
+@pytest.mark.parametrize(
+    ("settled", "said"),
+    [(True, "Nothing more is needed."), (False, "No readings that can be taken here would settle what is open.")],
+)
+def test_where_no_readings_are_advised_the_page_says_why(settled, said):
+    report, judged = SimpleNamespace(is_settled=settled), SimpleNamespace(too_little=False)
+    assert page._next_readings_in_words(SimpleNamespace(next_measurement=None, report=report, judged=judged)) == said
 
 
 def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
@@ -321,27 +319,11 @@ def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
     assert other.endswith("by 12 nats.")
 
 
-def test_rivals_are_told_in_words_and_a_formula_keeps_its_blanks():
-    formula = "formula:reading:outlet_c:exp(7.46 (flow - 0.4626))"
-    known = {formula: formula, "offset per run": "offset_per_run"}
-    said = page._hypothesis_label_in_words(f"{formula} with lag", known)
-    assert said == "a term exp(7.46 (flow - 0.4626)) in outlet_c and a sensor that follows slowly"
-    assert page._hypothesis_label_in_words("offset per run", known) == "an offset of its own in each run"
-    assert page._hypothesis_label_in_words("interference with interference", {}) == "two waves in the readings"
-
-
-def test_names_in_a_reason_are_said_in_words():
-    hypotheses = (
-        Hypothesis(("correlated_noise", "cubic:v:x", "forcing:v"), 0.5),
-        Hypothesis(("correlated_noise", "cubic:v:x", "input_offset:u_v"), 0.5),
+def test_a_range_far_narrower_than_all_values_is_one_number():
+    values = np.append(np.linspace(10.0, 60.0, 9), [57.636938104, 57.636938115])
+    place = dataclasses.replace(place_of("level", 0.0), start=57.636938104, end=57.636938115, values=values)
+    plan = SimpleNamespace(instrumentation=SimpleNamespace(unit="LEGO"))
+    found = SimpleNamespace(
+        apparatus=SimpleNamespace(words=SimpleNamespace(run="scan")), recording=SimpleNamespace(plan=plan)
     )
-    judged = Judged("named", ("cubic:v:x",), 1e-9, hypotheses, shared=("correlated_noise", "cubic:v:x"))
-    reason = "Beside that, these 9 readings cannot tell apart forcing:v (0.50) and input_offset:u_v (0.50)."
-    found = SimpleNamespace(reason=reason, hypotheses=hypotheses, judged=judged)
-    said = "Beside that, these 9 readings cannot tell apart a constant force on v (0.50) and an offset of u_v (0.50)."
-    assert page._reason_in_words(found) == said
-
-
-def test_a_time_constant_in_days_is_called_tau():
-    assert page._parameter_label(ParameterFound("tau_s", "day", 3.0, 0.1, (2.8, 3.2))) == "tau"
-    assert page._parameter_label(ParameterFound("offset_mm", "mm", 3.0, 0.1, (2.8, 3.2))) == "offset"
+    assert "predicted reading, 57.64 LEGO units (p" in page._place_caption(found, place)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import EffectFound, Hypothesis
+from probewise.diagnosis.effect_words import EFFECTS_IN_WORDS, effect_in_words
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.effects import EFFECTS, NUISANCES, VOCABULARY
 from probewise.recordings import Instrumentation
-from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words
 from probewise.report.headline import MOST_WORDS, headline
 
 NAMES = sorted(VOCABULARY)
@@ -43,6 +43,7 @@ def found(
         p_value=p_value,
         improvement=SimpleNamespace(p_value_after=after),
         effects=tuple(named) if combination != ("unknown",) else (),
+        where=(),
         hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
         judged=SimpleNamespace(
             unknown_shares=shares or {},
@@ -86,7 +87,7 @@ def test_a_headline_has_twenty_words_at_most_and_no_name_of_code():
 
 def test_every_effect_has_words_of_its_own():
     for name in (*EFFECTS, *NUISANCES):
-        assert name in EFFECTS_IN_WORDS, f"say {name} in words in report/effect_words.py"
+        assert name in EFFECTS_IN_WORDS, f"say {name} in words in diagnosis/effect_words.py"
     assert len(set(EFFECTS_IN_WORDS.values())) == len(EFFECTS_IN_WORDS)
 
 
@@ -165,3 +166,12 @@ def test_equal_readings_are_no_signal():
     diagnosis = found("cannot_tell", few=True)
     diagnosis.recording.readings[:] = 7.0
     assert headline(diagnosis) == "All 408 readings are equal: there is no signal to diagnose."
+
+
+def test_a_headline_has_the_size_and_the_date_where_they_fit():
+    diagnosis = found("named", ("ambient_step",))
+    sentence = "the reading rises by -247 ± 28 at 1898 ± 1 year"
+    diagnosis.effects = (EffectFound("ambient_step", 0.9, 9.0, sentence, ()),)
+    assert headline(diagnosis) == "The reading rises by −247 ± 28 at 1898 ± 1 year."
+    diagnosis.effects = (EffectFound("ambient_step", 0.9, 9.0, " ".join([sentence] * 3), ()),)
+    assert headline(diagnosis).startswith("The model leaves out")

@@ -88,6 +88,13 @@ def test_small_residuals_are_labelled_in_full():
     assert all("0.000" in label or label == "0" or "10⁻" in label for label in labels)
 
 
+@pytest.mark.parametrize(("window", "shaded"), [((2.0, 3.0), True), ((0.5, 9.5), False)])
+def test_only_a_part_of_the_axis_stands_out(window, shaded):
+    x = np.linspace(0.0, 10.0, 200)
+    ax = plots.mean_residuals_along(mean_residuals(x, np.sin(x), None, sd=1.0), label="X", unit="V", window=window)
+    assert ("stands out here" in ax.get_legend_handles_labels()[1]) is shaded
+
+
 def test_a_hundred_thousand_dots_stay_a_small_file():
     rng = np.random.default_rng(0)
     cloud = [("as calibrated", rng.standard_normal(100_000))]

@@ -4,13 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from probewise._words import unit_of_name
 from probewise.report.words import (
     digits_of_range,
     duration_text,
     interval_text,
     range_text,
     rounded_count_text,
-    unit_of,
     value_and_interval_texts,
     value_with_error,
     words_without_unit,
@@ -60,9 +60,9 @@ def test_ends_that_lie_close_together_are_written_with_the_digits_that_tell_them
 
 
 def test_a_parameters_unit_is_told_once():
-    assert (words_without_unit("rectangle.width_mm"), unit_of("rectangle.width_mm")) == ("rectangle width", "mm")
-    assert (words_without_unit("angle_rad"), unit_of("angle_rad")) == ("angle", "rad")
-    assert (words_without_unit("A_1"), unit_of("A_1")) == ("A 1", "")
+    assert (words_without_unit("rectangle.width_mm"), unit_of_name("rectangle.width_mm")) == ("rectangle width", "mm")
+    assert (words_without_unit("angle_rad"), unit_of_name("angle_rad")) == ("angle", "rad")
+    assert (words_without_unit("A_1"), unit_of_name("A_1")) == ("A 1", "")
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.repair import PredictionAndResiduals, Repair
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.residuals.locate import ALARM, Place
-from probewise.diagnosis.scheduling import MOST_READINGS, WORTHWHILE_NATS
+from probewise.diagnosis.scheduling import MOST_READINGS, SETTLED
 from probewise.diagnosis.search.thorough import weigh_thoroughly
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.system.audit import audit_system
@@ -47,8 +47,8 @@ __all__ = [
     "CURE_PLAN",
     "MOST_READINGS",
     "NEXT_PLAN",
+    "SETTLED",
     "TO_SEPARATE",
-    "WORTHWHILE_NATS",
     "Alias",
     "Cure",
     "DetectableSize",

@@ -69,6 +69,11 @@ class Apparatus(Protocol):
         """Whether the order of rows is that of recording, as far as readings tell."""
         ...
 
+    @property
+    def controls(self) -> Sequence[str]:
+        """Covariates that a person sets and has declared as such."""
+        ...
+
     def effects(self, recording: Recording, null: Null | None) -> Mapping[str, NamedEffect[Any]]:
         """Return the vocabulary scaled to a recording, by name, without effects that could not be detectable there."""
         ...
@@ -137,6 +142,10 @@ class Apparatus(Protocol):
 
         In a run that is yet to be recorded such a value is known by its prior alone.
         """
+        ...
+
+    def settings_of(self, plan: Plan) -> FloatArray:
+        """Return what a person sets, and so may repeat, of each row of a plan, (n_points, n_settings): no readings."""
         ...
 
     @property

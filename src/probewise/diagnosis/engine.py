@@ -15,11 +15,12 @@ import numpy as np
 from probewise._arrays import own_arithmetic
 from probewise._kinds import require_like, require_progress, require_rng
 from probewise.diagnosis.advice.next_scans import NextMeasurement
-from probewise.diagnosis.advice.rivals import choose_next_measurement
+from probewise.diagnosis.advice.rivals import choose_next_measurement, is_settled
+from probewise.diagnosis.effect_words import hypothesis_in_words
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
-from probewise.diagnosis.judgement.judged import Hypothesis, Judged, judge
+from probewise.diagnosis.judgement.judged import Judged, judge
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.prepared import Prepared, prepare
@@ -37,7 +38,14 @@ from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agr
 from probewise.diagnosis.verdict_report.beyond import formula_of, remainder_of
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
-from probewise.diagnosis.verdict_report.reason import ALL, NOTHING_MORE, Grounds, combinations_in_reason, reason_of
+from probewise.diagnosis.verdict_report.reason import (
+    ALL,
+    NOTHING,
+    NOTHING_MORE,
+    Grounds,
+    combinations_in_reason,
+    reason_of,
+)
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.effects.vocabulary import require_effect_classes, sentence_from_samples
 from probewise.progress import Progress, silent
@@ -143,7 +151,9 @@ def diagnosis_of_search(
         improvement, change = improvement_and_correction(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
     progress("choosing the next readings")
-    asked = choose_next_measurement(searched, test.null)
+    asked = choose_next_measurement(
+        searched, test.null, unknown_shows_in=next(iter(where), None), is_unknown=judged.verdict == "unknown"
+    )
     noise = noise_found(searched, best, drawn.best, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)
@@ -161,7 +171,7 @@ def diagnosis_of_search(
         repair=repair_of(prepared, best, drawn, change),
         where=where,
         next_measurement=asked,
-        report=VerdictReport(reason, found, noise, weighings, remainder, formula),
+        report=VerdictReport(reason, found, noise, weighings, remainder, formula, is_settled=is_settled(searched)),
         apparatus=prepared.apparatus,
     )
 
@@ -212,10 +222,10 @@ def _separating_readings_in_words(
     formulas = {names for names in asked.effects if effects_out_of_vocabulary(names)} - on_mean if asked else set()
     for names in told:
         if names == ("unknown",):  # without a formula it predicts what the null does
-            named |= dict.fromkeys(formulas or {()}, "unknown")
+            named |= dict.fromkeys(formulas or {()}, hypothesis_in_words(names))
         else:
             beside = tuple(sorted({*names} - {*judged.shared}))
-            label = Hypothesis(beside, 0.0).label if beside or not judged.shared else NOTHING_MORE
+            label = hypothesis_in_words(beside, nothing=NOTHING_MORE if judged.shared else NOTHING)
             named.setdefault(tuple(sorted({*names} - searched.prepared.noise_effect_names)), label)
     if len(named) < 2:
         return None, ""

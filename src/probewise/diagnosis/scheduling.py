@@ -11,8 +11,12 @@ from probewise._arrays import IntArray
 from probewise.recordings.plan import Plan
 
 MOST_READINGS = 102
-WORTHWHILE_NATS = 0.5
-"""Expected log Bayes factor below which further readings separate nothing that is worth their time."""
+SETTLED = 0.95
+"""Probability from which a hypothesis, or the fewest that hold it, leave no question open."""
+ENOUGH_NATS = 3.0
+"""Expected log Bayes factor that tells two hypotheses apart, as odds of 20 to 1; readings for less are not advised."""
+NOTHING_NATS = 0.5
+"""Expected log Bayes factor below which readings do not tell two hypotheses apart at all: they are aliases."""
 
 
 class Command(Protocol):

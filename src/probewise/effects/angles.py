@@ -8,10 +8,11 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_words
 from probewise.effects.motion import candidate_scan_groups, scan_indicator
-from probewise.effects.vocabulary import single_column_bank, value_with_sd
+from probewise.effects.vocabulary import single_column_bank
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 

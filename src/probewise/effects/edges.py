@@ -10,11 +10,12 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.patches import gaussian_bump
-from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, single_column_bank
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.recordings.plan import Plan

@@ -9,9 +9,10 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import FittedReadings
-from probewise.effects.vocabulary import NoiseEffect, value_with_sd
+from probewise.effects.vocabulary import NoiseEffect
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage

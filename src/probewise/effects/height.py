@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Self
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_words
 from probewise.effects.motion import candidate_scan_groups, scan_indicator
 from probewise.effects.origin import CountsPlaceFromOrigin
-from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import footprint_at_added_height
 from probewise.sensor.stages import Footprint, Stage

@@ -9,9 +9,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.change_points import ChangePointEffect, candidate_change_times_s
 from probewise.effects.extent import Extent
-from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 

@@ -10,8 +10,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
-from probewise.effects.vocabulary import NoiseEffect, value_with_sd
+from probewise.effects.vocabulary import NoiseEffect
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage

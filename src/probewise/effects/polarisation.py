@@ -8,9 +8,9 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 

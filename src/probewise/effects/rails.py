@@ -10,12 +10,13 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.motion import distinct_positions_mm
 from probewise.effects.origin import CountsPlaceFromOrigin
-from probewise.effects.vocabulary import NamedEffect, value_with_sd
+from probewise.effects.vocabulary import NamedEffect
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, single_column_bank
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage

@@ -10,8 +10,9 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
-from probewise.effects.vocabulary import NamedEffect, value_with_sd
+from probewise.effects.vocabulary import NamedEffect
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Poses, Stage

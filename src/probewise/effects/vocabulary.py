@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_mapping
+from probewise._words import unit_after_number
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.errors import ParameterError
@@ -21,7 +22,6 @@ V = TypeVar("V")
 
 _BOTH_SIGNS = 0.05  # least share of samples of either sign
 _NEAR_ZERO, _FEW_NEAR_ZERO = 0.1, 0.01  # in medians of their sizes; of a normal distribution about 0, .054 are so near
-_LEAST_WITH_POINT = 1e-7  # a smaller sd has no two digits among eight after the point
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,8 +249,9 @@ def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
     for k in effect.amplitudes:
         if _is_of_either_sign(samples[:, k]):
             low, high = np.quantile(samples[:, k], [0.025, 0.975])
-            name, unit = effect.prior.names[k], "" if effect.units[k] == "1" else f" {effect.units[k]}"
-            sentence += f"; its size {name} may have either sign, between {low:.2g} and {high:.2g}{unit} (95 %)"
+            between = f"between {low:.2g} and {high:.2g} {unit_after_number(effect.units[k])}".rstrip()
+            name = "size" if effect.prior.names[k] == "a" else f"size {effect.prior.names[k]}"
+            sentence += f"; its {name} may have either sign, {between} (95 %)"
     return f"{sentence} ({effect.counted_from})" if effect.counted_from else sentence
 
 
@@ -273,17 +274,3 @@ def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]
 def single_column_bank(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of one column from the parameters' values, numbers or (n_bank,): (n_bank, 1, n_params)."""
     return np.stack(np.broadcast_arrays(*parameters), axis=-1)[:, None, :].astype(np.float64)
-
-
-def value_with_sd(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:
-    """Return "mean ± sd unit", both numbers times `factor`, rounded to two significant digits of the sd."""
-    mean, sd = factor * mean, factor * sd
-    if 0 < sd < _LEAST_WITH_POINT and np.isfinite(mean):
-        digits = max(int(np.floor(np.log10(max(abs(mean), sd))) - np.floor(np.log10(sd))) + 2, 2)
-        written = f"{mean:z.{digits}g} ± {sd:.2g}"
-    elif np.isfinite(sd) and sd > 0:
-        digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, 8))
-        written = f"{mean:z.{digits}f} ± {sd:.{digits}f}"  # "z": no minus sign on a rounded zero
-    else:
-        written = f"{mean:.4g}"
-    return f"{written} {unit}".rstrip()

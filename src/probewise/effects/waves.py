@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.motion import distinct_positions_mm
 from probewise.effects.origin import CountsPlaceFromOrigin, CountsTimeFromOrigin
-from probewise.effects.vocabulary import NamedEffect, V, single_column_bank, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, V, single_column_bank
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage

@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.origin import CountsTimeFromOrigin
-from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import footprint_at_added_height
 from probewise.sensor.stages import Footprint, Poses, Stage

@@ -215,6 +215,7 @@ def step(
         notes=notes,
         pace=Pace.from_readings(readings),
         arm_error=arm,
+        checks_sensor=known and asks,
     )
     return ExplorationState(readings, carried, pose, tuple(planned)), info
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind
+from probewise._words import count_with_noun
 from probewise.arm.instrument import Pose, Reading
 from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.experiment.hidden import HiddenShape
@@ -83,6 +84,8 @@ class Step(ShowsItself):
         Pace of the run so far.
     arm_error
         Effect of the arm's own error; None far from the end of a run, or if that error is not known.
+    checks_sensor
+        Whether the stopping rule is met, and the run goes on only to check what the sensor model may leave out.
     """
 
     number: int
@@ -106,6 +109,7 @@ class Step(ShowsItself):
     replayed: bool = False
     pace: Pace = field(default_factory=Pace)
     arm_error: ArmError | None = None
+    checks_sensor: bool = False
 
     @property
     def log_z(self) -> float:
@@ -144,6 +148,15 @@ class Step(ShowsItself):
             f"reading {self.number}: {self.reading.value:g} at ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"
             f"{self.orientation_and_height_text}; {believed}; {self.bits:.1f} bits"
         )
+
+
+def stop_reason_with_checks(steps: Sequence[Step]) -> str | None:
+    """Return the reason of the last step to end, or None, and how many readings before it only checked the sensor."""
+    reason, n = steps[-1].stop_reason, sum(step.checks_sensor for step in steps)
+    if reason is None or n == 0:
+        return reason
+    taken = f"{count_with_noun(n, 'reading')} {'was' if n == 1 else 'were'} taken"
+    return f"{reason}; {taken} with that known, to check what the sensor model may leave out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +229,7 @@ class Exploration(ShowsItself):
     @property
     def stop_reason(self) -> str:
         """Reason why the run ended, and the largest sd with the arm's error if the stopping rule did not count that."""
-        reason = self.last.stop_reason or "the caller ended it"
+        reason = stop_reason_with_checks(self.steps) or "the caller ended it"
         if self.arm_error is None or self.experiment.fitted_arm is not None:
             return reason
         widest = largest_sd_mm(self.last.names, self.sd)

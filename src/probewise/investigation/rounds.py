@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from probewise._display import ShowsItself
-from probewise.diagnosis import Diagnosis
+from probewise.diagnosis import SETTLED, Diagnosis
+from probewise.diagnosis.effect_words import hypothesis_in_words
 from probewise.recordings.plan import Recording
 
-SURE = 0.95  # probability from which a hypothesis is settled
+SURE = SETTLED
+"""Probability from which a hypothesis is settled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,4 +84,4 @@ def reason_if_settled(diagnosis: Diagnosis) -> str | None:
     first = diagnosis.hypotheses[0]
     if diagnosis.verdict == "cannot_tell" or first.probability < SURE:
         return None
-    return f"{first.label.replace('_', ' ')} has probability {first.probability:.3f}"
+    return f"{hypothesis_in_words(first.effects)}: probability {first.probability:.3f}"

@@ -22,6 +22,7 @@ from probewise._arrays import (
 )
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
+from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
     A_SESSION,
@@ -79,8 +80,8 @@ class Instrumentation:
 
     @property
     def unit_after_number(self) -> str:
-        """Unit of a reading as it is written after a number: "LEGO units" for "LEGO", else `unit`."""
-        return "LEGO units" if self.unit == "LEGO" else self.unit
+        """The unit as written after a number: "LEGO units" for "LEGO", nothing for "1"."""
+        return unit_after_number(self.unit)
 
     @property
     def declared_ends(self) -> tuple[float, ...]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from probewise._words import unit_after_number
 from probewise.diagnosis import EffectAudit
 from probewise.effects import spoken_name
 from probewise.report.html import Markup, table
-from probewise.report.words import number_text, unit_name
+from probewise.report.words import number_text
 
 _SIZES = {
     "albedo": "change of albedo",
@@ -78,6 +79,6 @@ def _unit_in_words(unit: str) -> str:
         return unit.removeprefix("1 ")
     upper, _, lower = unit.partition("/")
     if upper not in ("1", "LEGO", "mm"):
-        return unit_name(unit)
-    own = "" if upper == "1" else unit_name(upper)
+        return unit_after_number(unit)
+    own = "" if upper == "1" else unit_after_number(upper)
     return f"{own} per {lower}".strip() if lower else own

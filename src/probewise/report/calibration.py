@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from probewise._words import count_with_noun
+from probewise._words import count_with_noun, unit_after_number
 from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
@@ -26,7 +26,6 @@ from probewise.report.words import (
     number_text,
     number_unsigned_zero,
     typeset_numbers,
-    unit_name,
     value_and_interval_texts,
     value_with_error,
     words_without_unit,
@@ -50,7 +49,7 @@ def summary_sentence(sensor: FittedSensor) -> str:
         "on the sensor, "
         f"{number_text(widths[0], digits)} by {number_text(widths[1], digits)} mm (sd), "
         f"noise {number_text(noise_sd, decimals_to_show(noise_sd, 2))} "
-        f"{unit_name(sensor.instrumentation.unit)} per reading."
+        f"{sensor.instrumentation.unit_after_number} per reading."
     )
 
 
@@ -204,7 +203,7 @@ def ssf_centre_and_width_table(sensor: FittedSensor) -> Markup:
 
 def _printed_unit(unit: str) -> str:
     """Return a unit as the report prints it: "mm⁻²" for "mm^-2", nothing for "1", else `unit_name`."""
-    return {"mm^-2": "mm⁻²", "1": ""}.get(unit, unit_name(unit))
+    return {"mm^-2": "mm⁻²", "1": ""}.get(unit, unit_after_number(unit))
 
 
 def page_html(

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import UNITS as UNITS_OF_NAMES
+from probewise._words import unit_after_number, unit_of_name
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.report.words import unit_name
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
-SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}
-"""Units by the last part of a user's column name, such as battery_mv."""
 DIRECTIONS = {-1.0: "backwards", 0.0: "at rest", 1.0: "forwards"}
 """Names of the signs of motion."""
 WORDS = {
@@ -27,7 +26,7 @@ WORDS = {
 def covariate_in_words(name: str) -> str:
     """Return a covariate's name in words, without its unit: "battery" for battery_mv."""
     stem, _, suffix = name.rpartition("_")
-    own = stem if stem and suffix in SUFFIXES else name
+    own = stem if stem and suffix in UNITS_OF_NAMES else name
     return WORDS.get(name, own.replace("column:", "column ").replace("_", " "))
 
 
@@ -41,9 +40,8 @@ def term_family_in_words(family: str) -> str:
 
 def covariate_unit(name: str, unit: str) -> str:
     """Return the unit of a covariate, "" if none is known; `unit` is the readings' unit."""
-    known = {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}
-    stem, _, suffix = name.rpartition("_")
-    return known.get(name, SUFFIXES.get(suffix, "") if stem else "")
+    known = {**UNITS, "level": unit_after_number(unit), "slope": f"{unit_after_number(unit)} per mm"}
+    return known.get(name, unit_of_name(name))
 
 
 def covariate_in_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
@@ -52,7 +50,7 @@ def covariate_in_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, s
     if not isinstance(apparatus, SimulatorApparatus):
         return ("scan" if name == "scan" else covariate_in_words(name)), covariate_unit(name, unit)
     units = {"time": apparatus.system.simulator.time_unit, "level": unit, "previous": unit}
-    return apparatus.words.covariate_in_words(name), units.get(name, "")
+    return apparatus.words.covariate_in_words(name), units.get(name, unit_of_name(name))
 
 
 def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
@@ -60,7 +58,7 @@ def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
     said, unit = covariate_in_words_and_unit(diagnosis, name)
     run = diagnosis.apparatus.words.run
     said += f", {run} {scan}" if scan is not None and name != run else ""
-    return said + (f" ({unit_name(unit)})" if unit else "")
+    return said + (f" ({unit_after_number(unit)})" if unit else "")
 
 
 def covariate_values_by_place(diagnosis: Diagnosis) -> dict[str, FloatArray]:

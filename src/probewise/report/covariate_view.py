@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._words import unit_after_number
 from probewise.diagnosis import ALARM, Diagnosis, Place
 from probewise.effects import RARE_EFFECTS, name_without_copy_suffix
 from probewise.recordings import Plan
@@ -18,7 +19,6 @@ from probewise.report.covariate import (
     covariate_values_by_place,
 )
 from probewise.report.residual_means import ResidualMeans, mean_residuals
-from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
 _SEEN = 2.3  # sds beyond which a mean visibly leaves the band
@@ -160,7 +160,7 @@ def view_along_place_covariate(diagnosis: Diagnosis, place: Place, at: FloatArra
     unit = diagnosis.recording.plan.instrumentation.unit
     label = axis_label(diagnosis, place.covariate, place.scan)
     if place.without_effect:
-        label = f"reading to be expected without it ({unit_name(unit)})"
+        label = f"reading to be expected without it ({unit_after_number(unit)})"
     names = category_name_by_value(diagnosis, place)
     return CovariateView(at, label, names, _shaded_interval(place, at, names), place)
 
@@ -249,7 +249,7 @@ def _covariates_and_periods_to_fold(
 
 
 def _view_against_repair_change(diagnosis: Diagnosis) -> CovariateView:
-    unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
+    unit = diagnosis.recording.plan.instrumentation.unit_after_number
     return CovariateView(
         diagnosis.repair.after.readings_with_walk - diagnosis.repair.before.readings_with_walk,
         f"change that the repair makes ({unit})",

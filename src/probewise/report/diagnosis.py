@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 
-from probewise._words import count_with_noun
+import numpy as np
+
+from probewise._words import count_with_noun, unit_after_number, value_with_sd
 from probewise.diagnosis import (
     ALARM,
     MOST_READINGS,
     TO_SEPARATE,
-    WORTHWHILE_NATS,
     Alias,
     Diagnosis,
     EffectFound,
@@ -22,24 +22,21 @@ from probewise.diagnosis import (
     notes_on_calls,
     p_in_words,
 )
-from probewise.diagnosis.repair.repair import Repair
+from probewise.diagnosis.effect_words import (
+    effect_has_words,
+    effect_in_words,
+    hypothesis_in_words,
+    join_lists,
+    join_names,
+    parameter_in_words,
+)
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.thinning import rows_to_diagnose
-from probewise.effects import name_without_copy_suffix, spoken_name
-from probewise.effects.vocabulary import value_with_sd
+from probewise.effects import name_without_copy_suffix
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import category_name_by_value, covariate_in_words_and_unit, term_family_in_words
 from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
 from probewise.report.diagnosis_figures import figure_drawers, first_figure_content, noun_of_held_out_part
-from probewise.report.effect_words import (
-    EFFECTS_IN_WORDS,
-    effect_has_words,
-    effect_in_words,
-    effects_in_words,
-    hypothesis_in_words,
-    join_lists,
-    join_names,
-)
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
@@ -50,7 +47,6 @@ from probewise.report.words import (
     range_text,
     rounded_count_text,
     typeset_numbers,
-    unit_name,
 )
 
 __all__ = ["figure_drawers", "page_html", "sections", "summary_sentence"]
@@ -60,8 +56,6 @@ _MOST_PLACES = 3
 _MOST_CREDIBLE = 6
 _LIKELY = 0.05  # probability of an effect from which it has a paragraph of its own
 _CHANCE = 0.05  # p-value above which chance is a sufficient explanation
-_WEAK = " too weak to be detected so far"
-_IN_UNIT_OF_TIME = ("tau_s", "at_s")
 _NOISE_CAPTIONS = {
     "correlated_noise": "Correlation of residuals, by how many readings they lie apart.",
     "random_walk": "Correlation of residuals, by how many readings they lie apart: for a random walk it falls slowly.",
@@ -83,7 +77,9 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
         Section("What it could be", _explanation_elements(diagnosis)),
         Section("Where it shows", _place_elements(diagnosis, drawn)),
         Section(
-            "Before and after the repair" if diagnosis.repair.changes_predictions else "The model",
+            f"Before and after: as calibrated, {diagnosis.repair.after_in_words}"
+            if diagnosis.repair.changes_predictions
+            else "The model",
             _before_and_after_elements(diagnosis, drawn),
         ),
         Section("Does the repaired model predict held-out readings?", _heldout_gain_elements(diagnosis, drawn)),
@@ -138,9 +134,9 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
         return "The readings in the order of time. Below: prior probabilities; these readings do not change them."
     if isinstance(shown, str):
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
-    after = ", blue squares the repaired model" if diagnosis.repair.changes_predictions else ""
+    after = f", blue squares: {diagnosis.repair.after_in_words}" if diagnosis.repair.changes_predictions else ""
     where = f" {_place_caption(diagnosis, shown.place)}" if shown.place else ""
-    circles = f"Orange circles: the model as calibrated{after}."
+    circles = f"Orange circles: as calibrated{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
     return f"Residuals, averaged in bins. {circles}{_walk_note(diagnosis)} {band}{where} {bars}"
 
@@ -154,10 +150,11 @@ def _walk_note(diagnosis: Diagnosis) -> str:
 
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """List pairs of a reader's question and its answer in words: what to measure next, what was found, ..."""
-    gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
+    gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
+    after = diagnosis.repair.after_in_words
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
-        ("What was found", _as_sentence(diagnosis, _reason_in_words(diagnosis))),
+        ("What was found", _as_sentence(diagnosis, diagnosis.reason.partition(TO_SEPARATE)[0])),
     ]
     if diagnosis.report.formula is not None:
         facts.append(("As a formula", _formula_in_words(diagnosis.report.formula)))
@@ -172,15 +169,16 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     if diagnosis.repair.changes_predictions:
         beside = " (beside the random walk of the zero)" if diagnosis.repair.after.has_walk else ""
         beside = f"{diagnosis.recording.weighting_in_words}{beside}"
-        left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after{beside}"
-        model = diagnosis.apparatus.words.model
-        only_here = f". The unknown part is corrected in these readings only; {model} does not contain it"
-        facts.append(("Residuals", f"{left}{only_here if diagnosis.repair.by_rows else ''}."))
+        left = f"rms {gain.rms_before:.3g} {unit} as calibrated, {gain.rms_after:.3g} {unit} {after}{beside}"
+        if diagnosis.repair.by_rows:
+            lacking = diagnosis.repair.not_in_model(diagnosis.apparatus.words.model)
+            left += f". The unknown part is corrected in these readings only: {lacking}"
+        facts.append(("Residuals", f"{left}."))
     if diagnosis.repair.combination_shares:
         facts.append(
             (
                 "In the repaired model",
-                _combination_shares_in_words(diagnosis.repair, diagnosis.apparatus.words.model),
+                f"Posterior samples in {diagnosis.apparatus.words.model} contain {diagnosis.repair.shares_in_words}.",
             )
         )
     return facts
@@ -207,23 +205,6 @@ def _formula_in_words(formula: Formula) -> str:
     return typeset_numbers(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
 
 
-def _reason_in_words(diagnosis: Diagnosis) -> str:
-    """Return the verdict's reason without its sentence on the next plan, hypotheses and effects in words for names."""
-    said = diagnosis.reason.partition(TO_SEPARATE)[0]
-    for hypothesis in (*diagnosis.hypotheses, *diagnosis.judged.beside_shared):
-        if hypothesis.effects and all(map(effect_has_words, hypothesis.effects)):
-            said = _with_words_for(said, hypothesis.label, hypothesis_in_words(hypothesis.effects), before=r" \(")
-    for name in {name for hypothesis in diagnosis.hypotheses for name in hypothesis.effects if ":" in name}:
-        said = _with_words_for(said, name_without_copy_suffix(name), effect_in_words(name), before="")
-    names = "|".join(EFFECTS_IN_WORDS)
-    return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
-
-
-def _with_words_for(text: str, name: str, words: str, *, before: str) -> str:
-    """Put words for a name wherever it stands alone, as no part of a longer one, and before this pattern."""
-    return re.sub(rf"(?<![\w:+]){re.escape(name)}(?![\w:+])(?={before})", lambda _: words, text)
-
-
 def _heldout_gain_in_words(nats: float, sd: float) -> str:
     measured = f"{_signed_nats(nats, sd)} per held-out reading"
     if nats > 2 * sd:
@@ -234,18 +215,6 @@ def _heldout_gain_in_words(nats: float, sd: float) -> str:
 def _signed_nats(nats: float, sd: float) -> str:
     written = value_with_sd(nats, sd)
     return f"{typeset_numbers(written if written.startswith('-') else f'+{written}')} nats"
-
-
-def _combination_shares_in_words(repair: Repair, model: str) -> str:
-    """Say which effects all samples of the repaired model contain, and which only a share of them."""
-    everywhere, opening, nothing = repair.effects_in_all_samples, f"Posterior samples in {model} contain", "no effect"
-    if everywhere:
-        opening, nothing = f"{opening} {join_names(effects_in_words(everywhere))}; beside that", "nothing more"
-    held = (
-        f"{join_names(effects_in_words(names)) if names else nothing} ({100 * share:.0f} %)"
-        for names, share in repair.combination_shares.items()
-    )
-    return f"{opening}: {', '.join(held)}."
 
 
 def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
@@ -272,41 +241,20 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if plan is None and diagnosis.judged.too_little:
         cure = diagnosis.apparatus.words.find_signal
         return f"{cure[:1].upper()}{cure[1:]}, and take more readings."
+    if plan is None and diagnosis.report.is_settled:
+        return "Nothing more is needed."
     if plan is None:
-        return "No measurement that this apparatus can take would tell more."
+        return "No readings that can be taken here would settle what is open."
     told = plan.expected_log_bayes_factor
     asked = count_with_noun(len(plan.plan), "reading")
     if not isinstance(diagnosis.apparatus, SimulatorApparatus) or diagnosis.apparatus.tells_duration:
         asked += f", about {duration_text(plan.minutes)}"
     description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
-    if told < WORTHWHILE_NATS:
-        return (
-            f"Nothing that is worth the time: the best plan of up to {MOST_READINGS} readings has an expected log "
-            f"Bayes factor of {number_text(told, 1)} nats. It is in {file}: {description} ({asked})."
-        )
     said = f"{description}: {asked}, {file}."
-    rivals = [_hypothesis_label_in_words(label, _names_by_spoken_name(diagnosis)) for label in plan.between]
-    classes = [join_lists([rivals[k] for k in own], "or") for own in plan.classes_among(plan.effects)]
+    classes = [join_lists([plan.between[k] for k in own], "or") for own in plan.classes_among(plan.effects)]
     separated = " from ".join(classes) if len(classes) == 2 else join_lists(classes)
-    nats = number_text(told, 0 if told >= 10 else 1)
+    nats = "more than 100" if told > 100 else number_text(told, 0 if told >= 10 else 1)  # no one needs more
     return f"{said[:1].upper()}{said[1:]} Expected to separate {separated} by {nats} nats."
-
-
-def _names_by_spoken_name(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return the names of effects and formulas that a diagnosis knows, by the words for them in labels of rivals."""
-    names = {name for hypothesis in diagnosis.hypotheses for name in hypothesis.effects}
-    return {spoken_name(name): name for name in (*names, *diagnosis.judged.unknown_shares, *diagnosis.repaired.effects)}
-
-
-def _hypothesis_label_in_words(label: str, known: Mapping[str, str]) -> str:
-    """Write a hypothesis's label "A with B" in words; one with any part that is no effect's name keeps its words.
-
-    `known` are names by their words in labels, which a formula's own words cannot be told from.
-    """
-    named, weak, _ = label.partition(_WEAK)
-    names = [known.get(part, part if ":" in part else part.replace(" ", "_")) for part in named.split(" with ")]
-    said = join_names(effects_in_words(names)) if all(effect_has_words(name) for name in names) else named
-    return f"{said}, too weak to be detected so far" if weak else said
 
 
 def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -410,8 +358,10 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
 
 def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     run = diagnosis.apparatus.words.run
-    which = f"The {run} that the repair changes most" if diagnosis.repair.changes_predictions else f"One {run}"
-    colours = "orange as calibrated, blue repaired" if diagnosis.repair.changes_predictions else "orange"
+    which, colours = f"One {run}", "orange"
+    if diagnosis.repair.changes_predictions:
+        which = f"The {run} that changes most"
+        colours = f"orange as calibrated, blue {diagnosis.repair.after_in_words}"
     walk = ", each with the random walk of the zero that all readings show" if diagnosis.repair.after.has_walk else ""
     return (
         figure(
@@ -427,7 +377,7 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
 
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
+    gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
     shown = (
         (
             figure(
@@ -442,7 +392,7 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
     )
     unit = f"{unit}{diagnosis.recording.weighting_in_words}"
     held = f"{_signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)} per reading"
-    rms = f"{gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} {unit} after the repair"
+    rms = f"{gain.rms_before:.3g} {unit} as calibrated, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
     repaired = (("log evidence gained", f"{number_text(gain.log_evidence, 1)} nats"), ("rms of the residuals", rms))
     return (
         *shown,
@@ -475,8 +425,7 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
     rows = (
-        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value_and_interval_texts(p))
-        for p in noise.parameters
+        (p.name.replace("_", " "), unit_after_number(p.unit), *_value_and_interval_texts(p)) for p in noise.parameters
     )
     beside = ", the random walk aside" if diagnosis.repair.after.has_walk else ""
     return (
@@ -507,19 +456,13 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
             _effect_words_and_name(effect.name) if k == 0 else "",
             probability_text(effect.probability) if k == 0 else "",
             number_text(effect.size_lambda, 1) if k == 0 else "",
-            _parameter_label(p),
+            parameter_in_words(effect.name, p.name, p.unit),
             *(_value_and_interval_texts(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
         )
         for effect in effects
         for k, p in enumerate(effect.parameters)
     ]
     return table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
-
-
-def _parameter_label(found: ParameterFound) -> str:
-    """Name a parameter without its unit: "tau", also where the time of a table, in tau_s, is in days."""
-    own = found.name.removesuffix("_s") if found.name in _IN_UNIT_OF_TIME else found.name
-    return own.removesuffix(f"_{found.unit}").replace("_", " ")
 
 
 def _effect_words_and_name(name: str) -> str:
@@ -532,14 +475,8 @@ def _effect_words_and_name(name: str) -> str:
 def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Return two texts: a parameter's mean ± sd (with its unit if `unit`), and its 95 % interval."""
     low, high = found.interval95
-    own = _unit_text(found) if unit else ""
-    return typeset_numbers(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset_numbers(
-        range_text(low, high)
-    )
-
-
-def _unit_text(found: ParameterFound) -> str:
-    return "" if found.unit == "1" else unit_name(found.unit)
+    written = value_with_sd(found.mean, found.sd, found.unit if unit else "")
+    return typeset_numbers(written), typeset_numbers(range_text(low, high))
 
 
 def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -618,7 +555,8 @@ def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> 
     elif names := category_name_by_value(diagnosis, place):
         what = ", ".join([covariate, *(name for v, name in names.items() if place.start <= v <= place.end)])
     else:
-        what = f"{covariate}, {range_text(place.start, place.end)} {unit}".rstrip()
+        scale = 0.0 if place.values is None else float(np.nanmax(place.values) - np.nanmin(place.values))
+        what = f"{covariate}, {range_text(place.start, place.end, scale)} {unit_after_number(unit)}".rstrip()
     if place.scan and place.covariate != run:
         what += f", {run} {place.scan}"
     chance = "" if place.p_value < ALARM else ", possibly chance"

@@ -9,7 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._words import unit_after_number
 from probewise.diagnosis import Diagnosis, Place
+from probewise.diagnosis.effect_words import hypothesis_in_words
 from probewise.recordings import Plan
 from probewise.report.covariate import axis_label, covariate_values_by_place
 from probewise.report.covariate_view import (
@@ -20,7 +22,6 @@ from probewise.report.covariate_view import (
     view_along_place_covariate,
     view_along_scan,
 )
-from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
     heldout_gain_by_scan,
     hypothesis_probabilities,
@@ -36,9 +37,8 @@ from probewise.report.plots import (
     stack_of_axes,
     svg,
 )
-from probewise.report.plots.residuals import AFTER, BEFORE
+from probewise.report.plots.residuals import BEFORE
 from probewise.report.plots.verdict import n_further_lines
-from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
 _WORTH_A_BAR = 0.005
@@ -140,10 +140,11 @@ def _draw_means_along(
     return mean_residuals_along(
         chance.mean_residuals(diagnosis, view, after=after),
         label=view.label,
-        unit=unit_name(diagnosis.recording.plan.instrumentation.unit),
+        unit=diagnosis.recording.plan.instrumentation.unit_after_number,
         each=(at, diagnosis.repair.before.residuals) if each else None,
         window=view.window,
         names=names,
+        after=diagnosis.repair.after_in_words,
         ax=ax,
     )
 
@@ -168,9 +169,10 @@ def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     walking = ", with the walk" if after.has_walk else ""
-    models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in ((BEFORE, before), (AFTER, after))]
+    named = ((BEFORE, before), (diagnosis.repair.after_in_words, after))
+    models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in named]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
-    unit = unit_name(plan.instrumentation.unit)
+    unit = plan.instrumentation.unit_after_number
     models = models if diagnosis.repair.changes_predictions else models[:1]
     return svg(
         scan_with_residuals(
@@ -193,12 +195,15 @@ def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
-    models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
+    models = [
+        (BEFORE, diagnosis.repair.before.residuals),
+        (diagnosis.repair.after_in_words, diagnosis.repair.after.residuals),
+    ]
     time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
     covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.repair.before.readings))
     return svg(
         residuals_against_covariates(
-            covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_name(unit)
+            covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_after_number(unit)
         )
     )
 
@@ -214,7 +219,7 @@ def _noise_tests_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
     """Return a function that draws a noise effect's panel on axes; for other names, spread by predicted reading."""
     recording, residuals = diagnosis.recording, np.array(diagnosis.repair.after.residuals)
-    unit = unit_name(recording.plan.instrumentation.unit)
+    unit = recording.plan.instrumentation.unit_after_number
     found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
     if "share" in found and "value" in found:  # lost readings carry no information on the noise of the others
         lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * float(chance.sd.mean()))

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise._words import count_with_noun
+from probewise._words import count_with_noun, unit_after_number, unit_of_name
 from probewise.effects import spoken_name
 from probewise.experiment import (
     CLEAN,
@@ -20,6 +20,7 @@ from probewise.experiment import (
     left_out_after_step,
     probability_of_length_off,
 )
+from probewise.experiment.state import stop_reason_with_checks
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
     draw_field_legend,
@@ -30,15 +31,7 @@ from probewise.report.plots import (
     png,
     posterior_widths,
 )
-from probewise.report.words import (
-    interval_text,
-    number_text,
-    probability_text,
-    unit_name,
-    unit_of,
-    value_with_error,
-    words_without_unit,
-)
+from probewise.report.words import interval_text, number_text, probability_text, value_with_error, words_without_unit
 from probewise.scene import outlines, with_angles_near
 from probewise.scene.any_of import shape_and_columns
 
@@ -132,7 +125,8 @@ def live_page_html(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), 
     `picture` is a PNG. If `trust` in the sensor model is below 1, the probabilities of its possible faults follow,
     after each of the `earlier` steps and this one.
     """
-    state = "The robot works" if step.stop_reason is None else f"The robot has stopped: {step.stop_reason}"
+    reason = stop_reason_with_checks((*earlier, step))
+    state = "The robot works" if reason is None else f"The robot has stopped: {reason}"
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
     found = figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1
@@ -168,7 +162,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     step, truth = run.last, _truth_with_angles_near_estimate(run, truth)
     return ", ".join(
         f"{words_without_unit(_without_shape_prefix(step, name))} "
-        f"{value_with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
+        f"{value_with_error(float(mean) - truth[name], float(sd), unit_of_name(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
@@ -190,7 +184,7 @@ def summary_sentence(run: Exploration) -> str:
     found = found_shape(run)
     several = f" (probability {probability_text(found.probability)})" if run.last.shapes else ""
     known = ", ".join(
-        f"{words_without_unit(p.name)} {value_with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters
+        f"{words_without_unit(p.name)} {value_with_error(p.mean, p.sd, unit_of_name(p.name))}" for p in found.parameters
     )
     if not run.reached:
         taken = count_with_noun(len(run.steps), "reading")
@@ -214,7 +208,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
         (
             (
                 words_without_unit(p.name),
-                unit_of(p.name),
+                unit_of_name(p.name),
                 *value_with_error(p.mean, p.sd).partition(" ± ")[::2],
                 *(() if p.arm_sd is None else (f"{p.arm_sd:.2g}",)),
                 interval_text(*p.interval95),
@@ -228,7 +222,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
 
 def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
     """Build an exploration's table of steps: place, reading (in `unit`), widest posterior sd, bits so far."""
-    reading = f"reading ({unit_name(unit)})" if unit else "reading"
+    reading = f"reading ({unit_after_number(unit)})" if unit else "reading"
     return table(
         ("number", "at (mm)", reading, "widest sd (mm)", "information so far (bits)"),
         (
@@ -294,7 +288,7 @@ def page_html(
     if truth:
         facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run, truth)))
     sensor = [
-        (words_without_unit(name), unit_of(name), *value_with_error(mean, sd).partition(" ± ")[::2])
+        (words_without_unit(name), unit_of_name(name), *value_with_error(mean, sd).partition(" ± ")[::2])
         for name, (mean, sd) in run.last.sensor.items()
     ]
     learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)

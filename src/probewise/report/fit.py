@@ -8,10 +8,11 @@ from typing import cast
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import unit_after_number
 from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import recorded_against_predicted, residuals_against_covariates, svg
-from probewise.report.words import digits_of_range, number_text, typeset_numbers, unit_name
+from probewise.report.words import digits_of_range, number_text, typeset_numbers
 from probewise.systems import RunTable
 
 _MOST_COLUMNS = 6
@@ -20,7 +21,7 @@ _LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 
 def summary_sentence(fit: SystemFit) -> str:
     """Summarise a fit of a simulator in one sentence: number of readings, and rms of the residuals."""
-    unit = unit_name(fit.recording.plan.instrumentation.unit)
+    unit = fit.recording.plan.instrumentation.unit_after_number
     n = int(fit.recording.usable.sum())
     rms = f"{fit.rms:.3g} {unit} (rms){fit.recording.weighting_in_words}"
     return f"The simulator fits {n} readings with residuals of {rms}."
@@ -32,7 +33,7 @@ def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
     Residuals are drawn against time, predicted reading, and up to four input columns of eight distinct values or more.
     """
     recording, own = fit.recording, fit.fitted.simulator
-    unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
+    unit, readings = unit_after_number(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
     return {
         "predicted.svg": lambda: svg(
             recorded_against_predicted(readings, fit.predicted, fit.sd, label=own.reading, unit=unit)
@@ -48,7 +49,7 @@ def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
 def _labelled_covariates(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
     own = fit.fitted.simulator
     time = f"{plan.time} ({own.time_unit})" if plan.has_varying_time else "row of the table"
-    out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]
+    out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_after_number(own.unit)})", fit.predicted)]
     inputs = {name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd)}
     varying = {name: v for name, v in inputs.items() if len(np.unique(v[np.isfinite(v)])) >= _LEAST_VALUES}
     return (*out, *list(varying.items())[: _MOST_COLUMNS - len(out)])
@@ -72,7 +73,7 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     run = (
         ("readings", f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}"),
         ("simulator", own.simulator.source or "given in Python"),
-        ("noise sd of a reading", f"{np.median(own.noise_sd):.4g} {unit_name(own.simulator.unit)}"),
+        ("noise sd of a reading", f"{np.median(own.noise_sd):.4g} {unit_after_number(own.simulator.unit)}"),
         ("log evidence", f"{number_text(evidence.log_z, 2)}{error} nats by {evidence.method}{how}"),
         ("seed", str(seed)),
     )

@@ -8,10 +8,18 @@ import numpy as np
 
 from probewise._words import count_with_noun
 from probewise.diagnosis import ALARM, Diagnosis
+from probewise.diagnosis.effect_words import (
+    effect_in_words,
+    effects_in_words,
+    hypothesis_in_words,
+    join_lists,
+    join_names,
+)
 from probewise.diagnosis.residuals.bases import MEMORY, PRODUCTS, SCAN_ENDS
+from probewise.diagnosis.verdict_report.reason import covariate_of_unknown
 from probewise.effects import PROPOSAL, RARE_EFFECTS
 from probewise.report.covariate import covariate_in_words_and_unit
-from probewise.report.effect_words import effect_in_words, effects_in_words, hypothesis_in_words, join_lists, join_names
+from probewise.report.words import typeset_numbers
 
 MOST_WORDS = 20
 _SURE = 0.5
@@ -46,7 +54,19 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
             said = _left_out_versions(diagnosis, "The model leaves out")
             beside = [f"{one[:-1]}; besides, {either}" for one in said[:1] for either in _open_beside_shared(diagnosis)]
             complete = [" ".join([one, *more]) for one in said]
-            return [*beside, *complete[:-1], *said[:-1], complete[-1], said[-1]]  # a name before that more is missing
+            # With sizes first; a name before that more is missing.
+            told = _told_with_sizes(diagnosis)
+            versions = [*beside, *(" ".join([one, *more]) for one in told), *told]
+            return [*versions, *complete[:-1], *said[:-1], complete[-1], said[-1]]
+
+
+def _told_with_sizes(diagnosis: Diagnosis) -> list[str]:
+    """Return the sentence on the effects that the verdict states, with sizes and dates; none if one lacks it."""
+    told = {effect.name: effect.sentence for effect in diagnosis.effects if effect.sentence}
+    if not all(name in told for name in diagnosis.judged.stated):
+        return []
+    joined = diagnosis.apparatus.words.as_sentence("; ".join(told[name] for name in diagnosis.judged.stated))
+    return [typeset_numbers(f"{joined}.")]
 
 
 def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:
@@ -71,7 +91,9 @@ def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
 def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
-    covariate = _covariate_with_article(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
+    family = top.partition(", ")[0].removesuffix(" within scans")
+    shows_in = covariate_of_unknown(top, [place.covariate for place in diagnosis.where])
+    covariate = _covariate_with_article(diagnosis, shows_in if family in ("time", "row") and shows_in else family)
     known = effects_in_words([e.name for e in diagnosis.effects if e.probability >= _SURE])
     short = "Something is missing that no known effect explains"
     plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short
@@ -81,6 +103,8 @@ def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
         said = [f"Outlying readings cluster in {covariate}: something is missing there that no known effect explains."]
     else:
         said = [f"{plain}; it depends most on {covariate}."] if top else []
+    if shows_in:
+        said += [f"{one}; it shows most in {_covariate_with_article(diagnosis, shows_in)}." for one in (plain, short)]
     return [*said, f"{plain}.", f"{short}."]
 
 

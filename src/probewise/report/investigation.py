@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from probewise._words import count_with_noun
 from probewise.diagnosis import p_in_words
+from probewise.diagnosis.effect_words import hypothesis_in_words
 from probewise.effects import spoken_name
 from probewise.investigation import Investigation, Round
 from probewise.report import diagnosis as of_a_diagnosis
-from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, probabilities_by_round

@@ -7,9 +7,10 @@ import html
 import numpy as np
 
 from probewise._display import render_html
-from probewise._words import count_with_noun
+from probewise._words import count_with_noun, unit_after_number, unit_of_name
 from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
+from probewise.diagnosis.effect_words import effect_in_words, hypothesis_in_words
 from probewise.experiment import Exploration, Step
 from probewise.investigation import Investigation
 from probewise.nested import NestedResult, Weighted
@@ -20,7 +21,6 @@ from probewise.report import diagnosis as diagnosis_report
 from probewise.report import exploration as exploration_report
 from probewise.report import fit as fit_report
 from probewise.report import investigation as investigation_report
-from probewise.report.effect_words import effect_in_words, hypothesis_in_words
 from probewise.report.html import Markup, element, figure, paragraph, table
 from probewise.report.plots import (
     corner_plot,
@@ -32,7 +32,7 @@ from probewise.report.plots import (
     recorded_against_predicted,
     spatial_sensitivity,
 )
-from probewise.report.words import unit_name, unit_of, value_with_error, words_without_unit
+from probewise.report.words import value_with_error, words_without_unit
 from probewise.sensor import SSFField
 from probewise.systems import SystemPrediction
 from probewise.systems.table import RunRecording
@@ -108,7 +108,7 @@ def _weighted_html(value: Weighted) -> str:
     names = value.names[:MOST_PARAMETERS]
     believed = zip(names, value.mean(), value.sd(), strict=False)
     known = ", ".join(
-        f"{words_without_unit(n)} {value_with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed
+        f"{words_without_unit(n)} {value_with_error(float(m), float(s), unit_of_name(n))}" for n, m, s in believed
     )
     drawn = corner_plot(value, parameters=names)
     return _div(
@@ -178,7 +178,7 @@ def _diagnosis_html(value: Diagnosis) -> str:
 def _system_fit_html(value: SystemFit) -> str:
     own = value.fitted.simulator
     readings = np.where(value.recording.usable, value.recording.readings, np.nan)
-    unit = unit_name(own.unit)
+    unit = unit_after_number(own.unit)
     drawn = recorded_against_predicted(readings, value.predicted, value.sd, label=own.reading, unit=unit)
     return _div(
         paragraph(fit_report.summary_sentence(value)),
@@ -192,7 +192,7 @@ def _system_prediction_html(value: SystemPrediction) -> str:
     said = _pre(value.summary())
     if not np.isfinite(value.readings).any():
         return _div(said)
-    unit = unit_name(value.table.instrumentation.unit)
+    unit = value.table.instrumentation.unit_after_number
     drawn = recorded_against_predicted(value.readings, value.mean, value.sd, label="reading", unit=unit)
     return _div(figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."), said)
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import re
 
-from probewise._words import count_with_noun
+from probewise._words import count_with_noun, unit_of_name
 
-_UNITS = {"mm": "mm", "rad": "rad", "deg": "°", "s": "s", "counts": "counts", "mv": "mV", "v": "V"}
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -56,10 +55,13 @@ def digits_of_range(low: float, high: float, least: int) -> int:
     return min(max(math.floor(math.log10(largest)) - math.floor(math.log10(width)) + 2, least), 15)
 
 
-def range_text(low: float, high: float) -> str:
-    """Write the ends of a range to four significant digits, or as many as tell them apart; one number if equal."""
-    if math.isclose(low, high, rel_tol=1e-12):
-        return f"{low:.4g}"
+def range_text(low: float, high: float, scale: float = 0.0) -> str:
+    """Write the ends of a range to four significant digits, or as many as tell them apart; one number if equal.
+
+    Ends within a thousandth of `scale`, the spread of all values, are equal.
+    """
+    if high - low <= max(1e-3 * scale, 1e-12 * max(abs(low), abs(high))):
+        return f"{low:.{digits_of_range(low, low + 0.01 * scale, 4)}g}"
     digits = digits_of_range(low, high, 4)
     return f"{low:.{digits}g} to {high:.{digits}g}"
 
@@ -71,15 +73,9 @@ def value_and_interval_texts(value: float, low: float, high: float) -> tuple[str
     return (number_unsigned_zero(value, decimals) if high > low else f"{value:.6g}"), ends
 
 
-def unit_of(name: str) -> str:
-    """Return the unit, as written, at the end of a parameter's name: "mm" of x_mm, "°" of turn_deg; "" if none."""
-    stem, _, suffix = name.rpartition("_")
-    return _UNITS.get(suffix, "") if stem else ""
-
-
 def words_without_unit(name: str) -> str:
     """Write a parameter's name without its unit, spaces for underscores and dots."""
-    stem = name.rpartition("_")[0] if unit_of(name) else name
+    stem = name.rpartition("_")[0] if unit_of_name(name) else name
     return stem.replace("_", " ").replace(".", " ")
 
 
@@ -115,11 +111,6 @@ def duration_text(minutes: float) -> str:
 def rounded_count_text(n: float) -> str:
     """Write a number of two significant digits in full, as in "640,000"."""
     return f"{float(f'{n:.2g}'):,.0f}"
-
-
-def unit_name(unit: str) -> str:
-    """Return a unit as written after a number: "LEGO units" for "LEGO"; all others are unchanged."""
-    return "LEGO units" if unit == "LEGO" else unit
 
 
 def probability_text(p: float) -> str:

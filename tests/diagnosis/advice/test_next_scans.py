@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,15 +18,17 @@ from probewise.diagnosis.advice.next_scans import (
     measurement_separating_rivals,
     mutual_information_lower_bound,
 )
+from probewise.diagnosis.advice.rivals import choose_next_measurement, is_settled
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, excerpts_of_scan
 from probewise.diagnosis.light_sensor.scheduling import plan_of_alternatives, plan_of_sequence, scan_started_after
 from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
-from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
+from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.scheduling import ENOUGH_NATS, MOST_READINGS, rows_by_command
 from probewise.effects import VOCABULARY, Extent
-from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan
+from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 
@@ -261,3 +264,71 @@ def test_readings_without_noise_leave_a_number_beside_values_that_a_new_run_does
     first, second = (PredictiveNormal(mean, slopes) for mean in (np.zeros(3), 1e11 * np.array([0.0, 1.0, 0.0])))
     nats = mutual_information_lower_bound([first, second], np.array([0.5, 0.5]))
     assert nats == pytest.approx(np.log(2))  # two readings that must be equal are not
+
+
+def searched(probabilities, plan, fits):
+    """What a search has found: the probability of each combination on the mean, and refits of some of them."""
+    apparatus = LightSensorApparatus()
+    recording = Recording(plan, np.zeros(len(plan)))
+    prepared = SimpleNamespace(recording=recording, everything=recording, apparatus=apparatus, effects={})
+    return SimpleNamespace(
+        prepared=prepared,
+        certain=(),
+        posterior=SimpleNamespace(marginal_over_noise=probabilities),
+        best_refit_of=lambda names, certain: fits.get(names),
+    )
+
+
+def refit(name: str, settings: list[float], plan: Plan) -> SimpleNamespace:
+    own = rival(name, 0.0, settings, plan)
+    found = SimpleNamespace(model=own.model, z=own.z, slopes=np.eye(len(plan))[:, : len(own.z)])
+    return SimpleNamespace(names=(name,), found=found, whitened_sd=0.4)
+
+
+@pytest.mark.parametrize(
+    ("lag", "play", "advised"),
+    [(0.5, 0.5, True), (0.93, 0.07, True), (0.984, 0.016, False), (0.02, 0.98, False)],
+)
+def test_readings_are_advised_only_where_a_question_is_open(lag, play, advised):
+    """They would tell a lag from backlash by many nats, whatever their probabilities."""
+    plan = paper_plan()
+    fits = {("lag",): refit("lag", [0.5], plan), ("backlash",): refit("backlash", [0.84], plan)}
+    found = searched({("lag",): lag, ("backlash",): play}, plan, fits)
+    asked = choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None, is_unknown=False)
+    assert is_settled(found) is not advised
+    assert (asked is not None) is advised
+    assert asked is None or asked.expected_log_bayes_factor >= ENOUGH_NATS
+
+
+def test_aliases_that_no_reading_tells_apart_leave_nothing_to_advise():
+    plan = paper_plan()
+    fits = {("lag",): refit("lag", [0.5], plan), ("twin",): refit("lag", [0.5], plan)}
+    fits["twin",].names = ("twin",)
+    found = searched({("lag",): 0.49, ("twin",): 0.49, (): 0.02}, plan, fits)
+    assert choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None, is_unknown=False) is None
+
+
+def test_the_next_readings_of_an_unknown_effect_go_where_its_residuals_lie():
+    plan = paper_plan()
+    scan = plan.scan_names[1]
+    x = plan.x_mm.copy()
+    inside = plan.scan == 1
+    shown = Place(
+        "place",
+        scan,
+        float(x[inside].min()),
+        float(x[inside].max()),
+        1e-9,
+        9.0,
+        np.array([0.0, 999.0]),
+        np.full(2, 0.8),
+        np.full(2, 0.1),
+        values=np.where(inside, x, np.nan),
+    )
+    null = refit("lag", [0.0], plan)
+    found = searched({("unknown",): 1.0}, plan, {})
+    asked = choose_next_measurement(found, null, unknown_shows_in=shown, is_unknown=True)
+    assert asked is not None
+    assert f"scan {scan} " in asked.description + " "
+    faint = replace(shown, curve_mean=np.full(2, 1e-3))
+    assert choose_next_measurement(found, null, unknown_shows_in=faint, is_unknown=True) is None

@@ -3,13 +3,17 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from probewise.diagnosis import Diagnosis, Judged, VerdictReport
+from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, SensorAndShape, VerdictReport
 from probewise.diagnosis.judgement.judged import Hypothesis
+from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.verdict_report.document import _weighing_json
 from probewise.diagnosis.verdict_report.findings import EffectFound
+from probewise.recordings import Plan, Uniform
+from probewise.scene import Circle
 
 JUDGED = Judged("clean", (), 0.4, (Hypothesis((), 1.0),))
 FOUND = Diagnosis(None, JUDGED, None, (), None, VerdictReport("All is explained.", (), None), None)
@@ -34,8 +38,9 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
         changes_predictions=False,
         by_rows=False,
         improvement=None,
+        after_in_words="repaired",
         combination_shares={twice: 1.0},
-        effects_in_all_samples=("lag",),
+        shares_in_words="two waves in the readings",
         unstated_effects=lambda stated: (),
     )
     found = replace(
@@ -45,8 +50,23 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
         ),
         report=replace(FOUND.report, effects=effects),
         repair=repair,
+        apparatus=LightSensorApparatus(),
     )
     assert "again" not in found.summary()
-    assert "samples of the repaired model: lag in all, beside that interference with interference in 100%" in (
-        found.summary()
-    )
+
+
+def test_the_field_of_a_next_plan_is_described_as_it_is_believed_to_be():
+    known = {"field": Uniform(0.0), "card": Uniform(0.5)}
+    plan = Plan.from_arrays(x_mm=[0.0, 5.0], y_mm=0.0, pattern=["field", "card"], patterns=known, unit="V")
+    plan = replace(plan, patterns={"card": Uniform(0.5)})
+    asked = NextMeasurement(plan, "read again", 1.0, 9.0, ("a", "b"), ((), ("lag",)), np.full(2, 0.5), np.eye(2))
+    names = ("sd", "x_mm", "y_mm", "radius_mm")
+    model = SimpleNamespace(chain=SimpleNamespace(names=names), theta=np.array([[1.0, 90.0, 40.0, 50.0]] * 3))
+    diagnosis = replace(FOUND, repair=SimpleNamespace(model=model), next_measurement=asked)
+    null = SimpleNamespace(nuisance_names=names[1:], shape=Circle())
+    described = SensorAndShape.with_shape_in_next_plan(null, diagnosis).next_measurement.plan.patterns
+    assert described["card"] == Uniform(0.5)
+    corners = np.array(described["field"].vertices_mm)
+    np.testing.assert_allclose(np.hypot(*(corners - [90.0, 40.0]).T), 50.0, rtol=0.01)
+    without = replace(diagnosis, next_measurement=None)
+    assert SensorAndShape.with_shape_in_next_plan(null, without) is without

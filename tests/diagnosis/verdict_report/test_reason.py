@@ -6,7 +6,7 @@ import pytest
 
 from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged
-from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
+from probewise.diagnosis.verdict_report.reason import Grounds, covariate_of_unknown, reason_of
 
 OVEN = Words(null="the oven's law", find_signal="switch the heater on", settles_nothing="no reading tells them apart")
 GROUNDS = Grounds(OVEN, 100, 24, sentences={"lag": "the probe follows with 8 s", "step": "it jumps by 2 at 40 s"})
@@ -19,6 +19,10 @@ def judged(verdict, combination=(), **more):
     return Judged(verdict, combination, 1e-4, (LAG, CLEAN, UNKNOWN), **more)
 
 
+APART = (
+    "These 100 readings cannot tell apart a sensor that follows slowly (0.70), nothing missing (0.20) and something "
+    "without a name (0.10)"
+)
 SAID = [
     (judged("named", ("lag",)), {}, "The probe follows with 8 s (p = 0.0001)."),
     (
@@ -69,25 +73,23 @@ SAID = [
     (
         judged("cannot_tell"),
         {"settles": "repeat run 2"},
-        "These 100 readings cannot tell apart lag (0.70), clean (0.20) and unknown (0.10); to tell them apart: "
-        "repeat run 2.",
+        f"{APART}; to tell them apart: repeat run 2.",
     ),
     (
         judged("cannot_tell"),
         {"settles": "repeat run 2", "apart": "lag or clean from unknown"},
-        "These 100 readings cannot tell apart lag (0.70), clean (0.20) and unknown (0.10); to tell lag or clean from "
-        "unknown: repeat run 2.",
+        f"{APART}; to tell lag or clean from unknown: repeat run 2.",
     ),
     (
         judged("cannot_tell"),
         {"settles": ""},
-        "These 100 readings cannot tell apart lag (0.70), clean (0.20) and unknown (0.10); no reading tells them "
-        "apart.",
+        f"{APART}; no reading tells them apart.",
     ),
     (
         judged("unknown", ("unknown",)),
         {"beside": ("lag",), "shows_in": ("time", "level")},
-        "Beside lag, something is missing (p = 0.0001) that no named effect explains; it shows most in time.",
+        "Beside a sensor that follows slowly, something is missing (p = 0.0001) that no named effect explains; it "
+        "shows most in time.",
     ),
     (
         judged("unknown", ("unknown",)),
@@ -114,7 +116,8 @@ SAID = [
     (
         judged("named", ("lag",)).with_verdict_withdrawn(),
         {},
-        "Something is missing (p = 0.0001); lag fits these readings best, but predicts held-out readings far worse "
+        "Something is missing (p = 0.0001); a sensor that follows slowly fits these readings best, but predicts "
+        "held-out readings far worse "
         "than the oven's law without it.",
     ),
     (
@@ -134,7 +137,44 @@ SAID = [
 def test_a_judgement_is_said_in_one_sentence_of_the_apparatus_own_words(judgement, grounds, sentence):
     said = reason_of(judgement, replace(GROUNDS, **grounds))
     assert said.startswith(sentence)
-    assert "sensor" not in said
+
+
+FEW = tuple(Hypothesis((name,), p) for name, p in (("step", 0.80), ("lag", 0.01), ("drift", 0.01)))
+
+
+@pytest.mark.parametrize(
+    ("judgement", "sentence"),
+    [
+        (
+            replace(judged("cannot_tell"), hypotheses=FEW),
+            "Most likely step (0.80); no other explanation has more than 0.01.",
+        ),
+        (
+            replace(judged("cannot_tell"), hypotheses=(Hypothesis(("lag",), 0.8), *OPEN[:1]), shared=("lag",)),
+            "The probe follows with 8 s. Beside that, these 100 readings cannot tell apart nothing more (0.80) and "
+            "step (0.50).",
+        ),
+        (
+            replace(
+                judged("named", ("lag",)), hypotheses=(Hypothesis(("lag",), 0.97),), shared=("lag",), leader=("lag",)
+            ),
+            "The probe follows with 8 s (p = 0.0001).",
+        ),
+    ],
+)
+def test_what_hardly_has_a_probability_is_no_open_question(judgement, sentence):
+    assert reason_of(judgement, GROUNDS) == sentence
+
+
+def test_a_p_value_that_speaks_against_an_unknown_effect_is_not_its_reason():
+    said = reason_of(replace(judged("unknown", ("unknown",)), p_value=0.65, hypotheses=(UNKNOWN,)), GROUNDS)
+    assert said.startswith("Something is missing (probability 0.10, though a test of the mean alone has p = 0.65)")
+
+
+def test_an_unknown_effect_shows_in_a_control_rather_than_in_time():
+    assert covariate_of_unknown("time, locally", ["power_w", "time"]) == "power_w"
+    assert covariate_of_unknown("time, locally", ["time"]) == "time"
+    assert covariate_of_unknown("level, locally", ["time", "level"]) == "level"
 
 
 def test_what_a_person_has_named_is_not_capitalised():

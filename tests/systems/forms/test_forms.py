@@ -640,3 +640,16 @@ def test_a_rate_of_change_of_what_has_no_unit_counts_from_one():
     assert units["drifts:gain"] == ("1/s",)
     assert units["sensitivity:room_c"] == ("V per room_c",)
     assert not [name for name, own in units.items() for unit in own if unit.startswith((" ", "/"))]
+
+
+def test_what_a_parameter_jumps_by_has_its_unit():
+    decay = replace(
+        _simulator(),
+        parameters={"tau_s": (1, 5), "gain": (0, 4)},
+        simulate=lambda p, u: p["gain"] * np.exp(-u["t_s"] / p["tau_s"]),
+    )
+    forms = bind_forms(_about(decay))
+    said = forms["steps:tau_s"].sentence(np.array([-2.0, 3.0]), np.array([0.1, 0.2]))
+    assert said == "tau_s jumps by -2.00 ± 0.10 s at 3.00 ± 0.20 s and stays there"
+    said = forms["sensitivity:room_c"].sentence(np.array([0.5]), np.array([0.1]))
+    assert said == "y changes by 0.50 ± 0.10 V per °C of room_c"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from probewise.diagnosis.effect_words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.effects import name_without_copy_suffix
-from probewise.report.effect_words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.world.systems.vocabulary import FAMILIES

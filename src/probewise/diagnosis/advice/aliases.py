@@ -13,7 +13,7 @@ from probewise.diagnosis.advice.separating_readings import COUNTS, Amounts, Effe
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.scheduling import MOST_READINGS, WORTHWHILE_NATS, rows_by_command
+from probewise.diagnosis.scheduling import ENOUGH_NATS, MOST_READINGS, NOTHING_NATS, rows_by_command
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
 from probewise.effects import name_of_first_copy
@@ -21,7 +21,6 @@ from probewise.effects import name_of_first_copy
 ALIAS_COSINE = 0.9
 _LAMBDA = 8.0  # size of an effect at which it is detected for certain
 _LEAST_SHARE = 0.05  # least share of its change of the readings that counts for its lambda, whatever a fit absorbs
-_ENOUGH = 3.0  # nats that separate two effects
 
 
 @dataclass(frozen=True)
@@ -148,15 +147,15 @@ def pairs_with_separating_scans(
     everywhere = apparatus.plan_of_alternatives(scans, plan)
     readings = ReadingsWithEffects.of(problem, found, named, usable=usable, plan=everywhere, apparatus=apparatus)
     sized = {pair.effects: _collinear_amounts(problem, readings, *pair.effects) for pair in pairs}
-    best = {pair.effects: (MOST_READINGS + 1, -WORTHWHILE_NATS, pair) for pair in pairs}  # the least is best
+    best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
         taken = readings.in_one_run(rows)
         for effects, (one, other) in sized.items():
             nats = _gained(taken.nats_against(one, other))
-            if not nats[-1] > WORTHWHILE_NATS:
+            if not nats[-1] > NOTHING_NATS:
                 continue
             nats = np.minimum(nats, _gained(taken.nats_against(other, one)))
-            enough = np.flatnonzero(nats >= _ENOUGH)
+            enough = np.flatnonzero(nats >= ENOUGH_NATS)
             needed = int(COUNTS[enough[0]]) if enough.size else MOST_READINGS + 1
             most = float(nats[enough[0] if enough.size else -1])
             if (needed, -most) < best[effects][:2]:

@@ -18,10 +18,11 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.advice.new_runs import slopes_split_by_run
 from probewise.diagnosis.apparatus import Apparatus
-from probewise.diagnosis.fitting.fit import Model
+from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.scheduling import MOST_READINGS, WORTHWHILE_NATS, Command, rows_by_command
-from probewise.recordings.plan import Plan
+from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.scheduling import ENOUGH_NATS, MOST_READINGS, NOTHING_NATS, Command, rows_by_command
+from probewise.recordings.plan import Plan, Recording
 
 _STRIDES = (2, 4)
 _PROMISING = 4  # scans per pair of rivals whose full predictive distribution is computed
@@ -30,6 +31,8 @@ _SETTLED = 0.05  # share of the entropy that may remain
 _LEAST_NOISE_2 = 1e-12  # of the largest variance of a reading
 _WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove
 _ANYTHING = 1e-6  # the same for the first scan
+NO_NAME = "what has no name"
+_NEAR = 0.05  # of a setting's range: how near a planned reading is to a recorded one that it repeats
 _LEAST_WEIGHT = 0.05  # least weight of a rival, since its probability may be wrong
 
 
@@ -56,7 +59,7 @@ class NextMeasurement:
     def classes_among(self, hypotheses: Collection[Names]) -> list[list[int]]:
         """Return the classes into which the readings separate some of the hypotheses, by their indices in `effects`.
 
-        Two hypotheses share a class if the expected log Bayes factor of one over the other is below `WORTHWHILE_NATS`,
+        Two hypotheses share a class if the expected log Bayes factor of one over the other is below `NOTHING_NATS`,
         directly or through a chain of others. Hypotheses that were not compared are in no class.
         """
         return _classes_told_apart(self.nats, [k for k, names in enumerate(self.effects) if names in hypotheses])
@@ -171,6 +174,56 @@ def measurement_separating_rivals(
     )
 
 
+def measurement_at_place(
+    place: Place, null: Fit, everything: Recording, sd: float, plan: Plan, apparatus: Apparatus
+) -> NextMeasurement | None:
+    """Choose the readings that would show an unknown effect again, if it stays where its residuals lie.
+
+    A planned reading repeats the recorded one with the nearest settings, and its mean residual, if that is in the
+    place. The readings with most nats per minute are chosen, of those with three nats over no effect; None if none has.
+
+    Parameters
+    ----------
+    place
+        A place in all readings of `everything`, with its curve of mean residuals.
+    null
+        The null fit.
+    sd
+        Noise sd of a reading.
+    plan, apparatus
+        The plan already measured, and the apparatus that can measure more.
+    """
+    from scipy.spatial import KDTree  # a tenth of a second, which few diagnoses need
+
+    commands = apparatus.candidate_measurements(plan, strides=_STRIDES, level=null.model.predict(null.z[None, :])[0])
+    if not commands or place.values is None:
+        return None
+    usable = np.flatnonzero(everything.usable)
+    inside = place.rows_among(everything.plan, usable)
+    shown = np.where(inside, np.interp(place.values, place.curve_at, place.curve_mean) / sd, 0.0)
+    known = apparatus.settings_of(everything.plan.take(usable))
+    scale = np.ptp(known, axis=0)
+    varies = scale > 0
+    planned = apparatus.settings_of(apparatus.plan_of_alternatives(commands, plan))[:, varies] / scale[varies]
+    apart, nearest = KDTree(known[:, varies] / scale[varies]).query(planned, p=np.inf)
+    squares = np.where(apart <= _NEAR, shown[nearest], 0.0) ** 2
+    nats = np.array([0.5 * float(squares[rows].sum()) for rows in rows_by_command(commands)])
+    per_minute = np.where(nats >= ENOUGH_NATS, nats, 0.0) / [command.minutes for command in commands]
+    best = int(np.argmax(per_minute))
+    if per_minute[best] == 0.0:
+        return None
+    return NextMeasurement(
+        apparatus.plan_of_sequence([commands[best]], plan),
+        commands[best].description,
+        commands[best].minutes,
+        float(nats[best]),
+        (f"{apparatus.words.null} as calibrated", NO_NAME),
+        ((), ("unknown",)),
+        np.full(2, 0.5),
+        nats[best] * (1 - np.eye(2)),
+    )
+
+
 def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
     """Return a lower bound on the mutual information of hypothesis and readings, in nats.
 
@@ -242,7 +295,7 @@ def _classes_told_apart(nats: FloatArray, members: Sequence[int]) -> list[list[i
     """Group members that the readings cannot tell apart, by their expected log Bayes factors, `nats` (n, n)."""
     classes: list[list[int]] = []
     for k in members:
-        alike = [own for own in classes if any(min(nats[k, j], nats[j, k]) < WORTHWHILE_NATS for j in own)]
+        alike = [own for own in classes if any(min(nats[k, j], nats[j, k]) < NOTHING_NATS for j in own)]
         classes = [own for own in classes if own not in alike] + [sorted([k, *itertools.chain(*alike)])]
     return sorted(classes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -21,7 +22,7 @@ from probewise.diagnosis.light_sensor.scheduling import Scan, plan_of_alternativ
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Extent, NamedEffect
+from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Extent, NamedEffect, orientation_deg
 from probewise.recordings.plan import Plan, Recording
 
 
@@ -90,6 +91,7 @@ class LightSensorApparatus:
         """Return no covariates: what an arm logs beside the readings is not known to act by products."""
         return ()
 
+    controls: ClassVar[Sequence[str]] = ()  # an arm's places are its covariates
     takes_one_measurement_at_a_time = False  # a plan names its scans
     prior_odds = staticmethod(PriorOdds.for_effects)
     covariate_of_effect = staticmethod(covariate_of_effect)
@@ -104,6 +106,11 @@ class LightSensorApparatus:
     def coordinates_of_new_run(self, model: Model) -> IntArray:
         """Return no indices: the sensor is the same in every scan."""
         return np.zeros(0, dtype=np.int64)
+
+    def settings_of(self, plan: Plan) -> FloatArray:
+        """Return place, orientation and a number for the pattern of each row, (n_points, 4)."""
+        number = np.array([zlib.crc32(name.encode()) for name in plan.pattern_names])[plan.pattern]
+        return np.stack([plan.x_mm, plan.y_mm, orientation_deg(plan), number], axis=1)
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None

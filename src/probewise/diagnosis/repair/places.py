@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,8 @@ from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.residuals.locate import Place, places_of_effect, significant_places
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.thinning import rows_to_diagnose
+
+_SAME = 0.8  # overlap from which two places hold the same rows
 
 
 def locate_effects_and_residuals(
@@ -61,9 +63,20 @@ def locate_effects_and_residuals(
             white, covariates, scan_names, residuals, white.draw_null_residuals(N_DRAWS, rng=rng)
         )
     first: dict[str, Place] = {}
-    for place in [*named, *scanned]:
+    for place in [*named, *_controls_before_time(scanned, prepared.apparatus.controls)]:
         first.setdefault(place.figure_name, place)
     return tuple(_place_in_everything(place, prepared) if prepared.is_thinned else place for place in first.values())
+
+
+def _controls_before_time(places: Sequence[Place], controls: Sequence[str]) -> list[Place]:
+    """Move the place of a control before that of time if they hold the same rows: what a person moves is the cause."""
+    out = list(places)
+    for place in places:
+        at = next((k for k, other in enumerate(out) if other is place), 0)
+        before = [k for k in range(at) if out[k].covariate in ("time", "row") and place.overlap(out[k]) >= _SAME]
+        if place.covariate in controls and before:
+            out.insert(before[0], out.pop(at))
+    return out
 
 
 def _place_in_everything(place: Place, prepared: Prepared) -> Place:

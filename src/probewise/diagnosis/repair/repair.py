@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, read_only_floats
+from probewise.diagnosis.effect_words import effects_in_words, hypothesis_in_words, join_lists, join_names
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.memory import walk_given_readings
 from probewise.diagnosis.prepared import Prepared
@@ -17,7 +18,7 @@ from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.samples import ModelSamples
-from probewise.effects import NamedEffect
+from probewise.effects import NamedEffect, is_out_of_vocabulary
 from probewise.effects.vocabulary import sentence_from_samples
 
 
@@ -78,6 +79,20 @@ class Repair:
         return not np.array_equal(self.before.residuals, self.after.residuals, equal_nan=True)
 
     @property
+    def after_in_words(self) -> str:
+        """What the later one of the two predictions is: "repaired", or, row by row, "corrected in these readings"."""
+        return "corrected in these readings" if self.by_rows else "repaired"
+
+    def not_in_model(self, model: str) -> str:
+        """Say that the file `model` lacks the correction by rows, or what share of its samples has a formula."""
+        named = [name for name in self.model.effects if is_out_of_vocabulary(name)]
+        marks = [self.model.absent.get(name, np.zeros(1, dtype=np.bool_)) for name in named]
+        share = 1.0 - float(np.mean(np.logical_and.reduce(np.broadcast_arrays(*marks)))) if marks else 0.0
+        if share:
+            return f"of the samples in {model}, {100 * share:.0f} % contain a formula for it instead"
+        return f"{model} does not contain it"
+
+    @property
     def combination_shares(self) -> dict[tuple[str, ...], float]:
         """Share of the repaired model's samples with each combination of the effects that not all samples contain.
 
@@ -93,6 +108,19 @@ class Repair:
     def effects_in_all_samples(self) -> tuple[str, ...]:
         """Effects that all samples of the repaired model contain."""
         return tuple(name for name in self.model.effects if name not in self.model.absent)
+
+    @property
+    def shares_in_words(self) -> str:
+        """Which effects all samples of the repaired model contain, and which only a share of them, in words."""
+        everywhere, nothing = self.effects_in_all_samples, "no effect"
+        opening = ""
+        if everywhere:
+            opening, nothing = f"{join_names(effects_in_words(everywhere))}; beside that ", "nothing more"
+        held = (
+            f"{hypothesis_in_words(names, nothing=nothing)} ({100 * share:.0f} %)"
+            for names, share in self.combination_shares.items()
+        )
+        return opening + join_lists([*held])
 
     def unstated_effects(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
         """List the repaired model's effects that are not `stated`: name, share of the samples with it, sentence."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, read_only_floats
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -66,6 +66,26 @@ class Place:
         """Name of the place's figure file: "witness_COVARIATE.svg" or "witness_COVARIATE_SCAN.svg"."""
         where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
         return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
+
+    def rows_among(self, plan: Plan, usable: IntArray) -> BoolArray:
+        """Return the mask of the usable readings, of a plan's rows `usable` (n_usable,), that lie in it."""
+        out = np.ones(len(usable), dtype=np.bool_)
+        if self.scan is not None:
+            out &= np.array(plan.scan_names)[plan.scan[usable]] == self.scan
+        return out & self._within
+
+    @property
+    def _within(self) -> BoolArray:
+        """Mask of the usable readings whose covariate lies in the window."""
+        values = np.zeros(0) if self.values is None else self.values
+        if self.start is None or self.end is None:
+            return np.isfinite(values)
+        return np.asarray((values >= self.start) & (values <= self.end))
+
+    def overlap(self, other: Place) -> float:
+        """Return the readings in both windows, as a share of those in either."""
+        either = int(np.sum(self._within | other._within))
+        return float(np.sum(self._within & other._within)) / either if either else 0.0
 
 
 def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], draws: FloatArray) -> float:

@@ -39,6 +39,7 @@ from probewise.systems import RunTable, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.proposals import formula_forms
 from probewise.systems.forms.rates import names_in_definitions
+from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.rebinding import has_value_per_run
 from probewise.systems.forms.sorted_rows import names_of_jumps_in_sorted_rows
 from probewise.systems.forms.stop import MeterStop
@@ -130,6 +131,11 @@ class SimulatorApparatus:
             },
             own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
         )
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """The columns that the simulator's file declares as controls."""
+        return self.system.simulator.controls
 
     @property
     def tells_duration(self) -> bool:
@@ -287,6 +293,12 @@ class SimulatorApparatus:
         as it is planned, and a lag or a backlash would reach from one into the other.
         """
         return self.system.simulator.run is None
+
+    def settings_of(self, plan: Plan) -> FloatArray:
+        """Return the columns besides the reading, and the time since the start of the run, (n_points, n_settings)."""
+        table, own = cast(RunTable, plan), self.system.simulator
+        columns = [v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)]
+        return np.nan_to_num(np.stack([*columns, time_since_start_of_run(table)], axis=1))
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None

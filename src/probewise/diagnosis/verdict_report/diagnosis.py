@@ -8,11 +8,12 @@ from probewise._display import ShowsItself
 from probewise._kinds import require_kind
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.apparatus import Apparatus
+from probewise.diagnosis.effect_words import hypothesis_in_words
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.repair import Repair
 from probewise.diagnosis.repair.samples import ModelSamples
-from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.residuals.locate import ALARM, Place
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.diagnosis.verdict_report.beyond import Formula, Remainder
 from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound
@@ -26,7 +27,8 @@ class VerdictReport:
     """The verdict in words and numbers: reason, effects, noise, log evidences, and what named effects do not explain.
 
     `weighings` are log evidences by Laplace's approximation and by nested sampling, if they were computed. `remainder`
-    (a misfit after the repair) and `formula` are None if there is none.
+    (a misfit after the repair) and `formula` are None if there is none. `is_settled`: whether one hypothesis on the
+    mean has a probability of .95 or more.
     """
 
     reason: str
@@ -35,6 +37,7 @@ class VerdictReport:
     weighings: tuple[Weighing, ...] = ()
     remainder: Remainder | None = None
     formula: Formula | None = None
+    is_settled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +55,7 @@ class Diagnosis(ShowsItself):
     where
         Places (ranges of covariates) of the repair's effects, largest first, then of other significant residuals.
     next_measurement
-        The next measurement to make; None if none would be informative.
+        The next measurement to make; None if no question is open, or no readings would answer it.
     report
         The verdict in words, and the numbers of effects and noise.
     apparatus
@@ -119,43 +122,43 @@ class Diagnosis(ShowsItself):
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""
-        lines = [f"{self.verdict}: {self.reason}", _p_value_in_words(self.p_value), "probability  explanation"]
-        lines += [f"  {h.probability:9.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
+        lines = [f"{self.verdict}: {self.reason}"]
+        if self.verdict != "unknown" or self.p_value <= ALARM:  # otherwise the reason says why it does not count
+            lines.append(_p_value_in_words(self.p_value))
+        lines.append("probability  explanation")
+        lines += [f"  {h.probability:9.3f}  {_with_code(h)}" for h in self.hypotheses[:5] if h.probability > 1e-3]
         # The reason is not repeated.
         lines += [
-            f"{name_without_copy_suffix(e.name)} (probability {e.probability:.3f}, all explanations together): "
-            f"{e.sentence}"
+            f"{self.apparatus.words.as_sentence(e.sentence)} ({name_without_copy_suffix(e.name)}, probability "
+            f"{e.probability:.3f} in all explanations together)"
             for e in self.effects
             if e.probability > 0.05 and e.sentence.lower() not in self.reason.lower()
         ]
         gain, unit = self.improvement, self.recording.plan.instrumentation.unit_after_number
         unit = f"{unit}{self.recording.weighting_in_words}"
+        after, model = self.repair.after_in_words, self.apparatus.words.model
         if self.repair.changes_predictions:
             held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats per held-out reading"
             tested = held if gain.heldout_by_scan else "no reading could be held out"
-            lines.append(
-                f"repaired: log evidence {gain.log_evidence:+.1f} nats, {tested}, "
-                f"rms of the residuals {gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip()
-            )
+            rms = f"{gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip()
+            lines.append(f"{after}: log evidence {gain.log_evidence:+.1f} nats, {tested}, rms of the residuals {rms}")
         elif self.verdict == "noise":
             lines.append(f"repaired noise model: log evidence {gain.log_evidence:+.1f} nats")
         if self.repair.by_rows:
-            model = self.apparatus.words.model
-            lines.append(f"the unknown effect is corrected in these readings only: {model} does not contain it")
+            lines.append(f"the unknown effect is corrected in these readings only: {self.repair.not_in_model(model)}")
         lines += [
             f"in {share:.0%} of the repaired model's samples: {sentence}"
             for _, share, sentence in self.unstated_effects
         ]
         if self.repair.combination_shares:
-            everywhere = " with ".join(map(name_without_copy_suffix, self.repair.effects_in_all_samples))
-            nothing = "nothing more" if everywhere else "no effect"
-            shares = ", ".join(
-                f"{' with '.join(map(name_without_copy_suffix, n)) or nothing} in {p:.0%}"
-                for n, p in self.repair.combination_shares.items()
-            )
-            shares = f"{everywhere} in all, beside that {shares}" if everywhere else shares
-            lines.append(f"samples of the repaired model: {shares}")
+            lines.append(f"samples of the repaired model contain {self.repair.shares_in_words}")
         return "\n".join(lines)
+
+
+def _with_code(hypothesis: Hypothesis) -> str:
+    """Return a hypothesis in words, followed by its label in diagnosis.json."""
+    words, label = hypothesis_in_words(hypothesis.effects), hypothesis.label
+    return words if words == label else f"{words} ({label})"
 
 
 def _p_value_in_words(p_value: float) -> str:

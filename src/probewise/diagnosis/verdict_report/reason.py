@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.effect_words import effects_in_words, hypothesis_in_words, join_lists, join_names
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.bases import PRODUCTS
 from probewise.diagnosis.residuals.locate import ALARM
 from probewise.diagnosis.residuals.outlying import FAR_OUT
+from probewise.diagnosis.scheduling import SETTLED
 from probewise.diagnosis.verdict_report.words import p_in_words
-from probewise.effects import spoken_name
 
 TO_SEPARATE = "; to tell "
 """Introduces the next readings in the reason of `cannot_tell`."""
@@ -21,7 +22,10 @@ ALL = "them apart"
 NOTHING_MORE = "nothing more"
 """The hypothesis of no effect beside those that are certain."""
 
-_WORTH_NAMING = 0.01  # least probability of a third rival
+NOTHING = "nothing missing"
+"""The hypothesis of no effect at all."""
+
+_OPEN = 0.05  # least probability of a rival: what has less is no open question
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,7 @@ def combinations_in_reason(judged: Judged) -> list[Names]:
 
 
 def _withdrawn_sentence(judged: Judged, grounds: Grounds) -> str:
-    leader, p = judged.hypotheses[0].label, p_in_words(judged.p_value)
+    leader, p = hypothesis_in_words(judged.hypotheses[0].effects), p_in_words(judged.p_value)
     worse = f"predicts held-out readings far worse than {grounds.words.null} without it"
     return f"Something is missing ({p}); {leader} fits these readings best, but {worse}."
 
@@ -118,6 +122,8 @@ def _clean_sentence(judged: Judged, grounds: Grounds) -> str:
 
 def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
     p = p_in_words(judged.p_value)
+    if judged.p_value > ALARM and not grounds.family.endswith(FAR_OUT):
+        p = f"probability {judged.unknown_probability:.2f}, though a test of the mean alone has {p}"
     if grounds.like:
         like = "; ".join(grounds.like)
         return f"Something is missing ({p}) that no named effect explains; it looks most like this: {like}."
@@ -125,14 +131,21 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
         covariate = grounds.words.covariate_in_words(grounds.family.removesuffix(FAR_OUT))
         tail = f"a test of the mean alone, which takes them for heavy-tailed noise, gives {p}"
         return f"Outlying readings cluster in {covariate}: something is missing there ({tail})."
-    likeliest = grounds.family.partition(",")[0].removesuffix(" within scans")
-    most = likeliest if likeliest in grounds.shows_in else next(iter(grounds.shows_in), "")
+    most = covariate_of_unknown(grounds.family, grounds.shows_in)
     place = f"; it shows most in {grounds.words.covariate_in_words(most)}" if most else ""
     if grounds.family == PRODUCTS:
         place = "; it varies as a product of two columns"
-    known = " and ".join(spoken_name(name) for name in grounds.beside)
-    what = f"Beside {known}, something" if known else "Something"
+    what = f"Beside {join_names(effects_in_words(grounds.beside))}, something" if grounds.beside else "Something"
     return f"{what} is missing ({p}) that no named effect explains{place}."
+
+
+def covariate_of_unknown(family: str, shows_in: Sequence[str]) -> str:
+    """Return the covariate in which an unknown effect shows most: that of its most probable form, if it shows there.
+
+    If that is the time, it is the first of the covariates `shows_in`, which a control is where both say the same.
+    """
+    likeliest, first = family.partition(",")[0].removesuffix(" within scans"), next(iter(shows_in), "")
+    return likeliest if likeliest in shows_in and likeliest not in ("time", "row") else first
 
 
 def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
@@ -141,24 +154,23 @@ def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
         cure = f"{TO_SEPARATE}{grounds.apart}: {grounds.settles}"
     said = _joined_effect_sentences(judged.shared, grounds)
     if said:
-        return f"{said}. {_open_beside_shared(judged, grounds)}{cure}."
-    return f"These {grounds.n_readings} readings cannot tell apart {_rivals_in_words(judged.hypotheses)}{cure}."
+        return f"{said}. Beside that, {_open_question(judged.beside_shared, grounds, NOTHING_MORE)}{cure}."
+    asked = _open_question(judged.hypotheses, grounds, NOTHING)
+    return f"{asked[:1].upper()}{asked[1:]}{cure}."
 
 
-def _open_beside_shared(judged: Judged, grounds: Grounds) -> str:
-    """Say what these readings cannot tell beside the effects that nearly all hypotheses share, without a full stop."""
-    beside = _rivals_in_words(judged.beside_shared, nothing=NOTHING_MORE)
-    return f"Beside that, these {grounds.n_readings} readings cannot tell apart {beside}"
-
-
-def _rivals_in_words(hypotheses: Sequence[Hypothesis], *, nothing: str = "clean") -> str:
+def _open_question(hypotheses: Sequence[Hypothesis], grounds: Grounds, nothing: str) -> str:
+    """Say which hypotheses these readings cannot tell apart, or which one is likeliest, without a full stop."""
     named = _rivals_to_name(hypotheses)
-    *others, last = (f"{h.label if h.effects else nothing} ({h.probability:.2f})" for h in named)
-    return f"{', '.join(others)} and {last}" if others else last
+    said = [f"{hypothesis_in_words(h.effects, nothing=nothing)} ({h.probability:.2f})" for h in named]
+    if len(said) > 1:
+        return f"these {grounds.n_readings} readings cannot tell apart {join_lists(said)}"
+    rest = max((h.probability for h in hypotheses if h not in named), default=0.0)
+    return f"most likely {said[0]}; no other explanation has more than {max(rest, 0.01):.2f}"
 
 
 def _rivals_to_name(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    return [h for k, h in enumerate(hypotheses[:3]) if k < 2 or h.probability >= _WORTH_NAMING]
+    return [h for k, h in enumerate(hypotheses[:3]) if k == 0 or h.probability >= _OPEN]
 
 
 def _noise_sentence(judged: Judged, grounds: Grounds) -> str:
@@ -172,7 +184,9 @@ def _noise_sentence(judged: Judged, grounds: Grounds) -> str:
 def _named_sentence(judged: Judged, grounds: Grounds) -> str:
     after = grounds.p_value_after
     named = f"{_joined_effect_sentences(judged.stated, grounds, *grounds.nuisances)} ({p_in_words(judged.p_value)})."
-    beside = f" {_open_beside_shared(judged, grounds)}." if len(judged.beside_shared) > 1 and judged.leader else ""
+    beside = ""
+    if judged.leader and judged.beside_shared[0].probability < SETTLED:
+        beside = f" Beside that, {_open_question(judged.beside_shared, grounds, NOTHING_MORE)}."
     more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
     return f"{named}{beside}{more}"
 

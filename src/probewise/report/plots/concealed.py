@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from probewise.report.effect_words import effect_has_words, effect_in_words
+from probewise.diagnosis.effect_words import effect_has_words, effect_in_words
 from probewise.report.plots.canvas import (
     BLUE,
     GREY,

@@ -17,6 +17,7 @@ from scipy.stats import binom
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_kind, require_like
+from probewise._words import unit_of_name
 from probewise.errors import ParameterError
 from probewise.nested import NestedResult, Weighted
 from probewise.report.plots.canvas import (
@@ -32,7 +33,7 @@ from probewise.report.plots.canvas import (
     label_axes,
     new_figure,
 )
-from probewise.report.words import unit_of, value_and_interval_texts, value_with_error, words_without_unit
+from probewise.report.words import value_and_interval_texts, value_with_error, words_without_unit
 
 Posterior: TypeAlias = NestedResult | Weighted
 
@@ -319,7 +320,7 @@ def _checked_parameter_columns(result: Posterior, parameters: Sequence[str] | No
 
 def _parameter_label(name: str) -> str:
     """Return a parameter's axis label: its name, its unit in brackets, an index as a subscript."""
-    unit = unit_of(name)
+    unit = unit_of_name(name)
     if unit:
         return f"{words_without_unit(name)} ({unit})"
     symbol = re.fullmatch(r"([A-Za-z])_(\w+)", name)

@@ -12,7 +12,7 @@ from probewise.recordings.plan import require_recording
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, CYCLE, GREY, AxesGrid, axes_or_new, grid_of_axes
 from probewise.report.plots.readings import MARKERS, tracks_and_single_rows
-from probewise.report.words import decimals_to_show, number_text, number_unsigned_zero, unit_name
+from probewise.report.words import decimals_to_show, number_text, number_unsigned_zero
 
 _DARK, _BRIGHT = "#1b1b1b", "#ffffff"
 _AROUND_MM = 16.0
@@ -119,7 +119,7 @@ def quadrant_patterns(recording: Recording) -> AxesGrid:
         ax.plot(0.0, 0.0, marker="+", markersize=10, markeredgewidth=1.4, color=GREY)
         ax.set(xlim=(-_AROUND_MM, _AROUND_MM), ylim=(-_AROUND_MM, _AROUND_MM), aspect="equal")
         ax.set_title(
-            f"{name.replace('_', ' ')} ({unit_name(plan.instrumentation.unit)})", fontsize="medium", loc="left"
+            f"{name.replace('_', ' ')} ({plan.instrumentation.unit_after_number})", fontsize="medium", loc="left"
         )
     return axes
 

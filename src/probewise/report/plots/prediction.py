@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._words import unit_after_number
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import (
@@ -24,7 +25,6 @@ from probewise.report.plots.canvas import (
 )
 from probewise.report.plots.readings import Track, track_axis_label, tracks_and_single_rows
 from probewise.report.residual_means import running_mean_curve
-from probewise.report.words import unit_name
 
 MAX_PANELS = 8
 
@@ -70,7 +70,7 @@ def predicted_and_recorded_by_scan(
     for ax in list(axes.flat)[n_panels:]:
         ax.set_visible(False)
     for ax in axes[:, 0]:
-        ax.set_ylabel(f"reading ({unit_name(unit)})")
+        ax.set_ylabel(f"reading ({unit_after_number(unit)})")
     for k in range(max(n_panels - n_columns, 0), len(shown)):
         axes.flat[k].set_xlabel(track_axis_label(shown).replace(", white side positive", ""))
     if own:
@@ -159,4 +159,4 @@ def residuals_against(
         ax.plot(center, average, color=colour, linewidth=2.0, label=name)
     ax.axhline(0, color=BLACK, linewidth=0.7)
     legend_above(ax)
-    return label_axes(ax, x=label, y=f"recorded − predicted ({unit_name(unit)})")
+    return label_axes(ax, x=label, y=f"recorded − predicted ({unit_after_number(unit)})")

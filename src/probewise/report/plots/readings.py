@@ -13,7 +13,6 @@ from probewise.recordings import Plan, Recording
 from probewise.recordings.patterns import HalfPlane
 from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import CYCLE, axes_or_new, label_axes, legend_above
-from probewise.report.words import unit_name
 
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 MAX_NAMED = 8  # tracks in the legend; with more there is none
@@ -116,4 +115,4 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
         )
     if 0 < len(found) <= MAX_NAMED:
         legend_above(ax, title="orientation of the sensor")
-    return label_axes(ax, x=track_axis_label(found), y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
+    return label_axes(ax, x=track_axis_label(found), y=f"reading ({recording.plan.instrumentation.unit_after_number})")

@@ -27,13 +27,14 @@ from probewise.report.plots.canvas import (
     stack_of_axes,
 )
 from probewise.report.residual_means import ResidualMeans, running_mean_curve
-from probewise.report.words import number_text, number_unsigned_zero, unit_name
+from probewise.report.words import number_text, number_unsigned_zero
 
 BEFORE, AFTER = "as calibrated", "repaired"
 _CROWDED = 500  # number of dots from which they are paler
 _MANY = 1500  # number of dots from which they are an image inside the SVG
 _ASIDE = 0.15  # offset of the means before and after from a categorical value's position
 _LEAST_SHADE = 0.008  # least width of a shaded interval, as a share of the axes' width
+_MOST_SHADE = 0.5  # the largest, from which on the rest of the axis is what stands out
 _MOST_SCANS = 12
 
 
@@ -45,6 +46,7 @@ def mean_residuals_along(
     each: tuple[FloatArray, FloatArray] | None = None,
     window: tuple[float, float] | None = None,
     names: Sequence[str] | None = None,
+    after: str = AFTER,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw mean residuals against a covariate, the 95 % band of chance, and the interval that is significant.
@@ -58,9 +60,11 @@ def mean_residuals_along(
     each
         Covariate and residual of every reading, (n_points,) each, drawn as dots behind.
     window
-        Ends of the significant interval, shaded.
+        Ends of the significant interval, shaded unless it takes up most of the axis.
     names
         Names of the values 0, 1, 2 ... of a categorical covariate.
+    after
+        What the later of the two models is called.
     ax
         Axes to draw on; a new figure without.
     """
@@ -76,7 +80,7 @@ def mean_residuals_along(
         ax.fill_between(means.at, -means.chance, means.chance, color=GREY, alpha=0.3, linewidth=0, label=_CHANCE)
     aside = _ASIDE if names and means.after is not None else 0.0
     said = "mean, " if each is not None else ""
-    drawn = ((means.before, VERMILLION, "o", BEFORE, -aside), (means.after, BLUE, "s", AFTER, aside))
+    drawn = ((means.before, VERMILLION, "o", BEFORE, -aside), (means.after, BLUE, "s", after, aside))
     for values, colour, marker, name, step in drawn:
         if values is not None:
             line = f"{marker}" if names else f"{marker}-"
@@ -86,7 +90,15 @@ def mean_residuals_along(
     if window is not None:
         low, high = ax.get_xlim()
         middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
-        ax.axvspan(middle - half, middle + half, color=SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
+        if 2 * half < _MOST_SHADE * (high - low):  # nothing stands out where nearly all is shaded
+            shade: dict[str, Any] = {
+                "color": SKY,
+                "alpha": 0.25,
+                "linewidth": 0,
+                "label": "stands out here",
+                "zorder": 0,
+            }
+            ax.axvspan(middle - half, middle + half, **shade)
     averaged = each is None and int(means.size.max(initial=1)) > 1
     label_axes(ax, x=label, y=f"{'mean residual' if averaged else 'residual'} ({unit})")
     set_plain_tick_labels(ax, x=not names)
@@ -146,7 +158,7 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)
     ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)
-    label_axes(ax, x="reading number", y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
+    label_axes(ax, x="reading number", y=f"reading ({recording.plan.instrumentation.unit_after_number})")
     set_plain_tick_labels(ax)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return ax

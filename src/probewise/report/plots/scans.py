@@ -13,7 +13,6 @@ from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import BLACK, BLUE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, label_axes
 from probewise.report.plots.readings import Track, tracks_and_single_rows
-from probewise.report.words import unit_name
 
 _MOST_GROUPS, _LEAST_ROWS = 18, 5  # number of groups of neighbours in a running mean
 _TELLING = 0.3  # share of the repair's largest change: the figure shows where the change exceeds it
@@ -59,7 +58,7 @@ def residuals_by_scan(
         ax.set_visible(False)
     sheet = axes.flat[0].figure
     sheet.supxlabel(_ALONG if all(track.from_edge for track in shown) else f"{_ALONG}, or {_ALONG_OTHERS}", fontsize=10)
-    sheet.supylabel(f"recorded − predicted ({unit_name(recording.plan.instrumentation.unit)})", fontsize=10)
+    sheet.supylabel(f"recorded − predicted ({recording.plan.instrumentation.unit_after_number})", fontsize=10)
     lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in (VERMILLION, BLUE)]
     sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize=SMALL_PT)
     return axes
@@ -115,7 +114,7 @@ def readings_before_and_after_repair(
         below.plot(*_running_mean_by_position(along[shown], residual[shown]), color=colour, linewidth=1.8)
     below.axhline(0.0, color=BLACK, linewidth=0.7)
     below.set_xlim(low, high)
-    unit = unit_name(recording.plan.instrumentation.unit)
+    unit = recording.plan.instrumentation.unit_after_number
     above.legend(frameon=False, fontsize=SMALL_PT)
     label_axes(above, x="", y=f"reading ({unit})", title=name)
     from_edge = all(track.from_edge for track in found)

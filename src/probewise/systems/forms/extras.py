@@ -7,9 +7,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, Form, Say, mean_with_sd
+from probewise.systems.forms.form import Act, Form, Say
 
 _N_VALUES = 9
 _UNSEEN = 1e-7  # of the noise
@@ -48,4 +49,4 @@ def _parameter_setter(name: str) -> Act:
 
 
 def _sentence_writer(says: str) -> Say:
-    return lambda mean, sd: says.replace("{value}", mean_with_sd(mean[0], sd[0], ""))
+    return lambda mean, sd: says.replace("{value}", value_with_sd(mean[0], sd[0], ""))

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects import name_of_first_copy
 from probewise.effects.shared_scale_prior import SharedScalePrior
-from probewise.effects.vocabulary import VariantMasks, value_with_sd
+from probewise.effects.vocabulary import VariantMasks
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
 from probewise.systems.law_inputs import BetweenRows
@@ -272,11 +273,5 @@ def flag_with_prior(on: bool) -> tuple[float, Uniform]:
 
 
 def period_with_sd(frequency: float, sd: float, time_unit: str) -> str:
-    """Return the period of a frequency, per `time_unit`, with its sd to first order, as `mean_with_sd` does."""
-    return mean_with_sd(1 / frequency, sd / frequency**2, time_unit)
-
-
-def mean_with_sd(mean: float, sd: float, unit: str) -> str:
-    """Return "mean ± sd unit" to two significant digits of the sd; for an sd up to 1e-7, the mean to three digits."""
-    digits = value_with_sd(mean, sd) if sd > 1e-7 else f"{mean:.3g} ± {sd:.1g}"
-    return f"{digits} {unit}" if unit not in ("", "1") else digits
+    """Return the period of a frequency, per `time_unit`, with its sd to first order, as `value_with_sd` does."""
+    return value_with_sd(1 / frequency, sd / frequency**2, time_unit)

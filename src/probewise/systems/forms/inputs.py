@@ -9,12 +9,13 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
+from probewise._words import value_with_sd
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
-from probewise.systems.forms.form import Act, ActInTime, Form, Say, mean_with_sd
+from probewise.systems.forms.form import Act, ActInTime, Form, Say
 from probewise.systems.forms.frequencies import max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.lags import delayed_values, values_at_earlier_times
 from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
@@ -121,7 +122,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _fill_sentence(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
-    return sentence.format(mean_with_sd(mean[0], sd[0], ""))
+    return sentence.format(value_with_sd(mean[0], sd[0], ""))
 
 
 def _column_with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -211,7 +212,7 @@ def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
             amplitudes=(),
             says=lambda m, s: (
                 f"{name} {'rises' if m[0] > ends.least_ceiling else 'falls'} no further than "
-                f"{mean_with_sd(m[0], s[0], '')}"
+                f"{value_with_sd(m[0], s[0], '')}"
             ),
             absent={0: ends.level_out_of_reach},
         )
@@ -256,8 +257,8 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         entries=sine_and_cosine_entries(typical, 1 / frequencies),
         amplitudes=(0,),
         says=lambda m, s: (
-            f"{name} has a periodic error with an amplitude of {mean_with_sd(m[0], s[0], '')} "
-            f"and a period of {mean_with_sd(m[1], s[1], '')}, both in units of {name}"
+            f"{name} has a periodic error with an amplitude of {value_with_sd(m[0], s[0], '')} "
+            f"and a period of {value_with_sd(m[1], s[1], '')}, both in units of {name}"
         ),
         joined=starting_point_of_wave,
         counted_from=origin_in_words(name, origin),

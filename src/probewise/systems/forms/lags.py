@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._words import value_with_sd
 from probewise.effects.decaying_sum import decaying_sum
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, Form, flag_with_prior, mean_with_sd
+from probewise.systems.forms.form import Act, Form, flag_with_prior
 from probewise.systems.forms.splines import Spline
 from probewise.systems.table import RunTable
 
@@ -59,7 +60,7 @@ def _with_smooth_variant(
             act=act,
             entries=np.stack([sizes, np.full(_N_SIZES, flag)], axis=1)[:, None, :],
             amplitudes=(),
-            says=lambda mean, sd: f"{says} {mean_with_sd(mean[0], sd[0], time_unit)}",
+            says=lambda mean, sd: f"{says} {value_with_sd(mean[0], sd[0], time_unit)}",
             absent={0: 0.0},
             needs_rising_time=True,
             fixed=(_SMOOTH,),

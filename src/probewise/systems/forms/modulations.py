@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values
+from probewise._words import unit_of_name, value_with_sd
 from probewise.effects import HeavyTailedPrior
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import ActBetween, ChangePoints, mean_with_sd, period_with_sd
+from probewise.systems.forms.form import ActBetween, ChangePoints, period_with_sd
 from probewise.systems.forms.frequencies import frequency_prior, residual_peaks, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.law_inputs import Jump
@@ -60,7 +61,7 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
         marginals=lambda a: {"a": a},
         entries=_single_entry_bank,
         units=lambda unit: (f"{unit or '1'}/{time_unit}",),
-        says=lambda what, unit, mean, sd: f"{what} drifts by {mean_with_sd(mean[0], sd[0], unit)} per {time_unit}",
+        says=lambda what, unit, mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
         counted_from=origin_in_words(table.time, origin, time_unit),
         between_rows=lambda name: lambda between, theta: between.with_drift(name, theta[:, :1]),
@@ -70,7 +71,7 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
 def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
     values = table.covariates[name]
-    middle = float(np.nanmean(values))
+    middle, per = float(np.nanmean(values)), unit_of_name(name) or "unit"
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle))
@@ -80,7 +81,9 @@ def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
         marginals=lambda a: {"a": a},
         entries=_single_entry_bank,
         units=lambda unit: (f"{unit or '1'} per {name}",),
-        says=lambda what, unit, mean, sd: f"{what} changes by {mean_with_sd(mean[0], sd[0], unit)} per unit of {name}",
+        says=lambda what, unit, mean, sd: (
+            f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}"
+        ),
         covariates=(covariate_of_column(name),),
     )
 
@@ -97,10 +100,10 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, gated: bool
         return np.asarray(theta[:, :1] * (change_points.variable_at_rows(rows) > theta[:, 1:2]))
 
     def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
-        jump = f"{what} jumps by {mean_with_sd(mean[0], sd[0], unit)}"
+        jump = f"{what} jumps by {value_with_sd(mean[0], sd[0], unit)}"
         if by_row:  # a point between two rows, counted from 0
             return f"{jump} at row {int(mean[1]) + 3} of the table (the header is row 1) and stays there"
-        return f"{jump} at {mean_with_sd(mean[1], sd[1], time_unit)} and stays there"
+        return f"{jump} at {value_with_sd(mean[1], sd[1], time_unit)} and stays there"
 
     def jump_in_time(parameter: str) -> ActBetween:
         return lambda between, theta: between.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))
@@ -133,7 +136,7 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
 
     def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
         far = int(np.argmax(np.abs(mean)))
-        return f"{what} differs from run to run, most in run {names[far]}: by {mean_with_sd(mean[far], sd[far], unit)}"
+        return f"{what} differs from run to run, most in run {names[far]}: by {value_with_sd(mean[far], sd[far], unit)}"
 
     return Modulation(
         at_rows=at_rows,
@@ -167,7 +170,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
         entries=lambda size: sine_and_cosine_entries(size, frequencies),
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
-            f"{what} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], unit)} and a period of "
+            f"{what} oscillates with an amplitude of {value_with_sd(mean[0], sd[0], unit)} and a period of "
             f"{period_with_sd(mean[1], sd[1], time_unit)}"
         ),
         covariates=("time",),

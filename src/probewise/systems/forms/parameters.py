@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from probewise._arrays import FloatArray, varies
+from probewise._words import unit_of_name
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
@@ -51,7 +52,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
                 act=act,
                 guess=size,
                 what=name,
-                unit="",
+                unit=unit_of_name(name),
             )
         for column in columns:
             how = modulations.column_proportional_modulation(column, table)
@@ -64,7 +65,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
                 act=_parameter_shifter(name, how),
                 guess=size,
                 what=name,
-                unit="",
+                unit=unit_of_name(name),
             ):
                 is_scale = isinstance(own.parameters[name], LogUniform)
                 yield _linear_or_by_factor(about, form, name, how) if is_scale else form

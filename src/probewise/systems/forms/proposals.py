@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, varies
+from probewise._words import value_with_sd
 from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, ChangePoints, Form, mean_with_sd
+from probewise.systems.forms.form import Act, ChangePoints, Form
 from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
 from probewise.systems.forms.proposals_in_time import formula_forms_in_time
 from probewise.systems.forms.proposals_of_columns import formula_forms_of_columns
@@ -163,8 +164,8 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         entries=entry,
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} where {name} is above "
-            f"{mean_with_sd(mean[1], sd[1], '')}: a proposal, not a known effect"
+            f"{own.reading} shifts by {value_with_sd(mean[0], sd[0], own.unit)} where {name} is above "
+            f"{value_with_sd(mean[1], sd[1], '')}: a proposal, not a known effect"
         ),
         change_points=ChangePoints(tuple(at), by_row=False, gated=True, column=name),
         expression=f"a {text}",
@@ -184,7 +185,7 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
             return value.with_term(state, lambda s, p, u: a * np.maximum(sign * (s[state] - at), 0.0))
 
         def says(mean: FloatArray, sd: FloatArray, text: str = text) -> str:
-            sizes = f"a = {mean_with_sd(mean[0], sd[0], '')} and at = {mean_with_sd(mean[1], sd[1], '')}"
+            sizes = f"a = {value_with_sd(mean[0], sd[0], '')} and at = {value_with_sd(mean[1], sd[1], '')}"
             return f"the rate of {state} lacks the term a {text} with {sizes}: a proposal, not a known effect"
 
         guess = trial_rate(about, state) / (high - low)
@@ -272,7 +273,7 @@ def _single_term_form(
         entries=np.full((1, 1, 1), typical),
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"{what} lacks the term {text} with a = {mean_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect"
+            f"{what} lacks the term {text} with a = {value_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect"
         ),
         expression=text,
     )

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Form, mean_with_sd, period_with_sd
+from probewise.systems.forms.form import Form, period_with_sd
 from probewise.systems.forms.frequencies import frequency_prior, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, text_rounded_to_spread, time_origin
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
@@ -69,8 +70,8 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
         entries=entries,
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} during "
-            f"{mean_with_sd(mean[3], sd[3], '')} of every "
+            f"{own.reading} shifts by {value_with_sd(mean[0], sd[0], own.unit)} during "
+            f"{value_with_sd(mean[3], sd[3], '')} of every "
             f"{period_with_sd(mean[1], sd[1], about.time_unit)}: a proposal, not a known effect"
         ),
         expression=f"a {text}",
@@ -116,7 +117,7 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
         entries=entries,
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"{own.reading} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], own.unit)} and a frequency "
+            f"{own.reading} oscillates with an amplitude of {value_with_sd(mean[0], sd[0], own.unit)} and a frequency "
             f"that goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
             "proposal, not a known effect"
         ),
@@ -163,9 +164,9 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
         entries=entries,
         amplitudes=(0, 1),
         says=lambda mean, sd: (
-            f"{own.reading} is off by {mean_with_sd(mean[0], sd[0], own.unit)} and "
-            f"{mean_with_sd(mean[1], sd[1], own.unit)} at the start of each run, which settle with time constants of "
-            f"{mean_with_sd(mean[2], sd[2], about.time_unit)} and {mean_with_sd(mean[3], sd[3], about.time_unit)}: a "
+            f"{own.reading} is off by {value_with_sd(mean[0], sd[0], own.unit)} and "
+            f"{value_with_sd(mean[1], sd[1], own.unit)} at the start of each run, which settle with time constants of "
+            f"{value_with_sd(mean[2], sd[2], about.time_unit)} and {value_with_sd(mean[3], sd[3], about.time_unit)}: a "
             "proposal, not a known effect"
         ),
         expression=text,

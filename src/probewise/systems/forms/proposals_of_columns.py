@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.effects.vocabulary import single_column_bank
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Form, mean_with_sd
+from probewise.systems.forms.form import Form
 from probewise.systems.forms.origins import rounded_to_spread, text_rounded_to_spread
 from probewise.systems.table import RunTable, covariate_of_column
 
@@ -59,10 +60,10 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
         entries=typical * entries,
         amplitudes=(0, 1, 2),
         says=lambda mean, sd: (
-            f"{own.reading} rises with {name} by {mean_with_sd(mean[0], sd[0], own.unit)} per sd in the middle of its "
-            f"range, {mean_with_sd(float(mean @ (1, -1, 1)), float(np.hypot(*sd[1:])), own.unit)} at its low end and "
-            f"{mean_with_sd(float(mean.sum()), float(np.hypot(*sd[1:])), own.unit)} at its high end: a proposal, not a "
-            "known effect"
+            f"{own.reading} rises with {name} by {value_with_sd(mean[0], sd[0], own.unit)} per sd in the middle of its "
+            f"range, {value_with_sd(float(mean @ (1, -1, 1)), float(np.hypot(*sd[1:])), own.unit)} at its low end and "
+            f"{value_with_sd(float(mean.sum()), float(np.hypot(*sd[1:])), own.unit)} at its high end: a proposal, "
+            "not a known effect"
         ),
         expression=text,
     )
@@ -111,8 +112,8 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
             entries=single_column_bank(typical, tried),
             amplitudes=(0,),
             says=lambda mean, sd, what=what: (  # type: ignore[misc]  # the second name of a value, not a parameter
-                f"{own.reading} shifts in the end by {mean_with_sd(mean[0], sd[0], own.unit)} as the {summed} of "
-                f"{what} grows in a run, by 63 % of it when that is {mean_with_sd(mean[1], sd[1], '')}: a proposal, "
+                f"{own.reading} shifts in the end by {value_with_sd(mean[0], sd[0], own.unit)} as the {summed} of "
+                f"{what} grows in a run, by 63 % of it when that is {value_with_sd(mean[1], sd[1], '')}: a proposal, "
                 "not a known effect"
             ),
             expression=f"a ({text.split(',')[0]}),{text.split(',', 1)[1]}",

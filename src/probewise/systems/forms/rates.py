@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, rounding_error
+from probewise._words import value_with_sd
 from probewise.effects import name_without_copy_suffix
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
-from probewise.systems.forms.form import Form, mean_with_sd, period_with_sd
+from probewise.systems.forms.form import Form, period_with_sd
 from probewise.systems.forms.frequencies import frequency_prior, max_n_trial_frequencies, trial_frequencies_in_time
 from probewise.systems.forms.origins import origin_in_words, time_origin
 from probewise.systems.motion import LawWithEffects, Limit
@@ -129,8 +130,8 @@ def _rate_term_form(
     def says(mean: FloatArray, sd: FloatArray) -> str:
         _, minus, of = what.partition(" -a ")
         if minus and mean[0] < 0:  # a term that adds to the rate, told without a double negative
-            return f"the rate of {state} lacks a term +b {of}, b = -a = {mean_with_sd(-mean[0], sd[0], '')}"
-        return f"the rate of {state} lacks {what}, a = {mean_with_sd(mean[0], sd[0], '')}"
+            return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], '')}"
+        return f"the rate of {state} lacks {what}, a = {value_with_sd(mean[0], sd[0], '')}"
 
     guess = trial_rate(about, state) / scale
     typical = about.typical_amplitude(Stage.RATE, act, np.full((1, 1, 1), guess), guess)
@@ -168,7 +169,7 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
             entries=entries,
             amplitudes=(),
             says=lambda mean, sd: (
-                f"dry friction slows {state} by {mean_with_sd(mean[0], sd[0], '')} per {about.time_unit}, "
+                f"dry friction slows {state} by {value_with_sd(mean[0], sd[0], '')} per {about.time_unit}, "
                 "and holds it at rest"
             ),
             absent={0: 0.0},
@@ -203,7 +204,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         entries=sine_and_cosine_entries(typical, frequencies),
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "
+            f"the rate of {state} lacks a sinusoidal term with an amplitude of {value_with_sd(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {period_with_sd(mean[1], sd[1], about.time_unit)}"
         ),
         joined=starting_point_of_wave,
@@ -241,7 +242,7 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > ends.least_ceiling else "falls"
-        return f"{state} {way} no further than {mean_with_sd(mean[0], sd[0], '')}" + _spilling_in_words(
+        return f"{state} {way} no further than {value_with_sd(mean[0], sd[0], '')}" + _spilling_in_words(
             others, mean, sd
         )
 
@@ -275,7 +276,7 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
 def _spilling_in_words(others: Sequence[str], mean: FloatArray, sd: FloatArray) -> str:
     """Return a phrase on the states that take up what a bound stops; `mean` holds its level, then their shares."""
     return "".join(
-        f"; {other} takes up {mean_with_sd(mean[k], sd[k], '')} of the rest"
+        f"; {other} takes up {value_with_sd(mean[k], sd[k], '')} of the rest"
         for k, other in enumerate(others, 1)
         if mean[k] > _NO_SHARE
     )

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
 
 from probewise._arrays import BoolArray, FloatArray, distinct_values, rounding_error, varies
+from probewise._words import value_with_sd
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
 from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, Form, mean_with_sd
+from probewise.systems.forms.form import Act, Form
 from probewise.systems.forms.lags import late_forms
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.table import RunTable
@@ -168,8 +169,8 @@ def _settling_form(about: ReferenceFit) -> Iterator[Form]:
         entries=entries,
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"{reading} is off by {mean_with_sd(mean[0], sd[0], unit)} at the start of each run, and settles "
-            f"with a time constant of {mean_with_sd(mean[1], sd[1], time_unit)}"
+            f"{reading} is off by {value_with_sd(mean[0], sd[0], unit)} at the start of each run, and settles "
+            f"with a time constant of {value_with_sd(mean[1], sd[1], time_unit)}"
         ),
     )
 
@@ -212,7 +213,7 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
         entries=np.full((1, 1, 1), about.sd),
         amplitudes=(0,),
         says=lambda mean, sd: (
-            f"{reading} reads {mean_with_sd(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} "
+            f"{reading} reads {value_with_sd(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} "
             "while it rises than while it falls"
         ),
     )
@@ -275,7 +276,7 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
         amplitudes=(0,),
         says=lambda mean, sd: (
             f"{reading} has a bent response, y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at "
-            f"{high:.4g} {unit}, a = {mean_with_sd(mean[0], sd[0], '')}, power = {mean_with_sd(mean[1], sd[1], '')}"
+            f"{high:.4g} {unit}, a = {value_with_sd(mean[0], sd[0], '')}, power = {value_with_sd(mean[1], sd[1], '')}"
         ),
     )
 
@@ -317,7 +318,8 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
         entries=levels[:, None, None],
         amplitudes=(),
         says=lambda mean, sd: (
-            f"{reading} {'rises' if mean[0] > middle else 'falls'} no further than {mean_with_sd(mean[0], sd[0], unit)}"
+            f"{reading} {'rises' if mean[0] > middle else 'falls'} no further than "
+            f"{value_with_sd(mean[0], sd[0], unit)}"
         ),
         absent={0: float(top + 1e3 * span)},
     )

@@ -1,4 +1,4 @@
-"""Names of effects and hypotheses for headlines, in plain words."""
+"""Names of effects, of their parameters and of hypotheses, in plain words."""
 
 from __future__ import annotations
 
@@ -31,6 +31,49 @@ FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
 """A noun phrase for each effect on a user's simulator, with placeholders for its targets."""
 
 
+_PARAMETERS = {
+    "a": "size",
+    "amp": "amplitude",
+    "alias_hz": "frequency",
+    "hz": "frequency",
+    "tau_s": "time constant",
+    "at_s": "time",
+    "at_row": "row (from 0)",
+}
+"""Names of parameters in words; others are their own, without underscores and unit."""
+_SIZES = {
+    "offset_step": "jump",
+    "gain_step": "jump",
+    "steps": "jump",
+    "offset_drift": "drift",
+    "gain_drift": "drift",
+    "drifts": "drift",
+    "sensitivity": "slope",
+    "depends": "slope",
+    "interference": "amplitude",
+    "periodic_error": "amplitude",
+    "periodic_forcing": "amplitude",
+    "input_offset": "offset",
+    "input_gain": "error of scale",
+    "clock_drift": "error of rate",
+    "delay": "delay",
+    "input_delay": "delay",
+}
+"""What the parameter `a` (or the time of a delay) of a kind of effect is."""
+
+
+def parameter_in_words(effect: str, name: str, unit: str) -> str:
+    """Return a parameter's name in words, without its unit: what `a` is, "frequency" of hz, "run 3" of values[3]."""
+    kind = effect.partition(":")[0]
+    if name in ("a", "tau_s") and kind in _SIZES:
+        return _SIZES[kind]
+    if name == "value" and not effect_has_words(effect):
+        return effect  # of a person's own effect
+    if of_run := re.fullmatch(r"values\[(.*)\]", name):
+        return f"run {of_run[1]}"
+    return _PARAMETERS.get(name, name.removesuffix(f"_{unit}").replace("_", " "))
+
+
 def effect_has_words(name: str) -> bool:
     """Return whether an effect has a name in words."""
     kind = name_without_copy_suffix(name).partition(":")[0]
@@ -47,10 +90,10 @@ def effect_in_words(name: str) -> str:
     return {**FORMS_IN_WORDS, **EFFECTS_IN_WORDS}.get(kind, spoken_name(name))
 
 
-def hypothesis_in_words(effects: Sequence[str]) -> str:
-    """Return a hypothesis in words, given its effects: () for clean, ("unknown",) for an effect out of vocabulary."""
+def hypothesis_in_words(effects: Sequence[str], *, nothing: str = "nothing is missing") -> str:
+    """Return a hypothesis in words, given its effects: `nothing` without any, ("unknown",) if out of vocabulary."""
     if not effects:
-        return "nothing is missing"
+        return nothing
     return "something without a name" if tuple(effects) == ("unknown",) else join_names(effects_in_words(effects))
 
 

@@ -172,7 +172,7 @@ def test_a_file_that_cannot_be_used_is_refused_with_the_entry_named(tmp_path, li
 def test_a_file_that_is_not_there_or_not_text_is_refused(tmp_path):
     with pytest.raises(FileError, match="there is no such file"):
         read_geometry(tmp_path / "none.toml")
-    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xff")
     with pytest.raises(FileError, match="UTF-8"):
         read_geometry(tmp_path / "bytes.toml")
 

@@ -134,7 +134,7 @@ def test_a_geometry_that_is_none_is_refused(what, refused, tmp_path):
 @pytest.mark.parametrize("what", TABLES)
 def test_a_table_that_is_none_is_refused(what, refused, recording_file, tmp_path):
     recording_file.write_bytes(TABLES[what])
-    assert "small.csv" in refused("diagnose", recording_file, "--out", tmp_path / "out")
+    assert "small.csv" in refused("diagnose", recording_file, "--out", tmp_path / "out", "--quiet")
 
 
 @pytest.mark.parametrize("what", ARRAYS)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nested_sampling import compare, few, problems, records, references, seeds, ssf
+from nested_sampling import compare, problems, records, references, seeds, ssf
 from nested_sampling.ours import ours
 from nested_sampling.sampler import Counted, Outcome
 from scipy.special import logsumexp
@@ -215,16 +215,6 @@ def test_evaluations_are_counted_and_samples_follow_the_weights() -> None:
     assert two.samples(400, 0).mean() == pytest.approx(1.75)
     assert two.n_eff == pytest.approx(1.6)
     assert two.mean(two.theta[:, 0])[0] == pytest.approx(1.75)
-
-
-@pytest.mark.slow
-def test_few_evaluations_are_compared_at_the_peers_error() -> None:
-    found = few.measure("Rosenbrock 2-D", range(2))
-    assert found["peer"] == "nautilus"
-    assert found["evaluations_ratio"] == pytest.approx(found["evaluations"] / 15_000, abs=0.006)
-    mean_square = np.mean(np.square(found["errors"]))
-    assert found["work_ratio"] == pytest.approx(found["evaluations"] * mean_square / 1.5, rel=0.02, abs=0.006)
-    assert found["worst_z"] == max(map(abs, found["z"])) < 5
 
 
 def test_the_comparison_names_the_best_correct_peer() -> None:

@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from probewise.campaign import run_campaign
-from probewise.challenge import NullRefit
-from probewise.challenge.case import Task
-from probewise.challenge.estimates import estimated_share
 from probewise.diagnosis import diagnose, weigh_thoroughly
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
-from probewise.world.challenge import PLANS, draw_case
+from probewise.proof.campaign import run_campaign
+from probewise.proof.challenge import NullRefit
+from probewise.proof.challenge.case import Task
+from probewise.proof.challenge.estimates import estimated_share
+from probewise.proof.sensors import PLANS, draw_case
 
 Result = Mapping[str, Any]
 _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")

@@ -25,15 +25,15 @@ import numpy as np
 from scipy import stats
 
 from probewise._progress import progress_shown
-from probewise.campaign import run_campaign
-from probewise.challenge.case import Task
 from probewise.diagnosis.judgement.global_test import run_global_test
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
+from probewise.proof.campaign import run_campaign
+from probewise.proof.challenge.case import Task
+from probewise.proof.systems import draw_system_case, system_stratum_of, write_system_case
 from probewise.recordings import write_text_atomically
 from probewise.systems import read_run_table, read_simulator, table_for
-from probewise.world.systems import draw_system_case, system_stratum_of, write_system_case
 
 LEVELS = 0.01, 0.02, 0.05, 0.1, 0.2, 0.5
 

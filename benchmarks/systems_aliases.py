@@ -18,10 +18,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from probewise.campaign import read_campaign
-from probewise.challenge.systems.case import nats_of_alternatives
+from probewise.proof.campaign import read_campaign
+from probewise.proof.challenge.systems.case import nats_of_alternatives
+from probewise.proof.systems import draw_system_case
 from probewise.recordings import write_text_atomically
-from probewise.world.systems import draw_system_case
 
 
 def lacks_rivals(result: Mapping[str, Any], sizes: list[float]) -> bool:

@@ -16,8 +16,8 @@ files. Results display themselves in notebooks.
 The parts are packages, loaded at first use. In the order of one reading's path: `arm` (where readings come from),
 `recordings`, `scene` (what lies under the sensor), `sensor` (from scene to reading), `inference`, `nested` (evidence
 and posterior: `nested.run`), `inquiry` (where to measure next), `experiment` (the loop), `calibration`, `effects`,
-`diagnosis` and `investigation` (what the model leaves out), `systems` (simulators of users), `study`, `challenge`,
-`report`; `world` is an independent simulator, `emulator` a LEGO brick in software.
+`diagnosis` and `investigation` (what the model leaves out), `systems` (simulators of users), `report`;
+`world` is an independent simulator, `emulator` a LEGO brick in software, `proof` measures robot and diagnosis.
 """
 
 from __future__ import annotations
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from probewise import (
         arm,
         calibration,
-        campaign,
-        challenge,
         diagnosis,
         effects,
         emulator,
@@ -46,11 +44,11 @@ if TYPE_CHECKING:
         nested,
         priors,
         progress,
+        proof,
         recordings,
         report,
         scene,
         sensor,
-        study,
         systems,
         world,
     )
@@ -67,8 +65,6 @@ __all__ = [
     "audit",
     "calibrate",
     "calibration",
-    "campaign",
-    "challenge",
     "diagnose",
     "diagnosis",
     "effects",
@@ -83,6 +79,7 @@ __all__ = [
     "predict",
     "priors",
     "progress",
+    "proof",
     "read_plan",
     "read_recording",
     "read_sensor",
@@ -90,7 +87,6 @@ __all__ = [
     "report",
     "scene",
     "sensor",
-    "study",
     "systems",
     "world",
 ]

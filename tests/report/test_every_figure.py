@@ -10,15 +10,16 @@ from matplotlib.text import Text
 from PIL import Image
 
 from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
-from probewise.challenge import Bin
-from probewise.challenge.estimates import estimated_share
 from probewise.errors import ShapeError
 from probewise.nested import run
 from probewise.priors import Product, Uniform
+from probewise.proof import plots as plots_of_campaigns
+from probewise.proof.challenge import Bin
+from probewise.proof.challenge.estimates import estimated_share
+from probewise.proof.study import ConcealedRow, Estimate
 from probewise.recordings import read_recording, shipped
 from probewise.report import plots
 from probewise.sensor import SSFField
-from probewise.study import ConcealedRow, Estimate
 
 X, Y = np.linspace(4, 1044, 66), np.linspace(4, 516, 33)
 
@@ -103,11 +104,13 @@ FIGURES = {
     "residuals_against": lambda s: plots.residuals_against(
         np.arange(40.0), np.sin(np.arange(40.0)), np.zeros(40), label="time (s)", unit="LEGO"
     ),
-    "readings_needed": lambda s: plots.readings_needed(ROWS),
-    "readings_needed, one row": lambda s: plots.readings_needed({"inside, naive": row(16.0)}),
-    "doubt_against_trust": lambda s: plots.doubt_against_trust(CONCEALED),
-    "posterior_widths_of_runs": lambda s: plots.posterior_widths_of_runs(RUNS),
-    "posterior_widths_of_runs, one": lambda s: plots.posterior_widths_of_runs({"inside, SSF": RUNS["inside, SSF"]}),
+    "readings_needed": lambda s: plots_of_campaigns.readings_needed(ROWS),
+    "readings_needed, one row": lambda s: plots_of_campaigns.readings_needed({"inside, naive": row(16.0)}),
+    "doubt_against_trust": lambda s: plots_of_campaigns.doubt_against_trust(CONCEALED),
+    "posterior_widths_of_runs": lambda s: plots_of_campaigns.posterior_widths_of_runs(RUNS),
+    "posterior_widths_of_runs, one": lambda s: plots_of_campaigns.posterior_widths_of_runs(
+        {"inside, SSF": RUNS["inside, SSF"]}
+    ),
     "hypothesis_probabilities": lambda s: plots.hypothesis_probabilities(EFFECTS[:3], [0.5, 0.3, 0.2]),
     "probabilities_by_round": lambda s: plots.probabilities_by_round(
         {
@@ -124,13 +127,15 @@ FIGURES = {
     "residuals_by_scan": lambda s: plots.residuals_by_scan(
         s.recording, np.sin(np.arange(len(s.recording))), np.zeros(len(s.recording))
     ),
-    "reliability_diagram": lambda s: plots.reliability_diagram(
+    "reliability_diagram": lambda s: plots_of_campaigns.reliability_diagram(
         [Bin(0.15, estimated_share([True] * 3 + [False] * 17)), Bin(0.5, estimated_share([True] * 11 + [False] * 9))]
     ),
     "recorded_against_predicted": lambda s: plots.recorded_against_predicted(
         np.arange(40.0), np.arange(40.0) + 0.3, np.ones(40), label="temp_c", unit="degC"
     ),
-    "confusion_matrix": lambda s: plots.confusion_matrix(["a", "b"], ["a", "b"], np.array([[3, 1], [0, 4]])),
+    "confusion_matrix": lambda s: plots_of_campaigns.confusion_matrix(
+        ["a", "b"], ["a", "b"], np.array([[3, 1], [0, 4]])
+    ),
 }
 
 
@@ -149,7 +154,10 @@ def test_every_plot_function_is_here():
         "spread_by_level",
         "residual_histogram",
     }
-    assert {name.partition(",")[0] for name in FIGURES} == set(plots.__all__) - others - of_a_diagnosis
+    assert {name.partition(",")[0] for name in FIGURES} == {
+        *plots.__all__,
+        *plots_of_campaigns.__all__,
+    } - others - of_a_diagnosis
 
 
 @pytest.mark.slow

@@ -9,11 +9,11 @@ from probewise.errors import ParameterError
 from probewise.experiment import with_cards
 from probewise.experiment.rivals import rivals_of
 from probewise.inquiry import CardedForecast, TabulatedChain, forecast_of
+from probewise.proof.study import experiment_of
+from probewise.proof.study.rows import REFERENCE
+from probewise.proof.study.trial import BRIGHT, DARK, footprint_pixels
 from probewise.recordings import Disc, Plan
 from probewise.scene import Card, CardedScene
-from probewise.study import experiment_of
-from probewise.study.rows import REFERENCE
-from probewise.study.trial import BRIGHT, DARK, footprint_pixels
 from probewise.world import World
 
 CARDS = (Card(300.0, 200.0, 60.0, 40.0, 0.5), Card(700.0, 100.0, 30.0, 30.0, 1.0))

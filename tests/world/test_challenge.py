@@ -10,8 +10,7 @@ import pytest
 from scipy.stats import kstest
 
 from probewise.errors import NotConvergedError
-from probewise.recordings import fingerprint, read_recording, write_recording
-from probewise.world.challenge import (
+from probewise.proof.sensors import (
     INSIDE,
     NEEDS_SENSOR,
     NOISE_LEVELS,
@@ -29,10 +28,11 @@ from probewise.world.challenge import (
     held_out_recordings,
     stratum_of,
 )
-from probewise.world.challenge.effect_samplers import CleanSetup
-from probewise.world.challenge.regions import CovariateRegion, region_of_effect
-from probewise.world.challenge.sensors import draw_spot
-from probewise.world.challenge.sizing import EffectSizer
+from probewise.proof.sensors.effect_samplers import CleanSetup
+from probewise.proof.sensors.regions import CovariateRegion, region_of_effect
+from probewise.proof.sensors.sensors import draw_spot
+from probewise.proof.sensors.sizing import EffectSizer
+from probewise.recordings import fingerprint, read_recording, write_recording
 
 
 def left_by_levels(clean, changed):

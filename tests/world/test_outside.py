@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from probewise.proof.sensors import INSIDE, OUTSIDE
 from probewise.recordings import HalfPlane
 from probewise.world import Blob, World, gaussian_spot
-from probewise.world.challenge import INSIDE, OUTSIDE
 from probewise.world.concealed import (
     AfterGlow,
     Chirp,

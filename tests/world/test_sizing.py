@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from probewise.errors import NotConvergedError, ParameterError
+from probewise.proof.sensors import EffectSizer, amplitude_of_size
+from probewise.proof.sensors.effect_samplers import CleanSetup
+from probewise.proof.sensors.sizing import noise_effect_size
 from probewise.world import World, gaussian_spot
-from probewise.world.challenge import EffectSizer, amplitude_of_size
-from probewise.world.challenge.effect_samplers import CleanSetup
-from probewise.world.challenge.sizing import noise_effect_size
 from probewise.world.concealed import (
     AmbientGradient,
     CorrelatedNoise,

@@ -66,7 +66,7 @@ def executor_and_progress(
 
 def message_to_resume_campaign(path: Path, noun: str, arguments: argparse.Namespace) -> str:
     """Return a message: how many finished tasks a campaign's file holds, and the command that resumes it."""
-    from probewise.campaign import read_campaign
+    from probewise.proof.campaign import read_campaign
 
     return (
         message_to_resume(path, len(read_campaign(path).results), noun, arguments)

@@ -24,10 +24,10 @@ from probewise.errors import ParameterError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from probewise.study import SearchConfiguration
+    from probewise.proof.study import SearchConfiguration
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
-MOST_CIRCLES = 10_000  # as of `probewise.study`, which takes a second to import
+MOST_CIRCLES = 10_000  # as of `probewise.proof.study`, which takes a second to import
 _SIZES = ("small", "plain", "gross")
 
 
@@ -79,8 +79,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks; write its table and report; return the exit status."""
     from probewise._progress import progress_shown
-    from probewise.report import study as report
-    from probewise.study import run_study
+    from probewise.proof.report import study as report
+    from probewise.proof.study import run_study
 
     out = checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
     if arguments.concealed:
@@ -115,9 +115,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run the remaining tasks of the study of concealed effects; write its table and report; return the exit status."""
+    from probewise.proof.report import concealed as report
+    from probewise.proof.study import concealed_csv_rows, concealed_rows, run_concealed
     from probewise.recordings.table import csv_text_of_rows
-    from probewise.report import concealed as report
-    from probewise.study import concealed_csv_rows, concealed_rows, run_concealed
 
     others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
     others += ["--beside-paper"] if arguments.beside_paper else []
@@ -148,7 +148,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
 
 
 def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:
-    from probewise.study import SearchConfiguration, paper_comparison_rows, standard_rows
+    from probewise.proof.study import SearchConfiguration, paper_comparison_rows, standard_rows
 
     given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
     if arguments.beside_paper:

@@ -6,9 +6,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from probewise.report import audit, calibration, challenge, demo, diagnosis, exploration, fit, plots, study
+    from probewise.report import audit, calibration, demo, diagnosis, exploration, fit, plots
 
-__all__ = ["audit", "calibration", "challenge", "demo", "diagnosis", "exploration", "fit", "plots", "study"]
+__all__ = ["audit", "calibration", "demo", "diagnosis", "exploration", "fit", "plots"]
 
 
 def __getattr__(name: str) -> object:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from probewise.calibration import read_sensor, write_sensor
-from probewise.challenge import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
 from probewise.diagnosis.fitting.sensor_prior import sensor_from_samples
 from probewise.experiment import experiment_for
+from probewise.proof.challenge import NullRefit
+from probewise.proof.sensors import Case, draw_case
 from probewise.scene import Circle, Field
-from probewise.world.challenge import Case, draw_case
 
 
 def diagnosed(number: int) -> tuple[Case, Diagnosis]:

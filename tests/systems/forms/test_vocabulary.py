@@ -5,9 +5,9 @@ import pytest
 
 from probewise.diagnosis.effect_words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.effects import name_without_copy_suffix
+from probewise.proof.systems.vocabulary import FAMILIES
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.world.systems.vocabulary import FAMILIES
 
 _T = np.tile(np.arange(0.0, 6.0, 0.2), 2)
 TABLE = RunTable(

@@ -13,8 +13,6 @@ from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
 from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_axes, png, stack_of_axes, svg
-from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
-from probewise.report.plots.concealed import doubt_against_trust
 from probewise.report.plots.doubt import effect_probabilities_by_reading
 from probewise.report.plots.fit import recorded_against_predicted
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
@@ -39,7 +37,6 @@ from probewise.report.plots.residuals import (
 from probewise.report.plots.scans import readings_before_and_after_repair, residuals_by_scan
 from probewise.report.plots.scene import draw_field_legend, playing_field
 from probewise.report.plots.ssf import spatial_sensitivity, ssf_by_n_gaussians
-from probewise.report.plots.study import posterior_widths_of_runs, readings_needed
 from probewise.report.plots.verdict import hypothesis_probabilities, probabilities_by_round
 
 __all__ = [
@@ -48,9 +45,7 @@ __all__ = [
     "AxesGrid",
     "arm_and_sensor",
     "audit_matrix",
-    "confusion_matrix",
     "corner_plot",
-    "doubt_against_trust",
     "draw_field_legend",
     "effect_probabilities_by_reading",
     "grid_of_axes",
@@ -63,7 +58,6 @@ __all__ = [
     "playing_field",
     "png",
     "posterior_widths",
-    "posterior_widths_of_runs",
     "predicted_and_recorded_by_scan",
     "probabilities_by_round",
     "quadrant_patterns",
@@ -72,9 +66,7 @@ __all__ = [
     "readings_by_orientation",
     "readings_in_order",
     "readings_modulo_step",
-    "readings_needed",
     "recorded_against_predicted",
-    "reliability_diagram",
     "residual_autocorrelation",
     "residual_histogram",
     "residuals_against",

@@ -1,0 +1,211 @@
+"""Draw a case: a simulated recording, its concealed effects, and held-out plans to test the diagnosis on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise.errors import NotConvergedError
+from probewise.proof.sensors.effect_samplers import CleanSetup
+from probewise.proof.sensors.in_vocabulary import INSIDE, PAIRABLE, SINGLES
+from probewise.proof.sensors.out_of_vocabulary import OUTSIDE
+from probewise.proof.sensors.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
+from probewise.proof.sensors.regions import region_of_effect
+from probewise.proof.sensors.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise_model
+from probewise.proof.sensors.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
+from probewise.proof.sensors.strata import Stratum, stratum_of
+from probewise.proof.sensors.truth import AliasedEffect, HiddenEffect, Truth
+from probewise.recordings.plan import Instrumentation, Plan, Recording
+from probewise.world.concealed import Disturbs
+from probewise.world.world import World
+
+ALIASES: tuple[tuple[str, str], ...] = (
+    ("backlash", "edge_misplacement"),
+    ("height_gradient", "albedo_gradient"),
+    ("lag", "edge_misplacement"),
+    ("edge_misplacement", "sensor_tilt"),
+    ("backlash", "sensor_tilt"),
+)
+"""Pairs of effects that may be aliased in the paper's plan; either may be concealed."""
+
+_ALIASED_NATS = 3.0  # below it two effects are aliased (diagnosis, section 3)
+_MOST_COSINE = 0.5  # upper bound on the cosine of a pair
+_ATTEMPTS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One case of a challenge.
+
+    Parameters
+    ----------
+    recording
+        The recording to diagnose.
+    truth
+        The truth that the diagnosis is scored against.
+    world
+        The simulated sensor with its concealed effects.
+    test_plans
+        Plans of the held-out readings, by name: "angle", "pattern", "direction" (`held_out_plans`).
+    test_seed
+        Seed sequence of the noise of the held-out readings.
+    """
+
+    recording: Recording
+    truth: Truth
+    world: World
+    test_plans: Mapping[str, Plan]
+    test_seed: np.random.SeedSequence
+
+
+def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Case:
+    """Draw case `number` of a challenge; it depends on the seed and the number alone.
+
+    Parameters
+    ----------
+    seed
+        The secret seed of the challenge.
+    number
+        Number of the case, from 0: determines its stratum (`stratum_of`) and, with the seed, everything else.
+    norm_after_refit
+        Function of two noise-free recordings, without and with an effect: norm of the effect after a full refit of the
+        null model, in reading units.
+
+    Raises
+    ------
+    NotConvergedError
+        If none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an alias's loss < 3.
+    """
+    stratum, n_earlier = stratum_of(number)
+    drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
+    rng = np.random.default_rng(drawing)
+    ssf = "gaussian" if stratum.kind == "ssf_order" else str(rng.choice(list(SSFS)))
+    level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
+    sensor = draw_sensor(ssf, level, rng=rng)
+    plan_names = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
+    plan_name, setup, chosen = _draw_plan_and_effects(
+        stratum, n_earlier, plan_names, sensor, norm_after_refit, rng=rng, plan_rng=np.random.default_rng(plan_seed)
+    )
+    if any(isinstance(hidden.effect, Disturbs) for hidden in chosen.hidden):
+        model = "white"  # only one noise fault at a time
+    plan = replace(setup.plan, instrumentation=_simulated_instrumentation(setup.plan, model))
+    concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in chosen.hidden))
+    world = with_noise_model(concealing, model, duration_s=setup.duration_s)
+    truth = Truth(
+        seed=seed,
+        number=number,
+        stratum=stratum,
+        ssf=ssf,
+        noise_level=level,
+        noise_model=model,
+        plan=plan_name,
+        noise_sd=world.noise_sd,
+        black=world.black,
+        white=world.white,
+        hidden=chosen.hidden,
+        cosine=chosen.cosine,
+        alias=chosen.alias,
+    )
+    recording = world.simulate(plan, rng=np.random.default_rng(noise))
+    return Case(recording, truth, world, held_out_plans(plan, rng=np.random.default_rng(test)), test_noise)
+
+
+def held_out_recordings(case: Case) -> dict[str, Recording]:
+    """Simulate the held-out plans of a case in its world; return the recordings by name of the plan.
+
+    They follow the recording in time: effects in time continue; effects tied to a named scan do not act.
+    """
+    rng = np.random.default_rng(case.test_seed)
+    return {name: case.world.simulate(plan, rng=rng) for name, plan in case.test_plans.items()}
+
+
+@dataclass(frozen=True)
+class _ConcealedEffects:
+    """Effects chosen for a case; the cosine of a pair, or the alias, is None in other strata."""
+
+    hidden: tuple[HiddenEffect, ...] = ()
+    cosine: float | None = None
+    alias: AliasedEffect | None = None
+
+
+def _draw_plan_and_effects(
+    stratum: Stratum,
+    n_earlier: int,
+    plan_names: list[str],
+    sensor: World,
+    norm_after_refit: NormAfterRefit,
+    *,
+    rng: np.random.Generator,
+    plan_rng: np.random.Generator,
+) -> tuple[str, CleanSetup, _ConcealedEffects]:
+    """Draw a plan and up to six times the stratum's effects, plan after plan, until the effects fit the stratum.
+
+    Return the plan's name, the plan with its effect-free world, and the effects; raise NotConvergedError if none fit.
+    """
+    failure = NotConvergedError("no plan to try")
+    for plan_name in plan_names:
+        setup = CleanSetup(draw_plan_with_displaced_patterns(plan_name, rng=plan_rng), sensor)
+        if stratum.kind == "clean":
+            return plan_name, setup, _ConcealedEffects()
+        sizer = EffectSizer(setup, norm_after_refit)
+        for _ in range(_ATTEMPTS):
+            try:
+                return plan_name, setup, _draw_effects(stratum, n_earlier, setup, sizer, rng)
+            except NotConvergedError as error:
+                failure = error
+    raise failure
+
+
+def _draw_effects(
+    stratum: Stratum, n_earlier: int, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
+) -> _ConcealedEffects:
+    """Draw the effects of a stratum once.
+
+    Raises NotConvergedError if they cannot have the size, a pair's abs(cosine) is 0.5 or more, an alias loses 3.
+    """
+
+    def draw_effect(name: str) -> HiddenEffect:
+        return _draw_effect_of_size(name, stratum.size, setup, sizer, rng)
+
+    match stratum.kind:
+        case "single":
+            return _ConcealedEffects((draw_effect(SINGLES[n_earlier % len(SINGLES)]),))
+        case "outside":
+            return _ConcealedEffects((draw_effect(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),))
+        case "pair":
+            first, second = (draw_effect(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
+            cosine = sizer.cosine(first.effect, second.effect)
+            if abs(cosine) >= _MOST_COSINE:
+                raise NotConvergedError(f"{first.name} and {second.name} are too similar: cosine {cosine:.2f}")
+            return _ConcealedEffects((first, second), cosine=cosine)
+        case "alias":
+            hidden, other = (draw_effect(str(name)) for name in rng.permutation(ALIASES[n_earlier % len(ALIASES)]))
+            cosine = sizer.cosine(hidden.effect, other.effect)
+            if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
+                raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
+            return _ConcealedEffects((hidden,), alias=AliasedEffect(other.effect, cosine))
+        case _:
+            return _ConcealedEffects((draw_effect(stratum.kind),))
+
+
+def _draw_effect_of_size(
+    name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
+) -> HiddenEffect:
+    """Return the effect `name`, other parameters drawn, with lambda about `wanted`, or at its fixed amplitude."""
+    sampler = INSIDE.get(name) or OUTSIDE[name]
+    of_amplitude = sampler.draw(setup, rng)
+    amplitude = sampler.first
+    if sampler.scalable:
+        amplitude = amplitude_of_size(
+            lambda a: sizer.size(of_amplitude(a)), wanted, first=sampler.first, limit=sampler.limit
+        )
+    effect = of_amplitude(amplitude)
+    return HiddenEffect(effect, sizer.size(effect), region_of_effect(effect, sizer))
+
+
+def _simulated_instrumentation(plan: Plan, model: str) -> Instrumentation:
+    """Return a plan's instrumentation, described as simulated; rounding step 1 for "quantised" noise, else None."""
+    step = 1.0 if model == "quantised" else None
+    return replace(plan.instrumentation, step=step, description="Simulated readings of a challenge")

@@ -1,0 +1,86 @@
+"""Do other effects explain the readings of a case? Their best fit to its noise-free readings."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import NotConvergedError
+from probewise.proof.systems.cases import DrawnSystem, SystemCase
+from probewise.proof.systems.fit import LeastSquaresFit, ModelWithForms, project_out
+from probewise.proof.systems.forms.form import Form
+from probewise.proof.systems.rivals import linearised_starts, vocabulary_name
+from probewise.proof.systems.vocabulary import forms_of
+
+_MOST_NAMES = 2
+_N_STARTS = 2  # of each effect, those of the least linearised loss
+_N_CHANGE_POINTS = 80
+
+
+def nats_of_alternative(case: SystemCase, names: Sequence[str]) -> float:
+    """Return how many nats of log likelihood the best fit of other effects loses on a case's noise-free readings.
+
+    Parameters
+    ----------
+    case
+        The case, with one concealed effect or more.
+    names
+        One or two names of the vocabulary, with their targets; fitted together with the nominal model.
+
+    Returns
+    -------
+    The loss, 0 or more; infinite for more names, for those that this system does not have, and where no fit converges.
+    """
+    drawn = case.drawn
+    forms = [_forms_of_name(drawn, name) for name in names]
+    if not 0 < len(names) <= _MOST_NAMES or not all(forms):
+        return np.inf
+    target = drawn.simulate_diagnosed_rows([effect.form_with_parameters for effect in case.effects])
+    start = drawn.nominal_model.fit(target, drawn.true_coordinates)
+    # Which effect is added first decides where the fit begins.
+    orders = list(itertools.permutations(forms))
+    return min(_least_nats(drawn, target, drawn.nominal_model, start, order) for order in orders)
+
+
+def _least_nats(
+    drawn: DrawnSystem, target: FloatArray, model: ModelWithForms, fitted: LeastSquaresFit, more: Sequence[list[Form]]
+) -> float:
+    """Add effects, one of each list of forms, to a fit one after the other; return the least loss, nats."""
+    if not more:
+        return 0.5 * fitted.chi_square
+    left = project_out((target - fitted.readings) / drawn.true_system.noise_sd, fitted.slopes)
+    starts = linearised_starts(drawn.true_system, more[0], left, fitted, model)
+    found = [np.inf]
+    for candidate in sorted(starts, key=lambda candidate: candidate.nats)[:_N_STARTS]:
+        wider, begin = model.with_form(candidate.form, candidate.start, fitted.coordinates)
+        try:
+            again = wider.fit(target, begin, max_calls=12)
+        except NotConvergedError:
+            continue
+        found.append(_least_nats(drawn, target, wider, again, more[1:]))
+    return min(found)
+
+
+def _forms_of_name(drawn: DrawnSystem, name: str) -> list[Form]:
+    """Return the forms of a name of the vocabulary in this system, steps at many times; none if it has no such form."""
+    return [
+        _with_many_change_points(form, drawn) for form in forms_of(drawn.true_system) if vocabulary_name(form) == name
+    ]
+
+
+def _with_many_change_points(form: Form, drawn: DrawnSystem) -> Form:
+    """Return a form whose bank has a step, if it is one, at 80 quantiles of the rows and at the start of each run."""
+    first = form.bank[0][0]
+    at = next((key for key in ("at_s", "at_row") if key in first), None)
+    if at is None:
+        return form
+    table = drawn.diagnosed_table
+    along = table.t if at == "at_s" else np.arange(float(len(table)))
+    between = np.unique(0.5 * (np.sort(along)[1:] + np.sort(along)[:-1]))
+    starts = [0.5 * (along[own[0]] + along[own[0] - 1]) for own in table.rows_by_run if own[0] > 0]
+    moments = np.unique([*np.quantile(between, np.linspace(0, 1, _N_CHANGE_POINTS), method="nearest"), *starts])
+    return replace(form, bank=[[{**first, at: float(moment)}] for moment in moments])

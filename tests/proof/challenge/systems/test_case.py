@@ -1,0 +1,37 @@
+"""One case, from its seed to what was stated."""
+
+import json
+
+import pytest
+
+from probewise.proof.challenge import run_challenge
+from probewise.proof.challenge.case import Task
+from probewise.proof.challenge.systems import run_system_case, score_systems
+
+
+@pytest.mark.slow
+def test_a_case_is_diagnosed_from_its_files_and_the_campaign_goes_on(tmp_path):
+    path = tmp_path / "cases.jsonl"
+    first = run_challenge(1, seed=5, work=run_system_case, of="systems", path=path)
+    both = run_challenge(2, seed=5, work=run_system_case, of="systems", path=path)
+    assert both[0] == first[0]
+    assert "failed" not in both[0]
+    assert set(both[0]["held_out"]) == {"inside", "beyond"}
+    assert len(path.read_text().splitlines()) == 3
+    assert any(row.found.n for row in score_systems(both))
+
+
+@pytest.mark.slow
+def test_a_case_is_the_same_each_time():
+    one, again = (run_system_case(Task(5, 0)) | {"cpu_s": 0.0} for _ in range(2))
+    assert json.dumps(one) == json.dumps(again)
+
+
+@pytest.mark.single_case
+@pytest.mark.slow
+def test_a_slow_wave_is_not_left_to_a_walk_of_the_noise():
+    """A case that was `unknown` at .71: fitted beside a walk alone, a wave of a run and a half had no amplitude."""
+    found = run_system_case(Task(60353, 2))
+    assert found["truth"] == ["interference"]
+    assert found["hypotheses"][0][0] == ["interference"]
+    assert found["hypotheses"][0][1] > 0.9

@@ -1,0 +1,69 @@
+"""One case from beginning to end, and the campaign that it belongs to."""
+
+import json
+
+import pytest
+
+from probewise.errors import FileError, ParameterError
+from probewise.proof.challenge import Task, run_case, run_challenge, score
+from probewise.proof.sensors import stratum_of
+
+
+@pytest.fixture
+def file_of(tmp_path, make):
+    """Write a campaign's file of cases made by hand."""
+
+    def write(results, seed=3, version=None):
+        from probewise import __version__
+
+        settings = {"challenge": version or __version__, "seed": seed}
+        lines = [{"format": "campaign/1", "settings": settings}]
+        lines += [{"key": Task(seed, k).key, "result": r} for k, r in enumerate(results)]
+        path = tmp_path / "cases.jsonl"
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        return path
+
+    return write
+
+
+def test_what_a_file_holds_is_not_done_again(file_of, make):
+    results = [make.case(), make.single()]
+    assert list(run_challenge(2, seed=3, path=file_of(results))) == results
+
+
+def test_another_version_s_cases_are_not_mixed_in(file_of, make):
+    with pytest.raises(FileError, match="other settings"):
+        run_challenge(1, seed=3, path=file_of([make.case()], version="0.0"))
+
+
+def test_no_case_is_no_challenge(tmp_path):
+    with pytest.raises(ParameterError, match="n_cases"):
+        run_challenge(0, seed=3, path=tmp_path / "x")
+
+
+def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):
+    def fails(*_, **__):
+        raise ZeroDivisionError("by zero")
+
+    monkeypatch.setattr("probewise.proof.challenge.case.draw_case", fails)
+    found = run_case(Task(1, 0))
+    assert (found["failed"], found["at"]) == ("ZeroDivisionError: by zero", "drawing")
+    assert found["kind"] == stratum_of(0)[0].kind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 9])
+def test_a_case_goes_through_strict_json_into_every_row(number):
+    """And one of them again: it depends on its seed and number alone."""
+    found = run_case(Task(1, number))
+    if number == 1:
+        assert {**run_case(Task(1, number)), "cpu_s": None} == {**found, "cpu_s": None}
+    found = json.loads(json.dumps(found, allow_nan=False))
+    assert "failed" not in found
+    assert found["kind"] == stratum_of(number)[0].kind
+    assert (found["settled"] is not None) == (found["kind"] == "alias")
+    assert sum(p for _, p in found["hypotheses"]) == pytest.approx(1.0, abs=0.05)
+    for h in found["hidden"]:
+        assert h["size_lambda"] == pytest.approx(found["size"], rel=0.1)
+        assert h["cosines"][h["name"]] > 0.98
+    assert score([found])

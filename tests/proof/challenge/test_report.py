@@ -1,0 +1,73 @@
+"""The page of a challenge and its files."""
+
+import csv
+import io
+import json
+
+import pytest
+
+from probewise.cli import main
+from probewise.proof import plots
+from probewise.proof.challenge import Task, confusion_counts, reliability_bins, score
+from probewise.proof.report import challenge as report
+
+
+@pytest.fixture
+def results(make):
+    failed = {"kind": "pair", "size": 12.0, "other_noise": False, "failed": "no <plan>", "at": "drawing"}
+    return [make.case(), make.case(p=0.6), make.single(), make.single(said=["halo"]), make.outside(), failed]
+
+
+def test_the_answer_counts_targets(results):
+    rows = score(results)
+    assert report.summary_sentence(rows, 6).startswith("6 cases of concealed physics: ")
+    open_rows = sum(row.decision == "open" for row in rows)
+    assert f"{open_rows} undecided by so few cases" in report.summary_sentence(rows, 6)
+    assert len(report.summary_sentence(rows, 6).split()) <= 20
+
+
+def test_the_csv_leaves_out_what_is_not_there(results):
+    lines = list(csv.DictReader(io.StringIO(report.target_table_csv(score(results)))))
+    by_name = {line["what"]: line for line in lines}
+    assert by_name["right name first, lambda 8"]["found"] == "0.5"
+    assert by_name["right name first, lambda 6"]["found"] == ""
+    assert by_name["false alarms, clean, alpha .05"]["target_most"] == "0.06"
+    assert by_name["detection, alpha .01, lambda 8"]["decision"] == "cannot decide"
+
+
+def test_the_page_stands_alone_and_tells_of_failures(results):
+    page = report.page_html(results, score(results), command="probewise challenge")
+    assert "no &lt;plan&gt;" in page
+    assert page.count("data:image/png;base64,") == 2
+    assert "http://" not in page
+
+
+def test_nothing_but_failures_still_makes_a_page(results):
+    assert "Cases that failed" in report.page_html(results[-1:], score(results[-1:]), command="probewise challenge")
+
+
+def test_the_matrix_writes_every_count(results):
+    truths, said, counts = confusion_counts([r for r in results if "failed" not in r])
+    ax = plots.confusion_matrix(truths, said, counts)
+    assert sorted(t.get_text() for t in ax.texts) == ["1", "1", "1", "2"]
+    assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)
+
+
+@pytest.mark.slow
+def test_the_diagram_says_of_how_many(results):
+    ax = plots.reliability_diagram(reliability_bins(results[:-1]))
+    assert [t.get_text() for t in ax.texts] == ["1", "4"]
+
+
+def test_the_verb_scores_what_its_file_holds(results, tmp_path, capsys):
+    from probewise import __version__
+
+    out = tmp_path / "out"
+    out.mkdir()
+    lines = [{"format": "campaign/1", "settings": {"challenge": __version__, "seed": 5}}]
+    lines += [{"key": Task(5, k).key, "result": r} for k, r in enumerate(results)]
+    (out / "cases.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert main(["challenge", "--cases", "6", "--seed", "5", "--out", str(out)]) == 0
+    assert "6 cases" in capsys.readouterr().out
+    assert (out / "table.csv").read_text().startswith("what,found")
+    assert "probewise challenge --cases 6 --seed 5" in (out / "report.html").read_text()

@@ -1,0 +1,160 @@
+"""A study is the same whoever does it: here, processes, or machines of which one is lost."""
+
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import pytest
+
+from probewise.errors import FileError, ParameterError
+from probewise.proof.campaign import run_campaign
+from probewise.proof.study import (
+    REFERENCE,
+    SearchConfiguration,
+    Trial,
+    paper_comparison_rows,
+    read_study,
+    run_study,
+    run_trial,
+)
+from probewise.proof.study.trial import experiment_of_trial
+
+ROWS = [REFERENCE, SearchConfiguration(model="naive")]
+BRIEF = {"n_circles": 2, "max_readings": 3}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    path = tmp_path_factory.mktemp("study") / "trials.jsonl"
+    return run_study(ROWS, path=path, **BRIEF), path
+
+
+def timeless(study):
+    return {
+        row: [{key: value for key, value in t.items() if key != "cpu_s"} for t in trials]
+        for row, trials in study.trials.items()
+    }
+
+
+@pytest.mark.slow
+def test_the_robot_knows_the_circle_when_it_stops():
+    trial = run_trial(Trial(REFERENCE, 2))
+    assert trial["reached"]
+    assert trial["error_mm"] < 12
+    assert len(trial["widest_mm"]) == trial["readings"]
+    assert trial["widest_mm"][-1] < 4 <= trial["widest_mm"][-2]
+    assert trial["first_white"] < trial["readings"]
+    assert trial["bits_at_white"] < trial["bits"]
+
+
+@pytest.mark.slow
+def test_a_run_that_may_not_go_on_is_a_miss(study):
+    table = study[0].table()
+    for row in ROWS:
+        assert [t["reached"] for t in study[0].trials[row]] == [False, False]
+        assert [t["readings"] for t in study[0].trials[row]] == [3, 3]
+        assert table[row].mean.value == 3
+        assert table[row].reached.value == 0
+
+
+@pytest.mark.slow
+def test_the_papers_method_stands_beside_ours_on_the_same_circle():
+    """The first place is drawn by the same rule from other samples; levels come from readings before the run."""
+    ours, paper, _, naive = rows = paper_comparison_rows(nested_stop="remaining")
+    assert [row.method for row in rows] == ["particles", "paper"] * 2
+    assert paper.name == "inside, SSF, the paper's method to remaining evidence"
+    assert ours == REFERENCE
+    for row in (paper, naive):
+        found = run_trial(Trial(row, 0, max_readings=1))
+        assert (found["readings"], found["reached"]) == (1, False)
+    one, again, other = (experiment_of_trial(Trial(naive, k)).likelihood for k in (0, 0, 1))
+    assert one == again != other
+    assert abs(one.mu_black - 10) < 5 / 20**0.5
+    assert abs(one.mu_white - 60) < 5 / 20**0.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"method": "other"}, "method"),
+        ({"method": "paper"}, "utility, learn_sensor, batch"),
+        ({"method": "paper", "utility": "entropy", "learn_sensor": True}, "utility, learn_sensor, batch"),
+        ({"method": "paper", "utility": "entropy", "nested_stop": "never"}, "nested_stop"),
+        ({"nested_stop": "remaining"}, "nested_stop"),
+    ],
+)
+def test_rows_that_cannot_be_are_refused(changes, named):
+    with pytest.raises(ParameterError) as caught:
+        SearchConfiguration(**changes)
+    assert caught.value.name == named
+
+
+def test_rows_that_differ_have_names_that_differ():
+    rows = [
+        SearchConfiguration(**{name: value})
+        for name in ("width", "noise_sd")
+        for value in (1.254, 1.25, 1.3, 1.3000001, 0.996, 0.7)
+    ]
+    assert len({row.name for row in rows}) == len(rows)
+    assert [rows[k].name.split(", ")[-1] for k in (0, 1, 2, 5, 9)] == [
+        "believed 1.254 times as wide",
+        "believed 25% too wide",
+        "believed 30% too wide",
+        "believed 30% too narrow",
+        "noise 1.3000001",
+    ]
+
+
+@pytest.mark.slow
+def test_other_processes_come_to_the_same(study, tmp_path):
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        other = run_study(ROWS, path=tmp_path / "trials.jsonl", executor=pool, **BRIEF)
+    assert timeless(other) == timeless(study[0])
+
+
+def test_what_a_file_holds_is_not_done_again(study):
+    told = []
+    again = run_study({REFERENCE: 1}, path=study[1], max_readings=3, progress=lambda *words: told.append(words))
+    assert told == [("runs", 1, 1)]
+    assert again.trials[REFERENCE] == study[0].trials[REFERENCE][:1]
+    assert list(again.table()) == []
+    assert read_study(study[1], ROWS).trials == study[0].trials
+
+
+def test_wrong_files_and_numbers_are_refused(study, tmp_path):
+    path = tmp_path / "other.jsonl"
+    run_campaign(dict, {}, path=path, settings={"something": "else"})
+    with pytest.raises(FileError, match="no study's"):
+        read_study(path, [REFERENCE])
+    with pytest.raises(FileError, match="other settings"):
+        run_study([REFERENCE], 1, path=study[1])
+    with pytest.raises(ParameterError, match="1 or more"):
+        run_study([REFERENCE], path=tmp_path / "none.jsonl")
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_loses_and_counts_twice_nothing(study, tmp_path):
+    """Two workers on this machine; one is killed as soon as the first run has ended."""
+    distributed = pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    path, killed = tmp_path / "trials.jsonl", []
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, processes=True, host="127.0.0.1"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        victim = cluster.workers[0].process.process
+
+        def kill(stage, done, total, note=""):
+            if note and not killed:
+                victim._process.kill()
+                killed.append(note)
+
+        found = run_study(ROWS, path=path, executor=client.get_executor(pure=False), progress=kill, **BRIEF)
+    assert killed
+    assert timeless(found) == timeless(study[0])
+    assert len(path.read_text().splitlines()) == 1 + 4
+
+
+def test_a_study_without_rows_is_refused(tmp_path):
+    with pytest.raises(ParameterError, match="one row or more"):
+        run_study([], 2, path=tmp_path / "trials.jsonl")

@@ -1,0 +1,110 @@
+"""What is said of many runs: numbers with errors that hold."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, poisson
+
+from probewise.errors import ParameterError
+from probewise.proof.study import (
+    POPULATIONS,
+    SearchConfiguration,
+    noise_of_run_in_sds,
+    share_with_interval,
+    standard_rows,
+    summarise,
+)
+
+
+def trial(readings: int, *, reached: bool = True, first_white: int | None = 3, error_mm: float = 1.0) -> dict:
+    return {
+        "reached": reached,
+        "readings": readings,
+        "first_white": first_white,
+        "bits": 20.0,
+        "bits_at_white": 8.0,
+        "error_mm": error_mm,
+        "chance_wrong": 0.001,
+        "held": [True, True, False],
+        "arm_s": 10.0 * readings,
+        "cpu_s": 0.1,
+        "widest_mm": [50.0] * readings,
+        "p_value": 0.5,
+    }
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 50), (1, 7), (89, 100), (200, 200)])
+def test_a_share_has_wilsons_interval(k, n):
+    """Its ends are as many standard errors of theirs from the share as 95 % of a normal distribution (Wilson 1927)."""
+    found, z2 = share_with_interval(k, n), chi2.ppf(0.95, 1)
+    ends = np.roots([1 + z2 / n, -2 * k / n - z2 / n, (k / n) ** 2])
+    assert (found.value, found.low, found.high) == pytest.approx((k / n, min(ends), max(ends)), abs=1e-12)
+
+
+def test_a_miss_counts_as_the_limit_and_says_nothing_of_what_comes_after_white():
+    found = summarise([trial(8), trial(14), trial(100, reached=False, first_white=None)], max_readings=100)
+    assert found.mean.value == pytest.approx((8 + 14 + 100) / 3)
+    assert found.median.value == 14
+    assert found.after_white.value == pytest.approx((5 + 11) / 2)
+    assert found.to_white.value == pytest.approx((3 + 3 + 100) / 3)
+    assert found.reached.value == pytest.approx(2 / 3)
+    assert found.held.value == pytest.approx(2 / 3)
+    assert found.bits_each.value == pytest.approx(np.mean([20 / 8, 20 / 14, 0.2]))
+
+
+def test_runs_that_are_sure_and_wrong_are_held_against_what_their_posteriors_expect():
+    runs = [trial(9) for _ in range(997)] + [trial(9, error_mm=13.0) for _ in range(3)]
+    found = summarise(runs, max_readings=100)
+    assert found.wrong == 3
+    assert found.wrong_expected == pytest.approx(1.0)
+    assert poisson.sf(found.wrong_limit, 1.0) <= 0.01 < poisson.sf(found.wrong_limit - 1, 1.0)
+
+
+def test_no_interval_of_the_median_is_given_from_runs_too_few_for_95_percent():
+    """The least and the greatest of n miss the median when all lie on one side: 2 / 2^n, 6 % of 5 and 3 % of 6."""
+    for n in range(2, 9):
+        found = summarise([trial(8 + k) for k in range(n)], max_readings=100).median
+        assert math.isfinite(found.low) == math.isfinite(found.high) == (2 / 2**n <= 0.05)
+        assert found.value == np.median(8 + np.arange(n))
+
+
+def test_the_medians_interval_holds_it_as_often_as_it_says():
+    """Distribution-free, so any skewed one will do: at least 95 of 100, over 400 tables of 41 runs."""
+    rng = np.random.default_rng(4)
+    draws = np.ceil(rng.lognormal(2.5, 0.8, (400, 41)))
+    true = math.ceil(math.exp(2.5))
+    tables = [summarise([trial(int(n)) for n in np.clip(row, 4, 1e6)], max_readings=10**6).median for row in draws]
+    held = np.mean([t.low <= true <= t.high for t in tables])
+    assert held > 0.95 - 4 * math.sqrt(0.95 * 0.05 / 400)
+
+
+def test_one_run_has_no_error():
+    with pytest.raises(ParameterError, match="2 or more"):
+        summarise([trial(8)], max_readings=100)
+
+
+def test_circles_and_noise_are_always_the_same():
+    """By the formula: a uniform number each, spread over what the circle may be."""
+    u = np.random.default_rng(2013).random((300, 3))
+    anywhere = POPULATIONS["anywhere"].circles(300)
+    np.testing.assert_allclose(anywhere, np.array([0, 0, 20]) + np.array([1048, 520, 130]) * u)
+    inside = POPULATIONS["inside"].circles(300)
+    r = 50 + 100 * u[:, 2]
+    np.testing.assert_allclose(inside, np.c_[r + (1048 - 2 * r) * u[:, 0], r + (520 - 2 * r) * u[:, 1], r])
+    np.testing.assert_array_equal(POPULATIONS["inside"].circles(7), inside[:7])
+    np.testing.assert_array_equal(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(5, 100)[:10])
+    assert not np.allclose(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(6, 10))
+
+
+def test_every_standard_row_has_a_name_of_its_own():
+    names = [row.name for row in standard_rows()]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"population": "outside"}, {"model": "best"}, {"utility": "luck"}, {"noise_sd": 0.0}, {"width": -1.0}]
+)
+def test_rows_that_mean_nothing_are_refused(wrong):
+    with pytest.raises(ParameterError, match=next(iter(wrong))):
+        SearchConfiguration(**wrong)

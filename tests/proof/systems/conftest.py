@@ -1,0 +1,64 @@
+"""A system small enough to solve by hand: x' = u - k x (or with k = 0, x' = u), three runs of uneven rows."""
+
+import numpy as np
+import pytest
+
+from probewise.proof.systems.chain import simulate_noise_free
+from probewise.proof.systems.forms.true_system import TrueSystem
+from probewise.proof.systems.kind import Law, Prior, SystemKind
+from probewise.proof.systems.table import SystemTable
+from probewise.proof.systems.vocabulary import forms_of
+
+T = np.array([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0])
+
+
+def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
+    kind = SystemKind(
+        name="by hand",
+        reading="x",
+        unit="m",
+        text="",
+        priors={"k": Prior("uniform", 0, 1)},
+        draw=lambda rng: {"k": k},
+        design=lambda rng, n, regime: (T, {}),
+        decimals={},
+        drives=("u",),
+        sd=0.01,
+        law=Law({"x": x0}, lambda s, p, u: {"x": u["u"] - p["k"] * s["x"]}, lambda s, p, u: s["x"], linear=linear),
+    )
+    u = np.zeros(len(T)) if u is None else np.asarray(u, dtype=float)
+    warm = np.linspace(-1.0, 1.0, len(T) * n_runs)
+    rows = SystemTable(
+        {"t_s": np.concatenate([T + 10 * r for r in range(n_runs)]), "u": np.tile(u, n_runs), "warm": warm},
+        np.repeat(np.arange(n_runs), len(T)),
+        "t_s",
+        n_runs,
+    )
+    return kind, rows, {"k": np.array([[k]])}
+
+
+def with_forms(names, numbers, **options):
+    """Simulate the small system with forms, (n_samples, n_points); also return its rows and the readings without."""
+    kind, rows, parameters = small(**options)
+    bare = simulate_noise_free(kind, rows, parameters)
+    true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
+    forms = {form.name: form for form in forms_of(true)}
+    placed = [(forms[name], own) for name, own in zip(names, numbers, strict=True)]
+    return simulate_noise_free(kind, rows, parameters, placed).readings, rows, bare.readings[0]
+
+
+@pytest.fixture
+def solve():
+    """Readings of the small system with one form of the vocabulary and its numbers."""
+
+    def run(name, numbers, **options):
+        found, rows, bare = with_forms([name], [numbers], **options)
+        return found[0], rows, bare
+
+    return run
+
+
+@pytest.fixture
+def simulate_pair():
+    """Readings of the small system with two forms of the vocabulary and their numbers, (n_samples, n_points)."""
+    return lambda names, numbers, **options: with_forms(names, numbers, **options)[0]

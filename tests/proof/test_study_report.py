@@ -1,0 +1,131 @@
+"""The page of a study: every row, with its numbers and their errors."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from probewise.experiment import CLEAN, least_readings
+from probewise.proof import plots
+from probewise.proof.report import concealed
+from probewise.proof.report import study as report
+from probewise.proof.study import REFERENCE, ConcealedTrial, SearchConfiguration, Study, concealed_rows, experiment_of
+
+ROWS = [REFERENCE, SearchConfiguration(model="naive")]
+
+
+def trial(rng, mean):
+    n = int(rng.poisson(mean)) + 2
+    reached = bool(n < 40)
+    return {
+        "reached": reached,
+        "readings": n if reached else 40,
+        "first_white": 2,
+        "bits": 22.0,
+        "bits_at_white": 9.0,
+        "error_mm": float(rng.exponential(1.0)),
+        "chance_wrong": 1e-4,
+        "held": [True, True, True],
+        "arm_s": 4.0 * n,
+        "cpu_s": 0.2,
+        "widest_mm": np.geomspace(300.0, 3.0, n).round(2).tolist(),
+        "p_value": 0.4,
+    }
+
+
+@pytest.fixture(scope="module")
+def study():
+    rng = np.random.default_rng(0)
+    return Study({row: tuple(trial(rng, 10 * (k + 1)) for _ in range(30)) for k, row in enumerate(ROWS)}, 40)
+
+
+def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
+    page = report.page_html(study, command="probewise study")
+    needed = study.table()[REFERENCE].mean.value
+    assert f"{needed:.1f}" in page.split("<figure>")[0]
+    assert all(row.name in page for row in ROWS)
+    assert "http" not in page
+    assert page.count("data:image/png") == 2
+
+
+def test_the_csv_holds_every_number_and_its_bounds(study):
+    rows = list(csv.DictReader(io.StringIO(report.table_csv(study))))
+    assert [row["row"] for row in rows] == [row.name for row in ROWS]
+    for row, summary in zip(rows, study.table().values(), strict=True):
+        assert float(row["mean"]) == pytest.approx(summary.mean.value, rel=1e-5)
+        assert float(row["mean_low"]) < float(row["mean"]) < float(row["mean_high"])
+        assert "cpu" not in ",".join(row)
+
+
+def test_the_bound_stands_beside_what_was_measured(study):
+    """Bits over capacity, of the rows whose robot knows its sensor."""
+    least = least_readings(experiment_of(REFERENCE), rng=np.random.default_rng(0))
+    shown = str(report.lower_bound_table(study))
+    assert f"{least.readings_of_search:.1f} = " in shown
+    assert f"{least.readings_of_refinement:.1f} = " in shown
+    assert ROWS[1].name not in shown
+
+
+def test_each_curve_is_the_median_of_its_runs():
+    widths = [np.array([100.0, 10.0, 2.0]), np.array([200.0, 50.0, 30.0, 3.0]), np.array([300.0, 3.0])]
+    axes = plots.posterior_widths_of_runs({"some": widths, "other": widths[:2]})
+    assert axes.shape == (1, 2)
+    for ax in axes.flat:
+        (own,) = (line for line in ax.lines if line.get_label() == "median")
+        (other,) = (line for line in ax.lines if line.get_label() == "median of another panel")
+        assert own.get_linewidth() > other.get_linewidth()
+    (median,) = (line for line in axes[0, 0].lines if line.get_label() == "median")
+    # A run that has ended stays at its last width.
+    np.testing.assert_allclose(median.get_ydata(), [200.0, 10.0, 3.0, 3.0])
+    assert "mm" in axes[0, 0].get_ylabel()
+
+
+def test_what_rows_need_is_drawn_with_its_bounds(study):
+    axes = plots.readings_needed({row.name: found for row, found in study.table().items()})
+    assert [text.get_text() for text in axes[0, 0].get_yticklabels()] == [row.name for row in ROWS]
+    assert len(axes[0, 0].containers) == 2
+    low, high = sorted(axes[0, 0].get_ylim())
+    assert low <= -0.5
+    assert high >= len(ROWS) - 0.5
+    assert len(axes[0, 1].containers) == 1
+
+
+@pytest.mark.slow
+def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
+    one = Study({ROWS[1]: study.trials[ROWS[1]]}, 40)
+    page = report.page_html(one, command="probewise study --model naive")
+    assert "<tbody></tbody>" not in page
+    assert max(head.count("<th ") for head in page.split("<thead>")[1:]) <= 7
+    assert report.lower_bound_table(one) is None
+
+
+def concealed_runs():
+    good = {"known": True, "readings": 11, "error_mm": 1.0, "held": [True] * 3, "noticed": True, "cpu_s": [0.5, 1.0]}
+    bad = {**good, "readings": 7, "error_mm": 30.0, "held": [False] * 3, "noticed": False}
+    return {
+        ConcealedTrial(effect, size, circle, trust): {
+            **(bad if effect and trust == 1 else good),
+            "credible": [effect or CLEAN] if trust < 1 else [CLEAN],
+        }
+        for effect, size in (("", 0), ("backlash", 1))
+        for circle in range(3)
+        for trust in (0.9, 1.0)
+    }
+
+
+def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
+    rows = concealed_rows(concealed_runs())
+    assert concealed.summary_sentence(rows).startswith(
+        "Sure and wrong: 3 of 6 runs where the robot trusts its sensor, 0 of 6 runs where it doubts it"
+    )
+    page = concealed.page_html(rows, command="probewise study --concealed")
+    assert "backlash (play) of the arm, 6" in page
+    assert "0.00 | 1.00" in page
+
+
+def test_doubt_and_trust_stand_beside_each_other_in_every_row():
+    axes = plots.doubt_against_trust(concealed_rows(concealed_runs()))
+    assert [label.get_text() for label in axes[0, 0].get_yticklabels()] == ["nothing", "backlash (play) of the arm, 6"]
+    (line, *_), *_ = axes[0, 2].containers
+    assert line.get_xdata().tolist() == [11.0, 7.0]

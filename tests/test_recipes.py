@@ -63,7 +63,7 @@ def test_a_region_with_its_closed_form():
 
 
 def test_an_effect():
-    creep = example("ArmCreep", "probewise.effects.tilt")()
+    creep = example("ArmCreep", "probewise.effects.pose")()
     assert creep.words == "an arm that creeps"
     plan = paper_plan()
     poses = Poses(*(np.zeros((1, len(plan))) for _ in range(3)))

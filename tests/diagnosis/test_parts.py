@@ -40,7 +40,7 @@ from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
-from probewise.effects.motion import candidate_scan_groups, sign_of_motion
+from probewise.effects.reference import candidate_scan_groups, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import (
     HalfPlane,

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from probewise.effects.density import log_gaussian_density, log_rounding_cell_density
+from probewise.effects.noise_distribution import log_gaussian_density, log_rounding_cell_density
 
 
 def test_the_gaussian_density_is_that_of_scipy() -> None:

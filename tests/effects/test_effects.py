@@ -45,10 +45,9 @@ from probewise.effects import (
     ScanMisplacement,
     StickSlip,
 )
-from probewise.effects.motion import orientation_deg, sign_of_motion
-from probewise.effects.origin import CountsFromOrigin, Origin
-from probewise.effects.patches import distinct_scan_lines
-from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples
+from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
+from probewise.effects.optics import distinct_scan_lines
+from probewise.effects.reference import CountsFromOrigin, Origin, orientation_deg, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times

@@ -5,8 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from probewise.effects.limited_range import limited_mean
-from probewise.effects.predictive_mixture import PredictiveMixture
+from probewise.effects.noise_distribution import PredictiveMixture, limited_mean
 from probewise.sensor.stages import NoiseParameters
 
 LOW, HIGH, SD = 0.0, 10.0, 2.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.effects import Origin
-from probewise.effects.albedo import RegionWithGradient, RegionWithPatch
+from probewise.effects.optics import RegionWithGradient, RegionWithPatch
 from probewise.scene import edge_distance
 from probewise.scene.regions import (
     EllipseRegion,

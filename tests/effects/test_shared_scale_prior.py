@@ -5,7 +5,7 @@ import pytest
 from scipy.special import ndtr, ndtri
 
 from probewise.effects import HeavyTailedPrior
-from probewise.effects.shared_scale_prior import SharedScalePrior
+from probewise.effects.priors import SharedScalePrior
 
 
 def _prior(n):

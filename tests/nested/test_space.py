@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_t
 
 from probewise.calibration import SSFPrior, default_prior
-from probewise.effects.heavy_tailed_prior import HeavyTailedPrior, LogHeavyTailedPrior
+from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.nested.space import space_of, unbounded_space_of
 from probewise.priors import Empty, Joint, LogUniform, Normal, Prior, Product, Uniform
 from probewise.recordings import Recording, paper_plan

@@ -7,8 +7,8 @@ import pytest
 
 from probewise.systems import Law, RunTable
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
-from probewise.systems.motion import LawWithEffects, Limit, integrate_states
-from probewise.systems.steps import steps_for_table
+from probewise.systems.law import LawWithEffects, Limit, integrate_states
+from probewise.systems.step import steps_for_table
 
 
 def _pendulum(s, p, u):

@@ -6,10 +6,9 @@ from scipy.integrate import solve_ivp
 
 from probewise.errors import FileError, ParameterError
 from probewise.systems import Law, RunTable, Simulator, System
-from probewise.systems.converged_step import with_converged_step
-from probewise.systems.motion import LawWithEffects, Limit, integrate_states
-from probewise.systems.rows_in_runs import RowsInRuns
-from probewise.systems.steps import steps_for_table
+from probewise.systems.law import LawWithEffects, Limit, integrate_states
+from probewise.systems.step import RowsInRuns, steps_for_table
+from probewise.systems.system import with_converged_step
 
 
 def _pendulum(s, p, u):

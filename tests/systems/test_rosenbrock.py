@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from probewise.systems.motion import LawWithEffects, Stepper
-from probewise.systems.rosenbrock import RODAS
+from probewise.systems.law import LawWithEffects, Stepper
 from probewise.systems.simulator import Law
+from probewise.systems.step import RODAS
 
 END = 2.0
 

@@ -8,8 +8,8 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.systems import Simulator, table_for
-from probewise.systems.forms.proposals import formula_forms
-from probewise.systems.row_order import chance_of_sorted_readings, note_on_row_order
+from probewise.systems.forms.formulas import formula_forms
+from probewise.systems.forms.reference import chance_of_sorted_readings, note_on_row_order
 
 _SPEED = np.repeat(np.arange(4.0, 16.0), 4)
 

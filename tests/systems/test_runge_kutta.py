@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from probewise.systems.motion import LawWithEffects, Limit, Stepper
-from probewise.systems.runge_kutta import FOURTH_ORDER, StepSchedule, eighth_order_method
+from probewise.systems.law import LawWithEffects, Limit, Stepper
 from probewise.systems.simulator import Law
+from probewise.systems.step import FOURTH_ORDER, StepSchedule, eighth_order_method
 
 EIGHTH_ORDER = eighth_order_method()
 SWINGS = LawWithEffects(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -s["x"] + 0 * u["t"]}))

@@ -19,7 +19,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
 from probewise.calibration.gaussian_responses import SingleGaussianResponses, total_light_by_gaussian
 from probewise.calibration.whole_coordinates import WholeFootprintCoordinates
-from probewise.effects.density import log_gaussian_mass_between
+from probewise.effects.noise_distribution import log_gaussian_mass_between
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled_rows
 

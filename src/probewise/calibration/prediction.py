@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
 from probewise.effects import PredictiveMixture
-from probewise.effects.origin import CountsTimeFromOrigin
+from probewise.effects.reference import CountsTimeFromOrigin
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording

@@ -47,7 +47,7 @@ from probewise.diagnosis.verdict_report.reason import (
     reason_of,
 )
 from probewise.effects import VOCABULARY, NamedEffect
-from probewise.effects.vocabulary import require_effect_classes, sentence_from_samples
+from probewise.effects.effect import require_effect_classes, sentence_from_samples
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 

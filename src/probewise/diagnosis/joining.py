@@ -13,7 +13,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern, have_same_albedo
 from probewise.recordings.plan import Plan, Recording, require_recording
 from probewise.sensor import COMMANDED, with_declared_height_commanded
-from probewise.systems.joining import unused_name
+from probewise.systems.table import unused_name
 
 
 @own_arithmetic

@@ -27,7 +27,7 @@ from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.outlying import LostReadings, find_lost_readings
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import NamedEffect, NoiseEffect
-from probewise.effects.faults import LARGEST_SIZE
+from probewise.effects.noise import LARGEST_SIZE
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording, require_patterns_described
 from probewise.sensor import Stage

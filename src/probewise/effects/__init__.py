@@ -11,36 +11,73 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from probewise.effects.albedo import AlbedoGradient, AlbedoPatch
-from probewise.effects.angles import OrientationError, ScanAngleError
-from probewise.effects.edges import EdgeBlur, EdgeShadow, Halo
-from probewise.effects.extent import Extent
-from probewise.effects.faults import Dropouts, Outliers
-from probewise.effects.gain import BatterySag, GainDrift
-from probewise.effects.glint import Glint
-from probewise.effects.heavy_tailed_prior import HeavyTailedPrior, LogHeavyTailedPrior
-from probewise.effects.height import HeightGradient, HeightOffset
-from probewise.effects.knocks import ArmKnock, GainStep
+from probewise.effects.effect import NamedEffect, NoiseEffect
 from probewise.effects.known import Estimated, Informed, Known
-from probewise.effects.lattice import Quantisation, lattice_step, sd_of_estimated_lattice_step
-from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
-from probewise.effects.motion import orientation_deg, scan_indicator, sign_of_motion
-from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
-from probewise.effects.noise_distribution import FittedReadings, log_density, reading_variance
-from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
-from probewise.effects.origin import CountsFromOrigin, Origin, origins_of
-from probewise.effects.polarisation import Polarisation
-from probewise.effects.pose import Backlash, PositionScale
-from probewise.effects.predictive_mixture import PredictiveMixture
-from probewise.effects.rails import BentRails, MissingTooth
-from probewise.effects.readings import Hysteresis, Lag, Overshoot
-from probewise.effects.reflection import Reflection
-from probewise.effects.response import Nonlinearity
-from probewise.effects.saturation import Saturation
-from probewise.effects.tilt import SensorTilt
-from probewise.effects.vocabulary import NamedEffect, NoiseEffect
-from probewise.effects.waves import Flicker, PeriodicPositionError, StickSlip
-from probewise.effects.wear import SlowSinking, SlowTurn
+from probewise.effects.noise import (
+    CorrelatedNoise,
+    DriftingNoise,
+    Dropouts,
+    NoisePerRun,
+    Outliers,
+    Quantisation,
+    RandomWalk,
+    SignalDependentNoise,
+    lattice_step,
+    sd_of_estimated_lattice_step,
+)
+from probewise.effects.noise_distribution import FittedReadings, PredictiveMixture, log_density, reading_variance
+from probewise.effects.optics import (
+    AlbedoGradient,
+    AlbedoPatch,
+    EdgeBlur,
+    EdgeMisplacement,
+    EdgeShadow,
+    Glint,
+    Halo,
+    HeightGradient,
+    HeightOffset,
+    Reflection,
+    ScanMisplacement,
+    SlowSinking,
+)
+from probewise.effects.pose import (
+    ArmKnock,
+    Backlash,
+    BentRails,
+    MissingTooth,
+    OrientationError,
+    PeriodicPositionError,
+    PositionScale,
+    ScanAngleError,
+    SensorTilt,
+    SlowTurn,
+    StickSlip,
+)
+from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
+from probewise.effects.reading import (
+    AmbientGradient,
+    AmbientStep,
+    BatterySag,
+    Flicker,
+    GainDrift,
+    GainStep,
+    Hysteresis,
+    Lag,
+    Nonlinearity,
+    OffsetDrift,
+    Overshoot,
+    Polarisation,
+    Saturation,
+)
+from probewise.effects.reference import (
+    CountsFromOrigin,
+    Extent,
+    Origin,
+    orientation_deg,
+    origins_of,
+    scan_indicator,
+    sign_of_motion,
+)
 
 VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
     {

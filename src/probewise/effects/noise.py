@@ -1,22 +1,30 @@
-"""Effects on the noise."""
+"""Effects on the noise, single faulty readings and undeclared rounding among them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
-from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
+from probewise.effects.effect import NoiseEffect
 from probewise.effects.noise_distribution import FittedReadings
-from probewise.effects.vocabulary import NoiseEffect
+from probewise.effects.priors import LogHeavyTailedPrior
+from probewise.effects.reference import Extent
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage
+
+_SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
+_NEWTON_STEPS = 40
+_FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
+_NEAR_END = 1e-4  # of the range of a lost reading's value: distance of the bank's values from its ends
+_TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printed values
+_DIGITS = 1e-6  # of a step: below this a difference is rounding
 
 
 @dataclass(frozen=True)
@@ -138,10 +146,6 @@ class RandomWalk(NoiseEffect):
         return f"the offset is a random walk with steps of sd {value_with_sd(mean[0], sd[0])} noise sds from row to row"
 
 
-_SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
-_NEWTON_STEPS = 40
-
-
 @dataclass(frozen=True)
 class NoisePerRun(NoiseEffect):
     """Noise that differs between runs: sd x the run's value, whose logarithm has a heavy-tailed prior.
@@ -255,3 +259,235 @@ def _most_probable_log_sd_ratios(counts: FloatArray, squares: FloatArray, spread
         if np.abs(step).max() < 1e-9:
             break
     return np.asarray(logs)
+
+
+LARGEST_SIZE = 40.0
+"""Largest sd of outlying readings, in noise sds; readings too far out for it are lost ones (`diagnosis.residuals`)."""
+
+
+MOST_OUTLYING = 0.2
+"""Largest share of outlying or of lost readings."""
+
+
+@dataclass(frozen=True)
+class Outliers(NoiseEffect):
+    """A heavy tail: with probability `share`, a reading's noise is `size` times as wide (sd)."""
+
+    name = "outliers"
+    words = "outlying readings"
+    stage = Stage.NOISE
+    units = ("1", "noise sd")
+    covariates = ("level", "time")
+    nodes_per_parameter = (4, 4)
+
+    @cached_property
+    def prior(self) -> Product:
+        return Product({"share": LogUniform(2e-3, MOST_OUTLYING), "size": LogUniform(2.5, LARGEST_SIZE)})
+
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+        return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return (
+            f"outliers: {value_with_sd(mean[0], sd[0], factor=100)} % of the readings scatter "
+            f"{value_with_sd(mean[1], sd[1])} times as widely as the others"
+        )
+
+
+@dataclass(frozen=True)
+class Dropouts(NoiseEffect):
+    """Lost readings: with probability `share` a reading is `value`, whatever lies under the sensor.
+
+    `lowest` and `highest` bound that value; `ends` are those of the instrument's declared range, its likeliest values.
+    `lost`: what the readings read that are lost beyond doubt, of `n_readings` in all, and `distance`, the norm of their
+    residuals in noise sds. They are left out of the recording, so that the noise of the others does not change; where
+    they differ, `value` is any of theirs.
+    """
+
+    lowest: float = -50.0
+    highest: float = 150.0
+    ends: tuple[float, ...] = ()
+    unit: str = field(default="", kw_only=True)
+    lost: tuple[float, ...] = field(default=(), kw_only=True)
+    n_readings: int = field(default=0, kw_only=True)
+    distance: float = field(default=0.0, kw_only=True)
+
+    name = "dropouts"
+    words = "lost readings"
+    stage = Stage.NOISE
+    units = ("1", "reading")
+    covariates = ("level", "time")
+    nodes_per_parameter = ()  # they depend on the readings, and the share's lie close
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with values within the readings' range, 1 % wider each way, and with the declared ends."""
+        low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
+        return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.reading_unit)
+
+    @classmethod
+    def of_lost_readings(cls, lost: FloatArray, n_readings: int, distance: float, unit: str) -> Self:
+        """Return the effect that lost these of `n_readings` readings; `distance` as above."""
+        wide = 0.01 * max(float(np.ptp(lost)), float(np.abs(lost).max()), 1e-300)
+        low, high = float(lost.min()) - wide, float(lost.max()) + wide
+        return cls(low, high, unit=unit, lost=tuple(lost.tolist()), n_readings=n_readings, distance=distance)
+
+    @property
+    def parameters_known_before_fit(self) -> FloatArray | None:
+        """The share of the readings that are `lost`, and the commonest value; None without them."""
+        if not self.lost:
+            return None
+        return np.array([len(self.lost) / self.n_readings, max(self.lost, key=self.lost.count)])
+
+    def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
+        """Draw the share that the number of `lost` readings tells (Jeffreys prior), and one of their values."""
+        if not self.lost:
+            return None
+        n, n_lost = len(nodes), len(self.lost)
+        share = rng.beta(n_lost + 0.5, self.n_readings - n_lost + 0.5, n)
+        return np.stack([share, rng.choice(self.lost, n)], axis=1)
+
+    @cached_property
+    def prior(self) -> Product:
+        return Product({"share": LogUniform(2e-3, MOST_OUTLYING), "value": Uniform(self.lowest, self.highest)})
+
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+        return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
+
+    def bank(self) -> FloatArray:
+        near = _NEAR_END * (self.highest - self.lowest)
+        ends = (self.lowest + near, self.highest - near)
+        return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
+
+    def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
+        """Return twelve pairs (share, value), (12, 2), with the commonest value of readings beyond four noise sds.
+
+        There is no node, (0, 2), unless an outlying value occurs twice or is an end of the declared range.
+        """
+        far = rows.readings[np.abs(residuals) > _FAR]
+        # Floats differ in their last digits, so the value is one of the readings, not their mean.
+        n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
+        at_end = (np.abs(far[:, None] - np.array(self.ends)) <= 1e-6 * rows.sd).any(axis=1)
+        if not (at_end | (n_alike > 1)).any():
+            return np.zeros((0, 2))
+        value = far[int(np.argmax(n_alike + 0.5 * at_end))]
+        shares = LogUniform(2e-3, MOST_OUTLYING).from_unit((np.arange(12) + 0.5) / 12)
+        return np.stack([shares, np.full(12, value)], axis=1)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        exact = f"{mean[1]:z.12g} {self.unit}".rstrip()  # lost readings have one value, to the last digit
+        value = value_with_sd(mean[1], sd[1], self.unit) if sd[1] > 0 else exact
+        share = value_with_sd(mean[0], sd[0], factor=100)
+        if len({*self.lost}) > 1:
+            values = [f"{each:.12g}" for each in sorted({*self.lost})]
+            value = f"{', '.join(values[:-1])} or {values[-1]} {self.unit}".rstrip()
+        return f"readings are lost: {share} % of them read {value}, whatever the true value"
+
+
+@dataclass(frozen=True)
+class Quantisation(NoiseEffect):
+    """Readings rounded to a step that was not declared: step round(reading / step), after the noise."""
+
+    smallest: float = 0.05
+    largest: float = 20.0
+    unit: str = field(default="", kw_only=True)
+
+    name = "quantisation"
+    words = "rounded readings"
+    stage = Stage.NOISE
+    units = ("reading",)
+    covariates = ("lattice",)
+    n_nodes = 16
+    nodes_per_parameter = ()  # one node, from the readings
+    seen_above: ClassVar[float] = 0.3
+    """Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with steps from 0.1 to 20 % of the readings' range; None if a step is declared."""
+        if extent.plan.instrumentation.step is not None:
+            return None
+        return cls(1e-3 * extent.span, 0.2 * extent.span, unit=extent.reading_unit)
+
+    @cached_property
+    def prior(self) -> Product:
+        return Product({"step": LogUniform(self.smallest, self.largest)})
+
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+        return replace(value, step=theta[:, :1])
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return (
+            f"the readings are rounded to steps of {value_with_sd(mean[0], sd[0], self.unit)}, which were not declared"
+        )
+
+
+def lattice_step(readings: FloatArray) -> float:
+    """Find the step of a lattice that holds all readings; 0 where there is none.
+
+    The result is 0 also for a step below 1e-5 of the range, and for fewer than three distinct readings. Readings
+    printed to some digits lie on a lattice too; a coarser lattice is found through it, since printing moves each value
+    by at most half a digit.
+    """
+    values = np.unique(readings[np.isfinite(readings)])
+    if len(values) < 3:
+        return 0.0
+    least = 1e-6 * float(values[-1] - values[0])
+    exact = _greatest_common_step(values, least)
+    return _step_of_rounded_lattice(values, exact or 10 * least) or exact
+
+
+def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
+    """Estimate the sd of a lattice's step, as fitted to distinct readings that were printed to some digits.
+
+    The result is the printing's rounding error (sd) over the norm of the readings' centred lattice numbers; at least a
+    millionth of the step.
+    """
+    values = np.unique(readings[np.isfinite(readings)])
+    first = max(math.floor(-math.log10(step)), 0)  # the digits are no coarser than the step, which may be tiny
+    digits = (
+        10.0**-n
+        for n in range(first, first + 10)
+        if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n)
+    )
+    reach = float(np.linalg.norm(values - values.mean())) / step
+    return max(next(digits, 0.0) / math.sqrt(12) / reach, _DIGITS * step)
+
+
+def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:
+    """Fit the step of a lattice to rounded values, from the two closest outwards; 0 if one of them is off the lattice.
+
+    `rounding` is the full width of the rounding error of each value.
+    """
+    gaps = np.diff(values)
+    step, start = float(gaps.min()), float(values[np.argmin(gaps)])
+    if step <= _TELLING * rounding:
+        return 0.0
+    reach, known = 0.0, 1.0  # distance up to which values are numbered, and how many steps the last fit spanned
+    while reach < values[-1] - values[0]:
+        further = 0.2 * step / rounding * known * step  # up to here every value's number is certain
+        near = values[np.abs(values - start) <= further]
+        if further <= reach or len(near) < 2:
+            return 0.0
+        number = np.round((near - start) / step)
+        reach, known = further, max(float(np.ptp(number)), 1.0)
+        step, start = np.polyfit(number, near, 1).tolist()
+    off = np.abs(values - start - step * np.round((values - start) / step))
+    return step if float(off.max()) <= 0.75 * rounding else 0.0
+
+
+def _greatest_common_step(values: FloatArray, tolerance: float) -> float:
+    """Find the greatest step of which all gaps of sorted values are multiples; 0 if at most ten times the tolerance.
+
+    Euclid's algorithm on their differences; a remainder below the tolerance counts as rounding.
+    """
+    step = 0.0
+    for gap in np.diff(values):
+        larger, smaller = max(step, float(gap)), min(step, float(gap))
+        while smaller > tolerance:
+            rest = larger - smaller * round(larger / smaller)
+            larger, smaller = smaller, abs(rest)
+        step = larger
+        if step <= 10 * tolerance:
+            return 0.0
+    return step

@@ -1,16 +1,54 @@
-"""The noise distribution of a reading, with all effects on the noise: its density and its variance."""
+"""The distribution of readings with all effects on the noise: density, variance, ends of a range, prediction."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import log_ndtr, ndtr
 
-from probewise._arrays import FloatArray, IntArray
-from probewise.effects.density import log_gaussian_density, log_rounding_cell_density
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.recordings.ends import masks_of_readings_at_ends
 from probewise.sensor.stages import NoiseParameters
 
+_LEAST_MASS = 1e-290  # below, masses lose digits; above, their difference is as exact as that of logs, in half the time
 _NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
+_FARTHEST = 40.0  # sds from which a normal distribution has no mass in doubles
+
+
+def log_gaussian_density(readings: FloatArray, mean: FloatArray | float, sd: FloatArray | float) -> FloatArray:
+    """Return the natural log of the normal density of readings, per unit of the reading; the arrays broadcast."""
+    z = (readings - mean) / sd
+    return np.asarray(-0.5 * z * z - np.log(sd) - 0.5 * math.log(2 * math.pi))
+
+
+def log_rounding_cell_density(
+    readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float | FloatArray
+) -> FloatArray:
+    """Return the natural log of the mean normal density over each reading's rounding cell, reading ± step / 2.
+
+    The two tail masses are subtracted in logs, so the result stays finite however far the reading lies from the mean.
+    """
+    low = (readings - step / 2 - mean) / sd
+    high = (readings + step / 2 - mean) / sd
+    # Mirror cells above the mean: log_ndtr keeps its precision in the lower tail only.
+    above = low + high > 0
+    near, far = np.where(above, -low, high), np.where(above, -high, low)
+    return log_gaussian_mass_between(far, near) - np.log(step)
+
+
+def log_gaussian_mass_between(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the natural log of a standard normal's mass from `low` to `high`; inexact if both are far above 0."""
+    low, high = np.broadcast_arrays(low, high)
+    mass = np.asarray(ndtr(high) - ndtr(low))
+    small = mass < _LEAST_MASS
+    if not small.any():
+        return np.asarray(np.log(mass))
+    out = np.log(np.where(small, 1.0, mass))
+    log_low, log_high = log_ndtr(low[small]), log_ndtr(high[small])
+    out[small] = log_high + np.log(-np.expm1(np.minimum(log_low - log_high, -1e-15)))
+    return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,3 +106,156 @@ def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray,
     width = np.where(step > 0, step, 1.0)
     in_cell = log_rounding_cell_density(readings, mean, sd, width)
     return in_cell if np.all(step) else np.where(step > 0, in_cell, log_gaussian_density(readings, mean, sd))
+
+
+def log_probability_at_end(
+    noise: NoiseParameters, readings: FloatArray, predicted: FloatArray, *, is_high: bool
+) -> FloatArray:
+    """Return the log probability of each reading at an end: of noise that reaches it, (n_samples, n_points).
+
+    Parameters
+    ----------
+    noise
+        The noise.
+    readings
+        Readings at an end of the range, (n_points,).
+    predicted
+        Noise-free readings of an unlimited instrument, (n_samples, n_points).
+    is_high
+        Whether that is the high end.
+    """
+    noise = noise_with_walk_variance(noise)
+    sign = 1.0 if is_high else -1.0
+    beyond = sign * (predicted - readings) + 0.5 * noise.step
+    out = log_ndtr(beyond / noise.sd)
+    with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
+        if np.any(noise.wide_share):
+            wide = log_ndtr(beyond / (noise.sd * noise.wide_times))
+            out = np.logaddexp(np.log1p(-noise.wide_share) + out, np.log(noise.wide_share) + wide)
+        if np.any(noise.lost_share):
+            lost = np.where(sign * (noise.lost_value - readings) + 0.5 * noise.step >= 0, 0.0, -np.inf)
+            out = np.logaddexp(np.log1p(-noise.lost_share) + out, np.log(noise.lost_share) + lost)
+    return np.asarray(out)
+
+
+def limited_mean(noise: NoiseParameters, predicted: FloatArray, low: float, high: float) -> FloatArray:
+    """Return the mean of a reading that is not lost, limited to a range, (n_samples, n_points).
+
+    `predicted` are noise-free readings of an unlimited instrument, of that shape.
+    """
+    noise = noise_with_walk_variance(noise)
+    own, wide = (
+        _mean_of_limited_normal(predicted, np.hypot(sd, noise.step / np.sqrt(12)), low, high)
+        for sd in (noise.sd, noise.sd * noise.wide_times)
+    )
+    return np.asarray((1 - noise.wide_share) * own + noise.wide_share * wide)
+
+
+def _mean_of_limited_normal(mean: FloatArray, sd: FloatArray, low: float, high: float) -> FloatArray:
+    """Return the mean of a normal variable that is limited to a range; arrays broadcast."""
+    a, b = (np.clip((end - mean) / sd, -_FARTHEST, _FARTHEST) for end in (low, high))
+    z = a * ndtr(a) + b * ndtr(-b) + _density(a) - _density(b)
+    return np.asarray(np.clip(mean + sd * z, low, high))
+
+
+def _density(z: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi))
+
+
+@dataclass(eq=False)
+class PredictiveMixture:
+    """The predictive distribution of readings: the mixture of posterior samples' predictions, added block by block.
+
+    Parameters
+    ----------
+    readings
+        Measured readings, (n_points,).
+    scored
+        Mask of the readings that get a log density, (n_points,).
+    step
+        The declared rounding step, if any.
+    ends
+        Smallest and largest reading of the instrument; infinite for an open end. At an end the "density" is a
+        probability: that the noise reaches the end.
+    """
+
+    readings: FloatArray
+    scored: BoolArray
+    step: float | None = None
+    ends: tuple[float, float] = (-math.inf, math.inf)
+    n_samples: int = field(default=0, init=False)
+    _center: FloatArray | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        n_points = len(self.readings)
+        self._total, self._squares, self._of_noise = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
+        self._limited_total = np.zeros(n_points)
+        self._log_sum = np.full(int(self.scored.sum()), -np.inf)
+
+    def add(self, mean: FloatArray, noise: NoiseParameters, between: FloatArray | None = None) -> None:
+        """Add noise-free predictions, (n_samples, n_points), and the noise about them.
+
+        `between` (n_points,) is an additional smoothing sd of the density, for samples whose predictions lie farther
+        apart than the noise; mean and sd are unaffected.
+        """
+        if self._center is None:
+            self._center = mean.mean(axis=0)  # sums about a nearby value keep their precision
+        self.n_samples += len(mean)
+        self._total += (mean - self._center).sum(axis=0)
+        self._squares += ((mean - self._center) ** 2).sum(axis=0)
+        self._of_noise += np.broadcast_to(reading_variance(noise), mean.shape).sum(axis=0)
+        if self._is_limited:
+            self._limited_total += limited_mean(noise, mean, *self.ends).sum(axis=0)
+        if self.step is not None:  # `reading_variance` above leaves it out: the pooled sd includes a declared rounding
+            noise = replace(noise, step=np.full((1, 1), self.step))
+        if between is not None:
+            noise = replace(noise, sd=np.hypot(np.broadcast_to(noise.sd, mean.shape), between))
+        if self._log_sum.size:
+            log_p = self._log_density_of_scored(noise, mean)
+            self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
+
+    @property
+    def _is_limited(self) -> bool:
+        return bool(np.isfinite(self.ends).any())
+
+    @property
+    def _are_at_end(self) -> BoolArray:
+        at_low, at_high = masks_of_readings_at_ends(self.readings, *self.ends, self.step)
+        return at_low | at_high
+
+    def _log_density_of_scored(self, noise: NoiseParameters, mean: FloatArray) -> FloatArray:
+        """Return the log density of each scored reading, or log probability at an end, (n_samples, n_scored)."""
+        readings = self.readings[self.scored]
+        out = log_density(_noise_of_rows(noise, self.scored), readings, mean[:, self.scored])
+        if not self._is_limited:
+            return out
+        for at_end, is_high in zip(
+            masks_of_readings_at_ends(readings, *self.ends, self.step), (False, True), strict=True
+        ):
+            rows = np.flatnonzero(self.scored)[at_end]
+            own = _noise_of_rows(noise, rows)
+            out[:, at_end] = log_probability_at_end(own, self.readings[rows], mean[:, rows], is_high=is_high)
+        return out
+
+    def mean_sd_and_log_density(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return mean and sd of a new reading at each row, and log density of the measured one: (n_points,) each.
+
+        The density is NaN where a reading is not scored. The mean is within the range of the instrument; the sd is
+        that of a reading which no end limits.
+        """
+        n = self.n_samples
+        shift = self._total / n
+        spread = np.maximum(self._squares / n - shift**2, 0.0)
+        scores = np.full(len(self.readings), np.nan)
+        scores[self.scored] = self._log_sum - math.log(n)
+        base = np.zeros(len(self.readings)) if self._center is None else self._center
+        mean = base + shift
+        if self._is_limited:
+            mean = np.clip(self._limited_total / n, *self.ends)
+            scores = np.where(self._are_at_end, np.minimum(scores, 0.0), scores)
+        return mean, np.sqrt(spread + self._of_noise / n), scores
+
+
+def _noise_of_rows(noise: NoiseParameters, rows: BoolArray | IntArray) -> NoiseParameters:
+    sd = noise.sd if noise.sd.shape[-1] == 1 else noise.sd[:, rows]
+    return replace(noise, sd=sd, walked=noise.walked if len(noise.walked) == 1 else noise.walked[rows])

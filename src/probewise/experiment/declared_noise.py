@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.effects.density import log_gaussian_density, log_rounding_cell_density
+from probewise.effects.noise_distribution import log_gaussian_density, log_rounding_cell_density
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inference.rounded import ScaleEnds

@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailedPrior, LogHeavyTailedPrior, NamedEffect
-from probewise.effects.patches import PatchPrior
-from probewise.effects.wrapped_effect import WrappedEffect
+from probewise.effects.known import WrappedEffect
+from probewise.effects.optics import PatchPrior
 from probewise.experiment.pace import EACH_S
 from probewise.priors import LogUniform, Prior, Product, Uniform
 

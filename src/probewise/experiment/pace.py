@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.effects.wrapped_effect import WrappedEffect
+from probewise.effects.known import WrappedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor.stages import Effect, Poses
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, floats
 from probewise._kinds import checked_number
-from probewise.effects.density import log_gaussian_density
+from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 

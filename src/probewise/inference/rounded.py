@@ -12,7 +12,7 @@ from scipy.special import log_ndtr
 
 from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import checked_number
-from probewise.effects.density import log_gaussian_mass_between
+from probewise.effects.noise_distribution import log_gaussian_mass_between
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 

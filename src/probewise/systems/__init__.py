@@ -1,13 +1,11 @@
 """A user's simulator over a table of readings, and the chain of effects that it may leave out."""
 
 from probewise.systems.calls import ProgressWithCallCount
-from probewise.systems.file import read_simulator
 from probewise.systems.fitted import FittedSystem, read_fitted_system, samples_csv, write_fitted_system
-from probewise.systems.joining import concatenate_tables
 from probewise.systems.prediction import SystemPrediction, as_recording, predict_system, write_system_prediction
-from probewise.systems.simulator import Extra, Law, Noise, Simulator, read_table_for, table_for
+from probewise.systems.simulator import Extra, Law, Noise, Simulator, read_simulator, read_table_for, table_for
 from probewise.systems.system import System, SystemChain
-from probewise.systems.table import RunRecording, RunTable, read_run_table, run_table_csv
+from probewise.systems.table import RunRecording, RunTable, concatenate_tables, read_run_table, run_table_csv
 
 __all__ = [
     "Extra",

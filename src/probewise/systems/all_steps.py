@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.systems.law_inputs import LawInputs, of_columns
-from probewise.systems.motion import (
+from probewise.systems.law import (
     LawWithEffects,
     Stepper,
     evaluations_per_step,
@@ -29,7 +28,8 @@ from probewise.systems.motion import (
     step_in_part,
     time_gaps,
 )
-from probewise.systems.steps import Steps
+from probewise.systems.law_inputs import LawInputs, of_columns
+from probewise.systems.step import Steps
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
 _NEWTONS = 8  # iterations with a sample's own Jacobian

@@ -1,9 +1,11 @@
-"""Calls of a user's `simulate`: for all samples at once if it broadcasts, otherwise one sample at a time."""
+"""Calls of a user's functions, for all samples at once if they broadcast, else one at a time; and their errors."""
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import itertools
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,16 +14,64 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import FileError, ParameterError, ShapeError, message_of
 from probewise.progress import Progress
-from probewise.systems.simulator import Simulate, call_on_read_only, read_only_views
-
-MOST_CALLS = 20_000
-"""Expected limit of calls in a diagnosis, for a `simulate` that takes one sample at a time; it is not enforced."""
+from probewise.recordings.python_file import EndedByFile
+from probewise.systems.simulator import Simulate, Simulator
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
 _MOST_REMEMBERED = 2_000_000  # size of the cache of earlier calls, in numbers
 _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
+_WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
+    "output operand": "k = k * x in place of k *= x: an array changed in place keeps its shape",
+    "converted to Python scalar": "np.sin(x) in place of math.sin(x), and so on: states and columns are arrays",
+    "truth value of an array": "np.where(condition, a, b) in place of if: states and columns are arrays",
+}
+
+
+def read_only_views(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by name with read-only views of the arrays among them, for `call_on_read_only`."""
+    out = dict(values)
+    for name, value in out.items():
+        if isinstance(value, np.ndarray) and value.flags.writeable:
+            out[name] = view = value.view()
+            view.setflags(write=False)
+    return out
+
+
+def call_on_read_only(function: Callable[..., Any], *given: Mapping[str, Any]) -> Any:
+    """Call a user's function with dicts of read-only arrays by name; with copies instead, if it writes into one.
+
+    To a user a parameter is a number, so `k = p["k"]; k /= 60` must leave p["k"], and the engine's own, as they are.
+    Copies at every call would cost every law a fifth of its time.
+    """
+    try:
+        return function(*map(dict, given))
+    except ValueError as error:
+        if "read-only" not in str(error):
+            raise
+    return function(*map(_CopyingDict, given))
+
+
+class _CopyingDict(dict[str, Any]):
+    """A dict of arrays and numbers that returns a new copy of an array whenever it is asked for one."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__({name: _copied(value) for name, value in values.items()})
+
+    def __getitem__(self, name: str) -> Any:
+        return _copied(super().__getitem__(name))
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return _copied(super().get(name, default))
+
+
+def _copied(value: Any) -> Any:
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+MOST_CALLS = 20_000
+"""Expected limit of calls in a diagnosis, for a `simulate` that takes one sample at a time; it is not enforced."""
 
 
 @dataclass(eq=False)
@@ -408,3 +458,75 @@ def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], 
     if len(wanted) > 1:
         one = "for each sample and row: it is called with parameters (n_samples, 1), as vectorized = True says"
     raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number {one}")
+
+
+def user_function_error(
+    what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]
+) -> FileError:
+    """Return a FileError for an exception that `simulate`, `rates` or `observe` raises at every call.
+
+    Parameters
+    ----------
+    what
+        Name of the function.
+    error
+        The exception.
+    simulator, columns
+        The simulator, and the columns passed to the function.
+    """
+    where = _files_of_user_functions(simulator)
+    if simulator.law is not None and simulator.law.observe is not None:
+        raised_in = {frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)}
+        what = "observe" if getattr(inspect.unwrap(simulator.law.observe), "__code__", None) in raised_in else what
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [f.lineno for f in frames if f.filename in where]
+    said = message_of(error, kind=False)
+    found = f"{what} raises {said if isinstance(error, EndedByFile) else message_of(error)}"
+    law, outside = simulator.law, not frames or frames[-1].filename not in where
+    if law is not None and outside:
+        by_name = f"a dict with a rate for each state, under its name: {', '.join(law.states)}"
+        if isinstance(error, KeyError) and error.args and error.args[0] in law.states:
+            return FileError(simulator.source or what, f"rates returns no {error.args[0]!r}", by_name)
+        if isinstance(error, TypeError) and ("list indices" in said or "tuple indices" in said):
+            return FileError(simulator.source or what, "rates returns a list or a tuple", by_name)
+    is_of_values = isinstance(error, TypeError | ValueError)
+    way_out = next((out for words, out in _WAY_OUT_BY_WORDS.items() if words in said), "")
+    texts = [name for name, values in columns.items() if values.dtype != np.float64]
+    if isinstance(error, KeyError):
+        names = ", ".join(columns)
+        states = f", states {', '.join(simulator.law.states)}" if simulator.law is not None else ""
+        allowed = (
+            f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
+        )
+    elif is_of_values and way_out:
+        allowed = way_out
+    elif is_of_values and texts:
+        shown = ", ".join(f"{name} ({_first_non_numeric_cell(columns[name])!r})" for name in texts[:4])
+        allowed = f"calculations with numeric columns; these contain text: {shown}"
+    elif law is not None and what == "rates":
+        allowed = f"a function that returns a rate for each state somewhere in the prior: {', '.join(law.states)}"
+    else:
+        allowed = f"a function that returns a reading for each of the {_n_rows(columns)} rows somewhere in the prior"
+    return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
+
+
+def _files_of_user_functions(simulator: Simulator) -> set[str]:
+    functions: list[Any] = [simulator.simulate]
+    if simulator.law is not None:
+        functions += [simulator.law.rates, simulator.law.observe]
+    codes = (getattr(inspect.unwrap(function), "__code__", None) for function in functions if function is not None)
+    return {code.co_filename for code in codes if code is not None}
+
+
+def _first_non_numeric_cell(values: NDArray[Any]) -> str:
+    """Return the first cell that is not a number; the first cell if all are numbers, "" if there is none."""
+    for cell in values.tolist():
+        try:
+            float(cell)
+        except ValueError:
+            return str(cell)
+    return str(values[0]) if len(values) else ""
+
+
+def _n_rows(columns: Mapping[str, NDArray[Any]]) -> int:
+    return max((np.shape(values)[-1] for values in columns.values()), default=0)

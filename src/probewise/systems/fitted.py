@@ -28,9 +28,8 @@ from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
 from probewise.sensor import Stage
-from probewise.systems.file import fingerprint_of_text, run_simulator_text
-from probewise.systems.forms.rebinding import StoredFit, counts_from_far_origin
-from probewise.systems.simulator import Simulator
+from probewise.systems.forms.binding import StoredFit, counts_from_far_origin
+from probewise.systems.simulator import Simulator, fingerprint_of_text, run_simulator_text
 from probewise.systems.table import RunTable
 
 FORMAT = "system/1"

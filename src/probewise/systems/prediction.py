@@ -31,18 +31,11 @@ from probewise.recordings.prediction import prediction_summary
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
-from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 from probewise.systems.fitted import FittedSystem, require_fitted_system
-from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
+from probewise.systems.forms.binding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
-from probewise.systems.system import System, SystemChain
-from probewise.systems.table import (
-    RunRecording,
-    RunTable,
-    column_error,
-    covariate_of_column,
-    relative_sds_of_column,
-)
+from probewise.systems.system import STANDS_STILL, System, SystemChain, with_converged_step
+from probewise.systems.table import RunRecording, RunTable, column_error, covariate_of_column, relative_sds_of_column
 
 _OF_A_COLUMN = "sensitivity:", "depends:"  # effects, besides those on an input, that name a column last
 _FEW = 20  # samples used to find rows that cannot be predicted

@@ -6,7 +6,7 @@ import pytest
 from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.rebinding import extract_stored_fit
+from probewise.systems.forms.binding import extract_stored_fit
 
 NAME = "depends:rate:temp_c"
 _HOURS, _TEMP = (a.ravel() for a in np.meshgrid(np.linspace(1.0, 40.0, 12), np.linspace(20.0, 80.0, 8)))

@@ -9,7 +9,7 @@ from probewise.diagnosis.system.left_out import recording_from_table
 from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
 from probewise.systems.calls import IntegrationTally
-from probewise.systems.converged_step import with_converged_step
+from probewise.systems.system import with_converged_step
 
 SD = 0.05
 TIMES = np.arange(60.0)
@@ -72,7 +72,7 @@ def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():
 
 def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
     table, recording, _, found, sd = stiff
-    monkeypatch.setattr("probewise.systems.converged_step._MOST_STEPS", 20)
+    monkeypatch.setattr("probewise.systems.system._MOST_STEPS", 20)
     first = System.of(_simulator(), table)
     assert not first.tally.too_stiff
     assert with_step_for_likely_parameters(first, table, recording, found, sd).tally.too_stiff

@@ -15,7 +15,7 @@ from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.diagnosis.verdict_report.document import diagnosis_json
 from probewise.systems import Law, Simulator, table_for
 from probewise.systems.forms import bind_forms
-from probewise.systems.forms.proposals import formula_forms
+from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.table import covariate_of_column, published_covariate
 
 _N = 60

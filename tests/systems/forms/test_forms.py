@@ -11,11 +11,10 @@ from probewise.effects import is_out_of_vocabulary
 from probewise.errors import ParameterError
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.clipping import clipping_levels
-from probewise.systems.forms.lags import values_at_earlier_times
-from probewise.systems.forms.proposals import formula_forms
-from probewise.systems.forms.readings import sign_of_change
-from probewise.systems.motion import LawWithEffects
+from probewise.systems.forms.formulas import formula_forms
+from probewise.systems.forms.readings import sign_of_change, values_at_earlier_times
+from probewise.systems.forms.reference import clipping_levels
+from probewise.systems.law import LawWithEffects
 
 SD = 0.01
 N_ROWS = 60

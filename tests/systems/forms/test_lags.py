@@ -7,8 +7,7 @@ from scipy.integrate import solve_ivp
 from probewise.diagnosis.evidence.templates import EffectTemplates
 from probewise.diagnosis.system.diagnose import diagnose_system, prepare_system
 from probewise.systems import Law, RunTable, Simulator
-from probewise.systems.forms.lags import delayed_readings, lagged_readings
-from probewise.systems.forms.splines import Spline
+from probewise.systems.forms.readings import Spline, delayed_readings, lagged_readings
 
 _RNG = np.random.default_rng(1)
 _T = np.sort(_RNG.uniform(0, 10, 60))

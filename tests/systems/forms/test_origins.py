@@ -7,13 +7,13 @@ import pytest
 
 from probewise.diagnosis import diagnose_system
 from probewise.effects import name_without_copy_suffix
-from probewise.effects.vocabulary import sentence_from_samples
+from probewise.effects.effect import sentence_from_samples
 from probewise.errors import FileError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.origins import origin_of_column, rounded_to_spread, text_rounded_to_spread, time_origin
-from probewise.systems.forms.proposals import formula_forms
-from probewise.systems.forms.rebinding import extract_stored_fit
+from probewise.systems.forms.binding import extract_stored_fit
+from probewise.systems.forms.formulas import formula_forms
+from probewise.systems.forms.modulations import origin_of_column, rounded_to_spread, text_rounded_to_spread, time_origin
 
 EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
 FAR = 2.0**21  # of a column

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.systems import Simulator, table_for
-from probewise.systems.forms.sorted_rows import names_of_jumps_in_sorted_rows, sorting_column
+from probewise.systems.forms.binding import names_of_jumps_in_sorted_rows, sorting_column
 
 _RNG = np.random.default_rng(3)
 _X = np.sort(_RNG.uniform(0, 10, 50))

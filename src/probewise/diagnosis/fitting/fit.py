@@ -16,7 +16,7 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST, GaussianMixtureSen
 from probewise.diagnosis.fitting.null import Null, Predictor
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.effects import NamedEffect
-from probewise.effects.shared_scale_prior import SharedScalePrior
+from probewise.effects.priors import SharedScalePrior
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES, footprint_of
 from probewise.sensor.stages import effects_with_columns

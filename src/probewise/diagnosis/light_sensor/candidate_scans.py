@@ -15,7 +15,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.effects import orientation_deg
-from probewise.effects.extent import median_gap_s
+from probewise.effects.reference import median_gap_s
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 

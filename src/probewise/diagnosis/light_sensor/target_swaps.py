@@ -19,7 +19,7 @@ from probewise.diagnosis.light_sensor.candidate_scans import (
     rows_of_distinct_scans,
 )
 from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
-from probewise.effects.extent import median_gap_s
+from probewise.effects.reference import median_gap_s
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 

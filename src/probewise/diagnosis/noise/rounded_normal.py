@@ -16,7 +16,7 @@ from functools import cache, cached_property, lru_cache
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.density import log_gaussian_mass_between
+from probewise.effects.noise_distribution import log_gaussian_mass_between
 
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 _LOG_HALVES = np.linspace(math.log(0.01), math.log(1000.0), 116)  # at which the information is tabulated

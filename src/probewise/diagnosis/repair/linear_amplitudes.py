@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.effects import HeavyTailedPrior, NamedEffect
-from probewise.effects.shared_scale_prior import SharedScalePrior
+from probewise.effects.priors import SharedScalePrior
 from probewise.priors import Prior, Product
 from probewise.sensor.stages import effects_with_columns
 

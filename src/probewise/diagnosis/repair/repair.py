@@ -19,7 +19,7 @@ from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import NamedEffect, is_out_of_vocabulary
-from probewise.effects.vocabulary import sentence_from_samples
+from probewise.effects.effect import sentence_from_samples
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from probewise.diagnosis.noise.law import NoiseLaw, Tail, white_noise_of_recordi
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import window_columns_and_bounds
 from probewise.effects import Dropouts
-from probewise.effects.faults import LARGEST_SIZE, MOST_OUTLYING
+from probewise.effects.noise import LARGEST_SIZE, MOST_OUTLYING
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 

@@ -32,7 +32,7 @@ from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.twins import TwinSwap, are_proportional
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
-from probewise.effects.shared_scale_prior import SharedScalePrior
+from probewise.effects.priors import SharedScalePrior
 
 Extended: TypeAlias = tuple[WeighedFit, dict[Names, float]]
 """A candidate with one more effect, and the closed-form scores of the effect by noise model."""

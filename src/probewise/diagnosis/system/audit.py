@@ -17,8 +17,8 @@ from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, name_of_first
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
+from probewise.systems.system import STANDS_STILL, with_converged_step
 from probewise.systems.table import median_sd_of_column
 
 _NOISE = 0.01  # of the range of the readings, if no noise is declared

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable
-from probewise.systems.joining import append_tables, unused_name
+from probewise.systems.table import append_tables, unused_name
 
 _LEAST_ROWS = 4
 _MOST_RUNS = 4  # recorded runs to start from

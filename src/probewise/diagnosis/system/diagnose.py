@@ -34,8 +34,8 @@ from probewise.progress import Progress, silent
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, table_for
 from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.sorted_rows import sorting_column
-from probewise.systems.row_order import note_on_row_order
+from probewise.systems.forms.binding import sorting_column
+from probewise.systems.forms.reference import note_on_row_order
 
 
 @own_arithmetic

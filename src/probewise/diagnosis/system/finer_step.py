@@ -24,7 +24,7 @@ from probewise.effects import NamedEffect
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.progress import Progress, silent
 from probewise.systems import RunTable, System
-from probewise.systems.converged_step import STANDS_STILL, with_converged_step
+from probewise.systems.system import STANDS_STILL, with_converged_step
 
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
 _HAS_A_CHANCE = 0.01  # probability from which a combination is refitted at the finer step

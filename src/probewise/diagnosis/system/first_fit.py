@@ -13,9 +13,9 @@ from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
 from probewise.recordings.plan import Recording
 from probewise.systems import RunTable, Simulator, System
-from probewise.systems.converged_step import STANDS_STILL, with_converged_step
 from probewise.systems.forms.readings import time_since_start_of_run
-from probewise.systems.row_order import rows_are_in_order
+from probewise.systems.forms.reference import rows_are_in_order
+from probewise.systems.system import STANDS_STILL, with_converged_step
 from probewise.systems.table import median_sd_of_column
 
 _STEPS_TRIED = 8  # from each start

@@ -16,7 +16,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, System, run_table_csv
 from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.rebinding import StoredFit, extract_stored_fit
+from probewise.systems.forms.binding import StoredFit, extract_stored_fit
 
 
 @own_arithmetic

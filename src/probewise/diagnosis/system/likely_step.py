@@ -19,7 +19,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.systems import RunTable, System
-from probewise.systems.converged_step import STANDS_STILL, with_converged_step
+from probewise.systems.system import STANDS_STILL, with_converged_step
 
 _LINE = np.arange(-3.0, 3.01, 0.25)  # standard-normal coordinates at which the step is tried
 _WRONG = 1.0  # noise sds, rms, by which half the step changes predictions where the step fails

@@ -20,7 +20,7 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.diagnosis.verdict_report.findings import ParameterFound, parameters_found
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import NamedEffect, is_out_of_vocabulary
-from probewise.effects.vocabulary import sentence_from_samples
+from probewise.effects.effect import sentence_from_samples
 
 _N_DRAWS = 199
 

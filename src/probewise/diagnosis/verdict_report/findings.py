@@ -21,7 +21,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.verdict_report.words import substitute_reading_unit
 from probewise.effects import Dropouts, NamedEffect, NoiseEffect, is_out_of_vocabulary
-from probewise.effects.vocabulary import mean_and_sd_of_samples, sentence_from_samples
+from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
 from probewise.recordings.plan import Plan
 
 _LEAST_PROBABILITY = 1e-3

@@ -10,7 +10,7 @@ from probewise._arrays import FloatArray
 from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis import Diagnosis, model_with
 from probewise.effects import VOCABULARY, Extent
-from probewise.effects.density import log_gaussian_density
+from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import ParameterError
 from probewise.proof.sensors import NO_PHYSICS, Case, held_out_recordings
 from probewise.recordings.plan import Recording

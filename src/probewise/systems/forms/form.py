@@ -13,8 +13,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.effects import name_of_first_copy
-from probewise.effects.shared_scale_prior import SharedScalePrior
-from probewise.effects.vocabulary import VariantMasks
+from probewise.effects.effect import VariantMasks
+from probewise.effects.priors import SharedScalePrior
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
 from probewise.systems.law_inputs import BetweenRows

@@ -10,16 +10,20 @@ import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
-from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
+from probewise.effects.effect import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
-from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, ActInTime, Form, Say
-from probewise.systems.forms.frequencies import max_n_trial_frequencies, trial_frequencies
-from probewise.systems.forms.lags import delayed_values, values_at_earlier_times
-from probewise.systems.forms.origins import origin_in_words, origin_of_column, time_origin
-from probewise.systems.late_columns import rounding_of_times
+from probewise.systems.forms.modulations import (
+    max_n_trial_frequencies,
+    origin_in_words,
+    origin_of_column,
+    time_origin,
+    trial_frequencies,
+)
+from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
+from probewise.systems.forms.reference import ReferenceFit, clipping_levels
+from probewise.systems.law_inputs import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
 
 _N_SIZES = 9
@@ -329,7 +333,7 @@ def _moves_both_ways(values: FloatArray, table: RunTable) -> bool:
     return bool((moves > still).mean() > _FORTH_AND_BACK and (moves < -still).mean() > _FORTH_AND_BACK)
 
 
-WORDS = {
+INPUT_WORDS = {
     "clock_drift": "a clock that runs fast or slow",
     "input_offset": "an offset of {0}",
     "input_gain": "a wrong scale of {0}",

@@ -1,27 +1,36 @@
-"""Forms on the parameters: parameters that vary instead of being constant."""
+"""Forms on the parameters: parameters that vary instead of being constant, and a user's own effects."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from probewise._arrays import FloatArray, varies
-from probewise._words import unit_of_name
+from probewise._words import unit_of_name, value_with_sd
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
-from probewise.systems.forms import modulations
-from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, ActInTime, Form, flag_with_prior
-from probewise.systems.forms.modulations import Modulation
+from probewise.systems.forms.form import Act, ActInTime, Form, Say, flag_with_prior
+from probewise.systems.forms.modulations import (
+    Modulation,
+    change_point_step_modulation,
+    column_proportional_modulation,
+    linear_drift_modulation,
+    value_per_run_modulation,
+)
 from probewise.systems.forms.readings import modulated_form
+from probewise.systems.forms.reference import ReferenceFit
 from probewise.systems.table import RunTable
 
 _AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
-_QUARTILES = np.array([0.25, 0.75])
 _FAR = 0.3  # change of a parameter by its own size, as large as the misfit asks for, at which the variants differ
 _MOST_NATS = 50.0  # largest logarithm of a factor
+_N_VALUES = 9
+_UNSEEN = 1e-7  # of the noise
+
+
+_QUARTILES = np.array([0.25, 0.75])
 
 
 def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
@@ -31,14 +40,14 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     values = system.parameters(about.theta, table)
     over: dict[str, Modulation] = {}
     if table.has_varying_time:
-        over["drifts"] = modulations.linear_drift_modulation(table, about.time_unit)
-    over["steps"] = modulations.change_point_step_modulation(table, about.time_unit, gated=False)
+        over["drifts"] = linear_drift_modulation(table, about.time_unit)
+    over["steps"] = change_point_step_modulation(table, about.time_unit, gated=False)
     columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and varies(v)]
     for name in own.parameters:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(own.parameters[name].from_unit(_QUARTILES))))
         each = dict(over)
         if name not in own.per_run and about.can_fit_value_per_run:
-            each["differs"] = modulations.value_per_run_modulation(table)
+            each["differs"] = value_per_run_modulation(table)
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)
             act = _parameter_shifter(name, how)
@@ -55,7 +64,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
                 unit=unit_of_name(name),
             )
         for column in columns:
-            how = modulations.column_proportional_modulation(column, table)
+            how = column_proportional_modulation(column, table)
             size = guess / float(np.nanstd(table.covariates[column]))
             for form in modulated_form(
                 about,
@@ -115,10 +124,46 @@ def _parameter_shifter(name: str, how: Modulation) -> Act:
     return lambda value, theta, table: {**value, name: value[name] + how.at_rows(theta, table)}
 
 
-WORDS = {
+PARAMETER_WORDS = {
     "drifts": "a drift of {0}",
     "steps": "a jump of {0}",
     "differs": "{0} that differs from run to run",
     "depends": "{0} that depends on {1}",
 }
 """A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""
+
+
+def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
+    """Yield a form for each extra effect of a file that changes the readings somewhere in its prior."""
+    for name, extra in about.system.simulator.extra.items():
+        values = np.asarray(extra.prior.from_unit((np.arange(_N_VALUES) + 0.5) / _N_VALUES))
+        values = values[values != extra.null]
+        act = _parameter_setter(name)
+        rms = about.rms_change_in_sds(Stage.PARAMETER, act, values[:, None])
+        seen = np.isfinite(rms) & (rms > _UNSEEN)
+        if seen.any():
+            yield Form(
+                name,
+                Stage.PARAMETER,
+                marginals={"value": extra.prior},
+                units=("",),
+                covariates=("level", "time", "row"),
+                act=act,
+                entries=values[seen][:, None, None],
+                amplitudes=(),
+                says=_sentence_writer(extra.says),
+                absent={0: extra.null},
+            )
+
+
+def _parameter_setter(name: str) -> Act:
+    """Return the function that sets a parameter of the simulator to the form's value."""
+
+    def act(value: Mapping[str, FloatArray], theta: FloatArray, table: object) -> dict[str, FloatArray]:
+        return {**value, name: theta[:, :1]}
+
+    return act
+
+
+def _sentence_writer(says: str) -> Say:
+    return lambda mean, sd: says.replace("{value}", value_with_sd(mean[0], sd[0], ""))

@@ -11,15 +11,19 @@ import numpy as np
 from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects import name_without_copy_suffix
-from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
+from probewise.effects.effect import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, period_with_sd
-from probewise.systems.forms.frequencies import frequency_prior, max_n_trial_frequencies, trial_frequencies_in_time
-from probewise.systems.forms.origins import origin_in_words, time_origin
-from probewise.systems.motion import LawWithEffects, Limit
+from probewise.systems.forms.modulations import (
+    frequency_prior,
+    max_n_trial_frequencies,
+    origin_in_words,
+    time_origin,
+    trial_frequencies_in_time,
+)
+from probewise.systems.forms.reference import ReferenceFit, clipping_levels
+from probewise.systems.law import LawWithEffects, Limit
 
 _N_SIZES = 9
 _NO_SHARE = 1e-9  # of what a bound stops: none
@@ -106,7 +110,7 @@ def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset
     places = tuple(
         begin
         for state in about.states_with_rates_by_definition
-        for begin in (*(f"{kind}:{state}" for kind in WORDS if kind != "limit"), f"formula:rate:{state}")
+        for begin in (*(f"{kind}:{state}" for kind in RATE_WORDS if kind != "limit"), f"formula:rate:{state}")
     )
     return frozenset(
         name for name in names if f"{name_without_copy_suffix(name)}:".startswith(tuple(f"{p}:" for p in places))
@@ -299,7 +303,7 @@ def _rms_rate(about: ReferenceFit, state: str) -> float:
     return float(np.sqrt(np.mean(joined**2))) or 1.0
 
 
-WORDS = {
+RATE_WORDS = {
     "damping": "damping of {0}",
     "drag": "drag on {0}",
     "friction": "dry friction of {0}",

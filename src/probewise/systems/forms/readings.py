@@ -3,25 +3,230 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
+from scipy.linalg import solve_banded
 
-from probewise._arrays import BoolArray, FloatArray, distinct_values, rounding_error, varies
+from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
+from probewise.effects.reading import decaying_sum
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms import modulations
-from probewise.systems.forms.about import ReferenceFit
-from probewise.systems.forms.form import Act, Form
-from probewise.systems.forms.lags import late_forms
-from probewise.systems.forms.modulations import Modulation
+from probewise.systems.forms.form import Act, Form, flag_with_prior
+from probewise.systems.forms.modulations import (
+    Modulation,
+    change_point_step_modulation,
+    column_proportional_modulation,
+    linear_drift_modulation,
+    sinusoid_modulation,
+    value_per_run_modulation,
+)
+from probewise.systems.forms.reference import ReferenceFit
 from probewise.systems.table import RunTable
 
 _N_SIZES = 9
+_SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
+_ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
+_APART = 1.0  # lambda between the two at some trial size, below which they are the same
 _BEND_DEGREE = 4
 _OUTLYING = 5.0  # medians of the residual's size
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """Splines through values (n_samples, n) at rising times (n,), twice differentiable, a parabola in each end segment.
+
+    Of rows at the same time the last counts.
+    """
+
+    time: FloatArray
+    values: FloatArray
+
+    @cached_property
+    def gaps(self) -> FloatArray:
+        """Time from each row to the next, (n - 1,)."""
+        return np.diff(self.time)
+
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """First derivative at each row, (n_samples, n)."""
+        last = np.append(self.gaps > 0, True)
+        x = self.values[:, last]
+        h = np.diff(self.time[last])
+        if len(h) == 0:
+            return np.zeros_like(self.values)
+        secants = np.diff(x, axis=1) / h
+        if len(h) == 1:
+            slopes = np.repeat(secants, 2, axis=1)
+        else:
+            n = len(h) + 1
+            bands, right = np.zeros((3, n)), np.empty_like(x)
+            bands[1, [0, -1]] = bands[0, 1] = bands[2, -2] = 1.0
+            bands[1, 1:-1] = 2 * (h[:-1] + h[1:])
+            bands[0, 2:], bands[2, :-2] = h[:-1], h[1:]
+            right[:, 0], right[:, -1] = 2 * secants[:, 0], 2 * secants[:, -1]
+            right[:, 1:-1] = 3 * (h[1:] * secants[:, :-1] + h[:-1] * secants[:, 1:])
+            slopes = np.asarray(solve_banded((1, 1), bands, right.T, check_finite=False)).T
+        return np.asarray(slopes[:, np.cumsum(last) - last])
+
+    @cached_property
+    def derivatives(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Second derivative after and before each gap, and third derivative in it, (n_samples, n - 1) each."""
+        h = np.where(self.gaps > 0, self.gaps, 1.0)
+        before, after = self.slopes[:, :-1], self.slopes[:, 1:]
+        secants = np.diff(self.values, axis=1) / h
+        return (
+            (6 * secants - 4 * before - 2 * after) / h,
+            (2 * before + 4 * after - 6 * secants) / h,
+            6 * (before + after - 2 * secants) / h**2,
+        )
+
+    def at(self, gap: IntArray, since: FloatArray) -> FloatArray:
+        """Return the values in the gaps `gap` after the time `since` from their start, (n_samples, n_asked) each."""
+        second, _, third = self.derivatives
+        start, slope, bend, twist = (
+            np.take_along_axis(np.broadcast_to(own, (len(gap), own.shape[1])), gap, axis=1)
+            for own in (self.values[:, :-1], self.slopes[:, :-1], second, third)
+        )
+        return np.asarray(start + since * (slope + since * (bend / 2 + since * twist / 6)))
+
+
+def late_forms(about: ReferenceFit) -> Iterator[Form]:
+    """Yield the forms of a reading that comes late: `lag` and `delay`."""
+    reading, unit = about.system.simulator.reading, about.time_unit
+    for name, act, tried, says in (
+        ("lag", lagged_readings, np.geomspace(0.02, 200.0, 33), f"{reading} lags with a time constant of"),
+        ("delay", delayed_readings, np.geomspace(1e-3, 100.0, 41), f"{reading} is delayed by"),
+    ):
+        prior = about.log_uniform_size_prior(Stage.LAG, _at_rows_alone(act), about.median_gap * tried)
+        if prior is not None:
+            yield _with_smooth_variant(about, name, act, prior, says, unit)
+
+
+def _at_rows_alone(act: Act) -> Act:
+    return lambda value, theta, table: act(value, np.append(theta, np.zeros_like(theta), axis=1), table)
+
+
+def _with_smooth_variant(
+    about: ReferenceFit, name: str, act: Act, prior: LogUniform, says: str, time_unit: str
+) -> Form:
+    sizes = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)
+
+    def variant(smooth: bool) -> Form:
+        flag, prior_of_flag = flag_with_prior(smooth)
+        return Form(
+            name,
+            Stage.LAG,
+            marginals={"tau_s": prior, _SMOOTH: prior_of_flag},
+            units=(time_unit, "1"),
+            covariates=("previous",),
+            act=act,
+            entries=np.stack([sizes, np.full(_N_SIZES, flag)], axis=1)[:, None, :],
+            amplitudes=(),
+            says=lambda mean, sd: f"{says} {value_with_sd(mean[0], sd[0], time_unit)}",
+            absent={0: 0.0},
+            needs_rising_time=True,
+            fixed=(_SMOOTH,),
+            relative_odds=_ODDS_OF_SMOOTH if smooth else 1.0,
+        )
+
+    at_rows, smooth = variant(False), variant(True)
+    value = about.predicted[None, :]
+    apart = act(value, at_rows.entries[:, 0], about.table) - act(value, smooth.entries[:, 0], about.table)
+    size = np.sqrt(np.nansum(apart[:, about.has_reading] ** 2, axis=1)) / about.sd
+    return replace(at_rows, alternatives=(smooth,)) if size.max() > _APART else at_rows
+
+
+def lagged_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Return readings that lag by first order, (n_samples, n_points); each run begins without a lag.
+
+    `theta` (n_samples, 2) is the time constant, and above 0.5 for readings that are smooth between the rows.
+    """
+    out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
+    tau, smooth = theta[:, :1], theta[:, 1:2] > 0.5
+    for rows in table.rows_by_scan():
+        if len(rows) < 2:
+            continue
+        time, x = table.time_s[rows], out[:, rows]
+        gaps = np.diff(time)
+        with np.errstate(divide="ignore"):
+            carry = np.where(tau > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)), 0.0)
+        gain = (1 - carry) * x[:, 1:]
+        if smooth.any():
+            gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(Spline(time, x), tau, carry), gain)
+        added, kept = np.insert(gain, 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
+        out[:, rows] = decaying_sum(added, kept, longest=len(rows))
+    return out
+
+
+def _gain_of_smooth_readings(spline: Spline, tau: FloatArray, carry: FloatArray) -> FloatArray:
+    """Return what each gap adds to `carry` times the lagging reading before it, (n_samples, n - 1).
+
+    Of a cubic x the lagging reading is x - tau x' + tau^2 x'' - tau^3 x''' once the start is forgotten.
+    """
+    second_after, second_before, third = spline.derivatives
+    late = tau**2 * np.stack([second_after, second_before]) - tau**3 * third
+    begin = spline.values[:, :-1] - tau * spline.slopes[:, :-1] + late[0]
+    end = spline.values[:, 1:] - tau * spline.slopes[:, 1:] + late[1]
+    return np.asarray(end - carry * begin)
+
+
+def delayed_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Return readings after a dead time, (n_samples, n_points); before it is over, a run's first reading holds.
+
+    `theta` (n_samples, 2) is the dead time, and above 0.5 for readings that are smooth between the rows.
+    """
+    out = delayed_values(value, theta, table)
+    smooth = np.flatnonzero(theta[:, 1] > 0.5)
+    if smooth.size:
+        by, own = theta[smooth, 0], value[smooth] if len(value) > 1 else value
+        for rows in table.rows_by_scan():
+            out[np.ix_(smooth, rows)] = _smooth_values_at_earlier_times(table.time_s[rows], own[:, rows], by)
+    return out
+
+
+def delayed_values(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Return readings or a column, (n_points,) or (n_samples, n_points), delayed within runs by theta[:, 0]."""
+    values = np.atleast_2d(values)
+    out = np.empty((max(len(values), len(theta)), values.shape[1]))
+    for rows in table.rows_by_scan():
+        out[:, rows] = values_at_earlier_times(table.time_s[rows], values[:, rows], theta[:, 0])
+    return out
+
+
+def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
+    """Interpolate values (1 or n_samples, n), given at times (n,), at times earlier by `by`: (n_samples, n).
+
+    Before the first time, the first value holds.
+    """
+    if len(time) < 2:
+        return np.broadcast_to(values, (len(by), len(time)))
+    asked = time[None, :] - by[:, None]
+    after = _index_of_next_row(time, asked)
+    gap = time[after] - time[after - 1]
+    share = np.clip((asked - time[after - 1]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+    values = np.broadcast_to(values, asked.shape)
+    low, high = np.take_along_axis(values, after - 1, axis=1), np.take_along_axis(values, after, axis=1)
+    # Where two rows have the same time, interpolation would take the last for the first.
+    return np.where(by[:, None] == 0, values, low + share * (high - low))
+
+
+def _index_of_next_row(time: FloatArray, asked: FloatArray) -> IntArray:
+    """Return the index of the row after each time asked for, (n_samples, n), from 1 to that of the last row."""
+    return np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1)
+
+
+def _smooth_values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
+    """Return what `values_at_earlier_times` does, by a spline."""
+    if len(time) < 2:
+        return np.broadcast_to(values, (len(by), len(time)))
+    asked = np.maximum(time[None, :] - by[:, None], time[0])
+    gap = _index_of_next_row(time, asked) - 1
+    found = Spline(time, values).at(gap, asked - time[gap])
+    return np.where(by[:, None] == 0, np.broadcast_to(values, asked.shape), found)
 
 
 def modulated_form(
@@ -66,10 +271,10 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     span = float(np.ptp(about.predicted)) or about.sd
     over: dict[str, Modulation] = {}
     if table.has_varying_time:
-        over["drift"] = modulations.linear_drift_modulation(table, about.time_unit)
-    over["step"] = modulations.change_point_step_modulation(table, about.time_unit, gated=True)
+        over["drift"] = linear_drift_modulation(table, about.time_unit)
+    over["step"] = change_point_step_modulation(table, about.time_unit, gated=True)
     if about.can_fit_value_per_run:
-        over["per_run"] = modulations.value_per_run_modulation(table)
+        over["per_run"] = value_per_run_modulation(table)
     for kind, how in over.items():
         yield from modulated_form(
             about,
@@ -93,7 +298,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
             covariates=("level",),
         )
     if table.has_varying_time:
-        how = modulations.sinusoid_modulation(about)
+        how = sinusoid_modulation(about)
         yield from modulated_form(
             about,
             "interference",
@@ -108,7 +313,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         yield from late_forms(about)
     for name, values in table.covariates.items():
         if name not in (reading, about.system.simulator.noise.sd) and varies(values):
-            how = modulations.column_proportional_modulation(name, table)
+            how = column_proportional_modulation(name, table)
             yield from modulated_form(
                 about,
                 f"sensitivity:{name}",
@@ -325,7 +530,7 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     )
 
 
-WORDS = {
+READING_WORDS = {
     "offset_step": "a jump of all readings",
     "gain_step": "a jump of the readings' gain",
     "offset_per_run": "an offset of its own in each run",

@@ -12,12 +12,12 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, ModelSamples
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.effects.density import log_gaussian_density
+from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import NotConvergedError
 from probewise.proof.systems import SystemCase, right_predictions
 from probewise.systems import RunTable
 from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.rebinding import extract_stored_fit, has_value_per_run, rebind_forms
+from probewise.systems.forms.binding import extract_stored_fit, has_value_per_run, rebind_forms
 from probewise.systems.prediction import draw_value_for_new_run
 from probewise.systems.system import SystemChain
 

@@ -12,14 +12,22 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ShapeError
+from probewise.systems.calls import call_on_read_only, read_only_views
 from probewise.systems.law_inputs import BetweenRows, LawInputs, StepInputs, StepPart, of_columns, values_at_rows
-from probewise.systems.rosenbrock import Rosenbrock
-from probewise.systems.rows_in_runs import RowsInRuns
-from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
-from probewise.systems.simulator import Law, call_on_read_only, read_only_views
-from probewise.systems.steps import Steps
+from probewise.systems.simulator import Law
+from probewise.systems.step import (
+    FOURTH_ORDER,
+    N_LONGER,
+    Rosenbrock,
+    RowsInRuns,
+    RungeKutta,
+    Steps,
+    StepSchedule,
+    Terms,
+)
 
 _MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
+
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""

@@ -1,27 +1,35 @@
-"""The protocol of a named effect: what the diagnosis needs besides its formula."""
+"""What the diagnosis needs of an effect besides its formula; bases of effects that are linear, change, or oscillate."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import pairwise
 from typing import Any, ClassVar, Protocol, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, distinct_values
 from probewise._kinds import require_mapping
 from probewise._words import unit_after_number
-from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import FittedReadings
+from probewise.effects.priors import HeavyTailedPrior
+from probewise.effects.reference import Extent
 from probewise.errors import ParameterError
+from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseParameters
 
-V = TypeVar("V")
-
 _BOTH_SIGNS = 0.05  # least share of samples of either sign
 _NEAR_ZERO, _FEW_NEAR_ZERO = 0.1, 0.01  # in medians of their sizes; of a normal distribution about 0, .054 are so near
+_OWN = ("name", "stage", "units", "covariates", "prior", "apply", "bank", "sentence")
+_MOST_TIMES = 512
+_FEW = 48  # intervals, enough to detect that something changed in one of them
+
+
+V = TypeVar("V")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,9 +196,6 @@ def require_effect_classes(effects: object) -> None:
             raise ParameterError("effects", name, f"{own!r}, the name of the class {kind.__name__}")
 
 
-_OWN = ("name", "stage", "units", "covariates", "prior", "apply", "bank", "sentence")
-
-
 class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
     """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True."""
 
@@ -274,3 +279,178 @@ def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]
 def single_column_bank(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of one column from the parameters' values, numbers or (n_bank,): (n_bank, 1, n_params)."""
     return np.stack(np.broadcast_arrays(*parameters), axis=-1)[:, None, :].astype(np.float64)
+
+
+class LinearEffect(NamedEffect[V]):
+    """Base of effects whose readings change in proportion to each parameter, to first order.
+
+    A subclass is a frozen dataclass with one field that begins with `typical`: the typical size of every parameter.
+    """
+
+    parameters: ClassVar[tuple[str, ...]]
+    """Names of the parameters."""
+    positive = False
+    """Whether the parameters are never negative."""
+
+    @cached_property
+    def _typical_size(self) -> float:
+        (name,) = (each.name for each in fields(self) if each.name.startswith("typical"))  # type: ignore[arg-type]
+        return float(getattr(self, name))
+
+    @property
+    def amplitudes(self) -> tuple[int, ...]:
+        """Indices of all parameters."""
+        return tuple(range(len(self.parameters)))
+
+    @cached_property
+    def prior(self) -> Product:
+        """The same heavy-tailed prior for each parameter."""
+        size = HeavyTailedPrior(self._typical_size, positive=self.positive)
+        return Product(dict.fromkeys(self.parameters, size))
+
+    def bank(self) -> FloatArray:
+        """Return one entry with a column for each parameter, (1, n_params, n_params)."""
+        return self._typical_size * np.eye(len(self.parameters))[None, :, :]
+
+
+@dataclass(frozen=True)
+class ScanGroupEffect(LinearEffect[V]):
+    """Base of linear effects on one scan, or on all scans of one mounting (orientation).
+
+    `scans` are the affected scans, chosen among the groups of scans in `choices`.
+    """
+
+    scans: tuple[str, ...] = ()
+    choices: tuple[tuple[str, ...], ...] = ()
+
+    def variants(self) -> tuple[Self, ...]:
+        return tuple(replace(self, scans=choice) for choice in self.choices)
+
+
+def scans_in_words(scans: tuple[str, ...]) -> str:
+    """Return the names of scans as a phrase: "scan a", or "scans a, b"."""
+    return f"scan{'s' if len(scans) > 1 else ''} {', '.join(scans)}"
+
+
+@dataclass(frozen=True)
+class ChangePointEffect(NamedEffect[V]):
+    """Base of effects that act on the readings taken after `at_s`, the last parameter.
+
+    `times_s` are the times of the readings. Between which two of them the change point lies is a discrete choice
+    (`between_s`); its position within that interval does not affect any reading.
+    """
+
+    times_s: tuple[float, ...] = (0.0, 1e5)
+    between_s: tuple[float, float] | None = None
+
+    @property
+    def typical_sizes(self) -> Mapping[str, float]:
+        """Typical size of each amplitude, by name."""
+        raise NotImplementedError
+
+    @property
+    def amplitudes(self) -> tuple[int, ...]:
+        """Indices of all parameters but the last, the time."""
+        return tuple(range(len(self.typical_sizes)))
+
+    @cached_property
+    def prior(self) -> Product:
+        """Prior of the amplitudes, heavy-tailed with either sign, and of the time, uniform in `change_interval_s`."""
+        sizes = {name: HeavyTailedPrior(size) for name, size in self.typical_sizes.items()}
+        return Product({**sizes, "at_s": Uniform(*self.change_interval_s)})
+
+    def bank(self) -> FloatArray:
+        """Return one entry, (1, n_amplitudes, n_params): a column per amplitude, the time amid its interval."""
+        sizes = np.diag(list(self.typical_sizes.values()))
+        return np.column_stack([sizes, np.full(len(sizes), sum(self.change_interval_s) / 2)])[None, :, :]
+
+    @property
+    def change_interval_s(self) -> tuple[float, float]:
+        """Bounds of the interval in which the change point may lie, s: `between_s`, else the whole recording."""
+        return self.between_s or (self.times_s[0], self.times_s[-1])
+
+    @staticmethod
+    def after_change_mask(theta: FloatArray, plan: Plan) -> BoolArray:
+        """Return the mask of the readings taken after each sample's change point, (n_samples, n_points)."""
+        return np.asarray(plan.time_s > theta[:, -1:])
+
+    @property
+    def has_change_point(self) -> bool:
+        """True."""
+        return True
+
+    def variants(self) -> tuple[Self, ...]:
+        """Return one variant for each interval between consecutive `times_s`."""
+        return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
+
+    def with_fewer_variants(self) -> Self:
+        """Return the effect with neighbouring intervals joined, so that at most 48 remain."""
+        stride = -(-(len(self.times_s) - 1) // _FEW)
+        return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
+
+    def variant_masks(self, plan: Plan) -> VariantMasks:
+        """Return the masks of readings after each candidate change point, (n_intervals, n_points).
+
+        A candidate is the middle of its interval. The bank entry beside the masks acts on all readings.
+        """
+        always = self.bank()[0]
+        always[:, -1] = -np.inf
+        middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]
+        return VariantMasks(always, np.array([plan.time_s > at for at in middles]))
+
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw the time of change: for each sample an interval with probability `weights`, then a time within it.
+
+        `theta` is (n_samples, n_params), in and out; `weights` is (n_intervals,).
+        """
+        times = np.array(self.times_s)
+        chosen = rng.choice(len(weights), len(theta), p=weights)
+        at_s = times[chosen] + np.diff(times)[chosen] * rng.random(len(theta))
+        return np.concatenate([theta[:, :-1], at_s[:, None]], axis=1)
+
+
+def candidate_change_times_s(extent: Extent) -> tuple[float, ...] | None:
+    """Return the distinct times of a recording's readings, thinned to at most 512 intervals; None for one time."""
+    times = distinct_values(extent.plan.time_s)
+    if len(times) < 2:
+        return None
+    stride = -(-(len(times) - 1) // _MOST_TIMES)
+    return tuple(np.append(times[:-1:stride], times[-1]).tolist())
+
+
+PHASE = Uniform(-2 * np.pi, 2 * np.pi)
+"""Prior of a phase, two full turns: every phase has an equivalent far from both ends."""
+
+
+def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:
+    """Return bank entries of waves, a sine and a cosine each, (n_bank, 2, n_params).
+
+    `parameters` are those before the phase, which is the last: numbers or (n_bank,); the first is the amplitude.
+    """
+    return np.concatenate([single_column_bank(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
+
+
+def starting_point_of_wave(entry: FloatArray, amounts: FloatArray) -> FloatArray:
+    """Return the parameters, (n_params,), of the sum of a bank entry's sine and cosine, times the fitted amounts (2,).
+
+    The amplitude is the first, the phase the last; those between are the entry's.
+    """
+    setting = entry[0].copy()
+    sine, cosine = amounts * setting[0]
+    setting[0], setting[-1] = np.hypot(sine, cosine), np.arctan2(cosine, sine)
+    return np.asarray(setting)
+
+
+class PeriodicEffect(NamedEffect[V]):
+    """Base of effects whose phase has a prior over two turns, which hold every posterior mode twice."""
+
+    @property
+    def n_peaks(self) -> int:
+        return 2
+
+
+class WaveEffect(PeriodicEffect[V]):
+    """Base of effects with amplitude, frequency or period, and phase; bank entries hold a sine and a cosine."""
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        return starting_point_of_wave(entry, amounts)

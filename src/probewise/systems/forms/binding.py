@@ -1,25 +1,91 @@
-"""Rebind the forms of a stored model from its recording, without a new fit."""
+"""Bind all forms to a fit, or those of a stored model to its recording, without a new fit."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import PROPOSAL
+from probewise.effects import AGAIN, PROPOSAL
 from probewise.errors import ParameterError
 from probewise.sensor import Stage
-from probewise.systems.forms import bind_forms, driving_columns
-from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, Form
-from probewise.systems.forms.proposals import formula_forms
+from probewise.systems.forms.formulas import formula_forms
+from probewise.systems.forms.inputs import INPUT_WORDS, driving_columns, forms_on_inputs
+from probewise.systems.forms.parameters import PARAMETER_WORDS, forms_of_extras, forms_on_parameters
+from probewise.systems.forms.rates import RATE_WORDS, forms_on_rates
+from probewise.systems.forms.readings import READING_WORDS, forms_on_readings
+from probewise.systems.forms.reference import ReferenceFit
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
-from probewise.systems.table import RunTable
+from probewise.systems.table import RunTable, covariate_of_column
+
+WORDS: Mapping[str, str] = MappingProxyType(READING_WORDS | INPUT_WORDS | PARAMETER_WORDS | RATE_WORDS)
+"""A noun phrase for each form, with places for its targets."""
+
+
+_IN_ORDER = frozenset({"offset_step", "gain_step", "steps", "hysteresis", "backlash", "lag", "delay", "input_delay"})
+
+
+def bind_forms(about: ReferenceFit) -> dict[str, Form]:
+    """Return every form that could be detectable near this fit, by name; each wave twice, as two may act."""
+    named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
+    if not about.rows_are_in_order:
+        named = [form for form in named if form.name.split(":")[0] not in _IN_ORDER]
+    if (column := sorting_column(about)) is not None:
+        named = [jump_in_sorted_rows(form, about.table, column) for form in named]
+    found = [*named, *forms_of_extras(about)]
+    waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]
+    return {form.name: form for form in [*found, *waves]}
+
 
 _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
+
+
+def sorting_column(about: ReferenceFit) -> str | None:
+    """Return the name of a column that drives the simulator and rises or falls along all rows; None if none does.
+
+    Where a time was recorded, there is none: rows are in its order, whatever they are sorted by besides. A column that
+    drives nothing, such as a number of the reading, may be that order itself.
+    """
+    table = about.table
+    if table.has_varying_time:
+        return None
+    changes = {name: np.diff(values) for name, values in table.covariates.items() if np.ptp(values) > 0}
+    ordered = {name for name, change in changes.items() if np.all(change >= 0) or np.all(change <= 0)}
+    return next((name for name in driving_columns(about) if name in ordered), None) if ordered else None
+
+
+def jump_in_sorted_rows(form: Form, table: RunTable, column: str) -> Form:
+    """Return a form with a jump at a row as one that shows in the column, and says where that is; others as given."""
+    if form.change_points is None or not form.change_points.by_row:
+        return form
+    values = table.covariates[column]
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        before = int(np.clip(np.floor(mean[-1]), 0, len(values) - 1))
+        return (
+            f"{form.says(mean, sd)}; rows are sorted by {column}, so it may be where {column} passes "
+            f"{values[before]:.4g} instead"
+        )
+
+    return replace(form, covariates=(covariate_of_column(column), *form.covariates), says=says)
+
+
+def names_of_jumps_in_sorted_rows(effects: Mapping[str, Any]) -> frozenset[str]:
+    """Return the names of the effects that `jump_in_sorted_rows` has changed."""
+    return frozenset(
+        name
+        for name, effect in effects.items()
+        if isinstance(effect, Form)
+        and effect.change_points is not None
+        and effect.change_points.by_row
+        and effect.covariates[0] != "row"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
 
-from probewise._arrays import BoolArray, FloatArray, rounding_error
+from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
+from probewise.systems.calls import call_on_read_only, read_only_views
 from probewise.systems.forms.form import Act, Form
-from probewise.systems.motion import integrate_states
-from probewise.systems.row_order import rows_are_in_order
-from probewise.systems.simulator import call_on_read_only, read_only_views
+from probewise.systems.law import integrate_states
+from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
-_ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
+_BY_CHANCE = 1e-4  # probability below which sorted readings are no chance
+_LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
+_LEAST_CUT = 0.003  # of a range, that is cut off at least by what is looked for
+_N_LEVELS = 10  # of either
+_WILD_SHARE = 0.001  # of the values, at either end, beside one that may be wild
+_WILD = 4.0  # times the range of the other values, from which some are wild
 _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings change
@@ -26,6 +34,113 @@ _TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in no
 _NUDGE = 1e-3  # of a state's range
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
+
+
+def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
+    """Return the probability that readings in equal rows are in order by chance; 1 if they are not in order.
+
+    Rows are equal where all columns but the reading and its sd are. Readings must rise in all groups of equal rows, or
+    fall in all: by chance once in the product of the numbers of their arrangements. It is 1 where a time was recorded,
+    where equal rows are apart, and for readings that rise or fall along the whole table, as those of a drift do.
+    """
+    own, readings = simulator, table.columns.get(simulator.reading)
+    if table.has_varying_time or readings is None or readings.dtype != np.float64:
+        return 1.0
+    inputs = [values for name, values in table.columns.items() if name not in (own.reading, own.noise.sd)]
+    codes = [_codes_of_equal_cells(values) for values in inputs]
+    group = np.unique(np.stack([*codes, np.zeros(len(table), dtype=np.int64)]), axis=1, return_inverse=True)[1].ravel()
+    there = np.flatnonzero(np.isfinite(readings))
+    if (
+        np.count_nonzero(np.diff(group[there])) >= np.unique(group[there]).size
+    ):  # equal rows apart: by a jump or a drift
+        return 1.0
+    sizes = np.bincount(group[there])
+    ties = np.unique(np.stack([group[there], readings[there]]), axis=1, return_counts=True)[1]
+    log_chance = np.log(2.0) - np.sum(gammaln(sizes + 1)) + np.sum(gammaln(ties + 1))
+    whole = np.diff(readings[there])
+    along = whole[np.diff(group[there]) == 0]  # equal rows are beside each other
+    for sign in (1.0, -1.0):
+        if np.all(sign * along >= 0) and not np.all(sign * whole >= 0):
+            return float(min(np.exp(log_chance), 1.0))
+    return 1.0
+
+
+def _codes_of_equal_cells(values: NDArray[Any]) -> IntArray:
+    """Return a number for each cell of a column, (n_points,), the same for cells that are equal but for rounding."""
+    if values.dtype != np.float64:
+        return np.unique(values, return_inverse=True)[1]
+    return np.where(np.isfinite(values), np.searchsorted(distinct_values(values), values, side="right"), 0)
+
+
+def rows_are_in_order(simulator: Simulator, table: RunTable) -> bool:
+    """Return whether the order of rows may be that of recording: readings in equal rows are not sorted."""
+    return chance_of_sorted_readings(simulator, table) > _BY_CHANCE
+
+
+def note_on_row_order(simulator: Simulator, table: RunTable) -> tuple[str, ...]:
+    """Return a note where rows are in no order of recording; else ()."""
+    chance = chance_of_sorted_readings(simulator, table)
+    if chance > _BY_CHANCE:
+        return ()
+    once_in = 1 / max(chance, 1e-300)
+    return (
+        f"rows are in no order of recording: wherever the other columns are equal, {simulator.reading} is sorted, by "
+        f"chance once in {once_in:.0e} tables; nothing is asked that needs their order, such as a jump at a row, "
+        "hysteresis or correlated noise",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ClippingLevels:
+    """Clipping levels between `low` and `high`: a ceiling above `least_ceiling`, otherwise a floor.
+
+    `top` is the largest value, which may be wild, far above `high`.
+    """
+
+    low: float
+    high: float
+    top: float
+
+    @property
+    def least_ceiling(self) -> float:
+        """Level at 40 % of the range: a clipping level above it is a ceiling, otherwise a floor."""
+        return self.low + _LOWER_PART * (self.high - self.low)
+
+    @property
+    def trial_levels(self) -> FloatArray:
+        """Trial levels for the template bank, (n_levels,): ceilings, then floors, densest at the ends of the range."""
+        range_ = self.high - self.low
+        ceilings = self.high - range_ * np.geomspace(_LEAST_CUT, 0.97 * (1 - _LOWER_PART), _N_LEVELS)
+        return np.append(ceilings, self.low + range_ * np.geomspace(_LEAST_CUT, 0.97 * _LOWER_PART, _N_LEVELS))
+
+    @property
+    def prior(self) -> Uniform:
+        """Uniform prior of the level, from `low` to `high`."""
+        return Uniform(self.low, self.high)
+
+    @property
+    def level_out_of_reach(self) -> float:
+        """A level far above all values: a ceiling without effect."""
+        return self.top + (self.high - self.low)
+
+
+def clipping_levels(values: FloatArray) -> ClippingLevels | None:
+    """Return the clipping levels within the range of some values, NaN aside; None if it is empty.
+
+    A wild value, as 9999 in one cell, is left out: it would move the level that tells a ceiling from a floor.
+    """
+    ordered = np.sort(values[np.isfinite(values)])
+    if not ordered.size or ordered[0] == ordered[-1]:
+        return None
+    n_wild = 1 + int(_WILD_SHARE * len(ordered))
+    inner, others = ordered, ordered[n_wild:-n_wild]
+    range_ = np.ptp(others) if others.size else 0.0
+    if 0 < _WILD * range_ < np.ptp(ordered):
+        inner = ordered[(ordered >= others[0] - range_) & (ordered <= others[-1] + range_)]
+    return ClippingLevels(float(inner[0]), float(inner[-1]), float(ordered[-1]))
+
+
+_ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,813 @@
+"""Effects of the light on its way: the scene, the sensor's height, its footprint, edges, patches."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
+from probewise.effects.effect import LinearEffect, NamedEffect, ScanGroupEffect, V, scans_in_words, single_column_bank
+from probewise.effects.priors import HeavyTailedPrior
+from probewise.effects.reference import (
+    CountsPlaceFromOrigin,
+    CountsTimeFromOrigin,
+    Extent,
+    Origin,
+    candidate_scan_groups,
+    distinct_positions_mm,
+    scan_indicator,
+)
+from probewise.priors import LogUniform, Normal, Product, Uniform
+from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Ramp, Stripes
+from probewise.recordings.plan import Plan
+from probewise.scene.albedo import Region
+from probewise.scene.regions import edge_distance
+from probewise.sensor.commanded import footprint_at_added_height, height_ratio
+from probewise.sensor.gaussian import LabGaussian, mean_albedo_under_one_gaussian
+from probewise.sensor.stages import Footprint, SceneView, Stage, View
+
+_RADII = (0.04, 0.1, 0.25)  # of the line's length, for the bank; the prior reaches twice as far either way
+_MARGIN = 0.1  # of the line's length: a patch may lie beyond its ends
+_STRAIGHT = 0.02  # of a scan's length: the largest deviation from a straight line
+_LEAST_PLACES = 8
+_STEP = 1e-3  # of a standard deviation, for the central difference: its error is a millionth of this
+_USUAL_MM = 14.0  # the height assumed where a recording gives none
+_ANGLES = 8
+
+
+@dataclass(frozen=True)
+class EdgeMisplacement(LinearEffect[SceneView]):
+    """Every pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X (all others)."""
+
+    typical_mm: float = 0.3
+
+    name = "edge_misplacement"
+    words = "misplaced edges"
+    stage = Stage.SCENE
+    units = ("mm",)
+    covariates = ("slope",)
+    parameters = ("offset_mm",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Set the typical offset to 0.3 % of the length of the longest scan."""
+        return cls(typical_mm=0.003 * extent.length_mm)
+
+    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+        return _with_shifted_patterns(value, theta * np.ones(len(plan)), plan)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return f"the printed edges lie {value_with_sd(mean[0], sd[0])} mm from their described place, in all scans"
+
+
+@dataclass(frozen=True)
+class ScanMisplacement(ScanGroupEffect[SceneView]):
+    """In one scan the pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X."""
+
+    typical_mm: float = 0.3
+
+    name = "scan_misplacement"
+    words = "a misplaced pattern in one scan"
+    stage = Stage.SCENE
+    units = ("mm",)
+    covariates = ("scan", "slope")
+    parameters = ("offset_mm",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Set the typical offset to 0.3 % of the length of the longest scan; None for a single scan."""
+        names = tuple(dict.fromkeys(extent.plan.scan_names))
+        if len(names) < 2:
+            return None
+        return cls(choices=tuple((name,) for name in names), typical_mm=0.003 * extent.length_mm)
+
+    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+        return _with_shifted_patterns(value, theta * scan_indicator(plan, self.scans), plan)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return (
+            f"in {scans_in_words(self.scans)} the pattern lies {value_with_sd(mean[0], sd[0])} mm from where it lies "
+            "in the others"
+        )
+
+
+def _with_shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
+    """Return the view with each reading's pattern shifted by `by_mm`, (n_samples, n_points).
+
+    The shift is along the normal of a half-plane, stripes or a ramp, and along X otherwise.
+    """
+    angle = np.zeros(len(plan))
+    for name, rows in plan.rows_by_pattern():
+        pattern = plan.patterns.get(name)
+        if isinstance(pattern, HalfPlane | Stripes | Ramp):
+            angle[rows] = pattern.normal_rad
+    return replace(view, dx_mm=view.dx_mm + by_mm * np.cos(angle), dy_mm=view.dy_mm + by_mm * np.sin(angle))
+
+
+_LEAST_ANGLE_RAD = np.radians(-89.5)
+
+
+_ONE_DIRECTION_RAD = np.radians(1.0)
+
+
+def gaussian_bump(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
+    """Return exp(-d^2 / 2 r^2) of the squared distances d^2; the arrays broadcast."""
+    return np.exp(-0.5 * squared_distance / radius**2)
+
+
+@dataclass(frozen=True)
+class ScanLine:
+    """A line at `angle_rad` to X, `offset_mm` beside the origin, from `low_mm` to `high_mm` along it.
+
+    Its points are s t + offset_mm n, s from low_mm to high_mm; t is the unit vector along the line, n is t turned by 90
+    degrees.
+    """
+
+    angle_rad: float
+    offset_mm: float
+    low_mm: float
+    high_mm: float
+
+    @property
+    def length_mm(self) -> float:
+        """Length of the line, mm."""
+        return self.high_mm - self.low_mm
+
+    def lab_coordinates_mm(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return X and Y of points given by their position along the line and distance from it; arrays broadcast."""
+        c, s, n = np.cos(self.angle_rad), np.sin(self.angle_rad), self.offset_mm + beside_mm
+        return c * along_mm - s * n, s * along_mm + c * n
+
+    def line_coordinates_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the position of points X, Y along the line, and their distance from it; arrays broadcast."""
+        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        return c * x_mm + s * y_mm, c * y_mm - s * x_mm - self.offset_mm
+
+
+ALONG_X = ScanLine(0.0, 0.0, -50.0, 50.0)
+"""The X axis, 50 mm to either side."""
+
+
+def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
+    """Return the distinct lines of the plan's straight scans that have eight distinct places or more."""
+    found: list[ScanLine] = []
+    for rows in plan.rows_by_scan():
+        places = np.unique(np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1), axis=0)
+        if len(places) < _LEAST_PLACES:
+            continue
+        angle = _principal_angle_rad(places)
+        along, across = ScanLine(angle, 0.0, 0.0, 1.0).line_coordinates_mm(*places.T)
+        if len(distinct_positions_mm(along)) < _LEAST_PLACES or np.ptp(across) > _STRAIGHT * np.ptp(along):
+            continue
+        line = ScanLine(angle, float(across.mean()), float(along.min()), float(along.max()))
+        for k, other in enumerate(found):
+            if _are_one_line(line, other):
+                low_mm, high_mm = min(line.low_mm, other.low_mm), max(line.high_mm, other.high_mm)
+                found[k] = replace(other, low_mm=low_mm, high_mm=high_mm)
+                break
+        else:
+            found.append(line)
+    return tuple(found)
+
+
+def _are_one_line(line: ScanLine, other: ScanLine) -> bool:
+    """Return whether two lines have one direction and, as shares of their lengths, one offset."""
+    apart = line.offset_mm / line.length_mm - other.offset_mm / other.length_mm
+    return abs(line.angle_rad - other.angle_rad) < _ONE_DIRECTION_RAD and abs(apart) < 0.5 * _STRAIGHT
+
+
+def _principal_angle_rad(places_mm: FloatArray) -> float:
+    """Return the angle to X of the principal axis of places, (n_places, 2), above -89.5 and up to 90.5 degrees.
+
+    So places that scatter about a line along Y have an angle of about 90 degrees, and never one of -90.
+    """
+    x_mm, y_mm = (axis - axis.mean() for axis in (places_mm - places_mm[0]).T)  # exactly 0 for an axis that rests
+    angle = 0.5 * float(np.arctan2(2 * x_mm @ y_mm, x_mm @ x_mm - y_mm @ y_mm))
+    return angle + np.pi if angle < _LEAST_ANGLE_RAD else angle
+
+
+@dataclass(frozen=True)
+class PatchPrior:
+    """Prior of a patch of either sign on or beside a line; parameters: its height (named `size`), x, y, r."""
+
+    size: str
+    typical: float
+    line: ScanLine
+
+    BESIDE: ClassVar[Normal] = Normal(0.0, 0.7)  # distance from the line in radii
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The height's name, then x, y, r."""
+        return (self.size, "x", "y", "r")
+
+    @property
+    def radius_prior(self) -> LogUniform:
+        """Log-uniform prior of the radius, mm: from 0.02 to 0.5 of the line's length."""
+        return LogUniform(_RADII[0] / 2 * self.line.length_mm, _RADII[-1] * 2 * self.line.length_mm)
+
+    @cached_property
+    def _prior_seen_by_scan(self) -> Product:
+        """Prior over what the scan shows: height on the line, place along it, distance in radii, radius."""
+        line, length = self.line, self.line.length_mm
+        return Product(
+            {
+                "on_line": HeavyTailedPrior(self.typical),
+                "along": Uniform(line.low_mm - _MARGIN * length, line.high_mm + _MARGIN * length),
+                "beside": self.BESIDE,
+                "r": self.radius_prior,
+            }
+        )
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        """Map unit-cube coordinates to height, x, y, r; both (n_samples, 4)."""
+        on_line, along, beside, r = self._prior_seen_by_scan.from_unit_cube(u).T
+        x, y = self.line.lab_coordinates_mm(along, beside * r)
+        return np.stack([on_line * np.exp(0.5 * beside**2), x, y, r], axis=-1)
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        """Map height, x, y, r to unit-cube coordinates; both (n_samples, 4)."""
+        return self._prior_seen_by_scan.to_unit_cube(self._parameters_seen_by_scan(theta))
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        """Return the natural log of the density, (n_samples, 4) -> (n_samples,); -inf for a radius of 0 or below."""
+        possible = theta[:, 3] > 0
+        shown = self._parameters_seen_by_scan(np.where(possible[:, None], theta, 1.0))
+        # d(on_line, beside) / d(height, y) = exp(-beside^2 / 2) / r
+        log_density = self._prior_seen_by_scan.log_prob(shown) - 0.5 * shown[:, 2] ** 2 - np.log(shown[:, 3])
+        return np.where(possible, log_density, -np.inf)
+
+    def _parameters_seen_by_scan(self, theta: FloatArray) -> FloatArray:
+        """Convert height, x, y, r to height on the line, place along it, distance in radii, radius: (n_samples, 4)."""
+        height, x, y, r = theta.T
+        along, beside_mm = self.line.line_coordinates_mm(x, y)
+        beside = beside_mm / r
+        return np.stack([height * np.exp(-0.5 * beside**2), along, beside, r], axis=-1)
+
+
+@dataclass(frozen=True)
+class PatchEffect(NamedEffect[V]):
+    """Base of effects that are a patch on or beside the scanned line `line`; `lines` are the candidate lines."""
+
+    typical: float
+    line: ScanLine = ALONG_X
+    lines: tuple[ScanLine, ...] = ()
+
+    size: ClassVar[str]
+    """Name of the patch's height."""
+
+    @cached_property
+    def prior(self) -> PatchPrior:
+        """Prior of height, place and radius."""
+        return PatchPrior(self.size, self.typical, self.line)
+
+    def variants(self) -> tuple[Self, ...]:
+        """Return one variant for each scanned line."""
+        return tuple(replace(self, line=line) for line in self.lines)
+
+    def bank(self) -> FloatArray:
+        """Return parameters of patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
+        patches = []
+        for share in _RADII:
+            r = share * self.line.length_mm
+            along = np.arange(self.line.low_mm, self.line.high_mm + r / 2, r)
+            x, y = self.line.lab_coordinates_mm(along, np.zeros_like(along))
+            patches.append(single_column_bank(self.typical, x, y, r))
+        return np.concatenate(patches)
+
+
+@dataclass(frozen=True)
+class Glint(PatchEffect[FloatArray]):
+    """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y)."""
+
+    typical: float = 1.0
+    unit: str = field(default="", kw_only=True)
+
+    name = "glint"
+    words = "a glint at one place"
+    stage = Stage.OFFSET
+    size = "amp"
+    units = ("reading", "mm", "mm", "mm")
+    covariates = ("place",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Set the typical height to 2 % of the readings' range, and the bank on straight scans; None without any."""
+        lines = distinct_scan_lines(extent.plan)
+        return cls(0.02 * extent.span, lines[0], lines, unit=extent.reading_unit) if lines else None
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        amp, x, y, r = (theta[:, k : k + 1] for k in range(4))
+        return np.asarray(value + amp * gaussian_bump((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return (
+            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
+            f"{value_with_sd(mean[2], sd[2])}) mm the readings are {value_with_sd(abs(mean[0]), sd[0], self.unit)} too "
+            f"{'high' if mean[0] > 0 else 'low'}, over black and white alike: a reflection"
+        )
+
+
+@dataclass(frozen=True)
+class AlbedoGradient(CountsPlaceFromOrigin, LinearEffect[SceneView]):
+    """Paper or illumination that is uneven across the table: S (1 + per_mm_x X + per_mm_y Y).
+
+    X and Y are those of the lab frame, from `origin`.
+    """
+
+    typical_per_mm: float = 2e-4
+
+    name = "albedo_gradient"
+    words = "unevenly white paper"
+    stage = Stage.SCENE
+    units = ("1/mm", "1/mm")
+    covariates = ("place",)
+    parameters = ("per_mm_x", "per_mm_y")
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with a typical slope of 2 % over the length of the longest scan."""
+        return cls(typical_per_mm=0.02 / extent.length_mm, origin=extent.origin)
+
+    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+        regions = _regions_with_readings(value, plan)
+        return replace(value, regions={name: RegionWithGradient(r, theta, self.origin) for name, r in regions.items()})
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return (
+            f"the signal over white changes by {value_with_sd(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
+            f"{value_with_sd(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
+            "its illumination is uneven"
+        )
+
+
+@dataclass(frozen=True)
+class AlbedoPatch(PatchEffect[SceneView]):
+    """A stain or a bright patch on every pattern: S + albedo exp(-d^2 / 2 r^2), d the distance from (x, y)."""
+
+    typical: float = 0.05
+
+    name = "albedo_patch"
+    words = "a stain on the paper"
+    stage = Stage.SCENE
+    size = "albedo"
+    units = ("1", "mm", "mm", "mm")
+    covariates = ("place",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with a bank on the straight scans; None without any."""
+        lines = distinct_scan_lines(extent.plan)
+        return cls(line=lines[0], lines=lines) if lines else None
+
+    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+        return replace(
+            value, regions={name: RegionWithPatch(r, theta) for name, r in _regions_with_readings(value, plan).items()}
+        )
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        kind = "whiter" if mean[0] > 0 else "darker"
+        return (
+            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
+            f"{value_with_sd(mean[2], sd[2])}) mm every pattern is "
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {kind} than it should be: a stain or a worn area"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RegionWithGradient:
+    """A region whose albedo is multiplied by 1 + per_mm . (X, Y), from `origin`; `per_mm` has shape (n_samples, 2)."""
+
+    region: Region
+    per_mm: FloatArray
+    origin: Origin = field(default=Origin())
+
+    @property
+    def n_regions(self) -> int:
+        """Number of regions, one for each sample; 1 where all samples share one."""
+        return max(self.region.n_regions, len(self.per_mm))
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        return self.region.albedo(points_mm) * self._albedo_factor_at_points(points_mm)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over pixels, the gradient taken at their centres: (n_regions, n_points)."""
+        return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._albedo_factor_at_points(centers_mm)
+
+    def _albedo_factor_at_points(self, points_mm: FloatArray) -> FloatArray:
+        return np.asarray(1 + self.per_mm @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
+
+
+@mean_albedo_under_one_gaussian.register
+def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Return the mean albedo under each Gaussian, (n_samples, n_points), by Stein's lemma.
+
+    The mean is the gradient's factor at the centre times the region's mean albedo, plus a central difference of the
+    region's mean along the gradient.
+    """
+    a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
+    x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
+    rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
+    x, y = x / rise * _STEP, y / rise * _STEP
+
+    def mean_albedo_at_shift(sign: float) -> FloatArray:
+        moved = replace(gaussian, dx_mm=gaussian.dx_mm + sign * x, dy_mm=gaussian.dy_mm + sign * y)
+        return mean_albedo_under_one_gaussian(region.region, moved, n_nodes)
+
+    ahead, behind = mean_albedo_at_shift(1.0), mean_albedo_at_shift(-1.0)
+    from_x = gaussian.x_mm + gaussian.dx_mm - region.origin.x_mm
+    from_y = gaussian.y_mm + gaussian.dy_mm - region.origin.y_mm
+    factor = 1 + a * from_x + b * from_y
+    return np.asarray(factor * (ahead + behind) / 2 + rise * (ahead - behind) / (2 * _STEP))
+
+
+@dataclass(frozen=True, eq=False)
+class RegionWithPatch:
+    """A region and a bell-shaped patch on it; `patch` holds albedo, x, y, r, (n_samples, 4)."""
+
+    region: Region
+    patch: FloatArray
+
+    @property
+    def n_regions(self) -> int:
+        """Number of regions, one for each sample; 1 where all samples share one."""
+        return max(self.region.n_regions, len(self.patch))
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        return self.region.albedo(points_mm) + self._added_albedo(points_mm)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over pixels, the patch taken at their centres: (n_regions, n_points)."""
+        return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added_albedo(centers_mm)
+
+    def _added_albedo(self, points_mm: FloatArray) -> FloatArray:
+        albedo, x, y, r = (self.patch[:, k : k + 1] for k in range(4))
+        return albedo * gaussian_bump((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
+
+
+@mean_albedo_under_one_gaussian.register
+def _mean_albedo_with_patch(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Return the mean albedo under each Gaussian: the region's, plus the patch's, a bell of covariance C + r^2."""
+    albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
+    from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
+    var_x, var_y = gaussian.var_x + r**2, gaussian.var_y + r**2
+    det = var_x * var_y - gaussian.cov_xy**2
+    distance = (var_y * from_x**2 + var_x * from_y**2 - 2 * gaussian.cov_xy * from_x * from_y) / det
+    added = albedo * r**2 / np.sqrt(det) * np.exp(-0.5 * distance)
+    return mean_albedo_under_one_gaussian(region.region, gaussian, n_nodes) + added
+
+
+def _regions_with_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
+    """Return the regions over which at least one reading is taken, by the pattern's name."""
+    return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
+
+
+@edge_distance.register(RegionWithGradient)
+@edge_distance.register(RegionWithPatch)
+def _distance_to_unchanged_edge(
+    region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
+) -> FloatArray:
+    """Return the distance of points from the nearest edge of the region, which the effect leaves in place, mm."""
+    return edge_distance(region.region, x_mm, y_mm)
+
+
+@dataclass(frozen=True)
+class HeightGradient(CountsPlaceFromOrigin, LinearEffect[Footprint]):
+    """A table that slopes: mm_per_mm X adds to the height; footprint x h/h0, signal x (h0/h)^2.
+
+    h = h0 + mm_per_mm X with h0 of the recording's description, or 14 mm where it gives none; where a height is
+    commanded, h is that height + mm_per_mm X. X counts from `origin`.
+    """
+
+    typical: float = 0.001
+
+    name = "height_gradient"
+    words = "a sloping table"
+    stage = Stage.FOOTPRINT
+    units = ("mm/mm",)
+    covariates = ("place",)
+    parameters = ("mm_per_mm",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Set the typical slope to 1 % of the height over the longest scan."""
+        typical = 0.01 * _nominal_height_mm(extent.plan) / extent.length_mm
+        return cls(typical=typical, origin=extent.origin)
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        added = theta[:, :1] * (plan.x_mm - self.origin.x_mm) / _nominal_height_mm(plan)
+        return footprint_at_added_height(value, added, plan)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        way = "grows" if mean[0] > 0 else "shrinks"
+        return (
+            f"the sensor's height above the surface {way} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} mm per "
+            "100 mm along X: the table slopes"
+        )
+
+
+@dataclass(frozen=True)
+class HeightOffset(ScanGroupEffect[Footprint]):
+    """One mounting or scan at another height: mm adds to the height there; footprint x h/h0, signal x (h0/h)^2.
+
+    h0 and h are those of `HeightGradient`.
+    """
+
+    typical_mm: float = 0.15
+
+    name = "height_offset"
+    words = "another sensor height in some scans"
+    stage = Stage.FOOTPRINT
+    units = ("mm",)
+    covariates = ("scan",)
+    parameters = ("mm",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Set the typical offset to 1 % of the height; None for a single scan."""
+        choices = candidate_scan_groups(extent.plan)
+        return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        added = theta * scan_indicator(plan, self.scans) / _nominal_height_mm(plan)
+        return footprint_at_added_height(value, added, plan)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        way = "higher" if mean[0] > 0 else "lower"
+        much = value_with_sd(abs(mean[0]), sd[0])
+        return f"in {scans_in_words(self.scans)} the sensor hangs {much} mm {way} than in the others"
+
+
+def _nominal_height_mm(plan: Plan) -> float:
+    """Return the height in the recording's description, or 14 mm where it gives none."""
+    return plan.instrumentation.height_mm or _USUAL_MM
+
+
+@dataclass(frozen=True)
+class SlowSinking(CountsTimeFromOrigin, LinearEffect[Footprint]):
+    """The sensor sinks or rises: per_hour t h0 adds to the height; footprint x h/h0, signal x (h0/h)^2.
+
+    t is the time since `origin` in hours; h0 and h are those of `HeightGradient`.
+    """
+
+    typical_per_hour: float = 0.1
+
+    name = "slow_sinking"
+    words = "a sensor that slowly rises or sinks"
+    stage = Stage.FOOTPRINT
+    units = ("1/h",)
+    covariates = ("time", "level")
+    parameters = ("per_hour",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Set the typical rate to 1 % of the height over the recording."""
+        return cls(typical_per_hour=0.01 / (extent.duration_s / 3600), origin=extent.origin)
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        return footprint_at_added_height(value, theta[:, :1] * self.origin.hours(plan), plan)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        way = "rises" if mean[0] > 0 else "sinks"
+        return (
+            f"the sensor {way} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} % of its height per hour: "
+            "it is loose in its holder"
+        )
+
+
+@dataclass(frozen=True)
+class EdgeBlur(LinearEffect[Footprint]):
+    """Printed edges are blurred by a Gaussian of sd_mm, which acts as a wider footprint over sharp edges would.
+
+    The footprint's covariance grows by sd_mm^2 along each axis, whatever the sensor's orientation.
+    """
+
+    typical_mm: float = 2.0
+
+    name = "edge_blur"
+    words = "soft printed edges"
+    stage = Stage.FOOTPRINT
+    units = ("mm",)
+    covariates = ("edge_distance",)
+    parameters = ("sd_mm",)
+    positive = True
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with a typical sd of 2 % of the length of the longest scan."""
+        return cls(typical_mm=0.02 * extent.length_mm)
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        wider = theta[:, :, None] ** 2
+        return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
+
+    def is_absorbed_by_ssf(self, plan: Plan) -> bool:
+        """Return True (it equals a wider SSF) unless the height varies, which scales a footprint but not a blur."""
+        ratio = height_ratio(plan)
+        return ratio is None or float(np.ptp(ratio)) == 0.0
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        """Return a starting sd, (1,): the entry's, its square scaled by the fitted amount."""
+        return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return f"the printed edges are soft: blurred by {value_with_sd(mean[0], sd[0])} mm (sd)"
+
+
+@dataclass(frozen=True)
+class Halo(NamedEffect[Footprint]):
+    """Light scattered in the lens: `share` of the footprint becomes one more Gaussian, of sd r_mm about its centre."""
+
+    least_share: float = 1e-3
+    narrowest_mm: float = 10.0
+    widest_mm: float = 100.0
+
+    name = "halo"
+    words = "scattered light around the spot"
+    stage = Stage.FOOTPRINT
+    units = ("1", "mm")
+    covariates = ("edge_distance",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with radii from a tenth of the length of the longest scan to all of it."""
+        return cls(narrowest_mm=0.1 * extent.length_mm, widest_mm=extent.length_mm)
+
+    @cached_property
+    def prior(self) -> Product:
+        return Product(
+            {"share": LogUniform(self.least_share, 0.7), "r_mm": LogUniform(self.narrowest_mm, self.widest_mm)}
+        )
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
+
+        def with_halo_appended(own: FloatArray, halo: FloatArray) -> FloatArray:
+            n_gaussians = max(own.shape[2], value.weight.shape[2])
+            shape = (*np.broadcast_shapes(own.shape[:2], halo.shape[:2]), n_gaussians)
+            return np.concatenate([np.broadcast_to(own, shape), np.broadcast_to(halo, (*shape[:2], 1))], axis=2)
+
+        def mixture_mean(mean: FloatArray) -> FloatArray:
+            return np.asarray(np.sum(value.weight * mean, axis=2, keepdims=True))
+
+        return replace(
+            value,
+            weight=with_halo_appended((1 - share) * value.weight, share),
+            u_mm=with_halo_appended(value.u_mm, mixture_mean(value.u_mm)),
+            v_mm=with_halo_appended(value.v_mm, mixture_mean(value.v_mm)),
+            var_u=with_halo_appended(value.var_u, variance),
+            var_v=with_halo_appended(value.var_v, variance),
+            cov_uv=with_halo_appended(value.cov_uv, np.zeros((1, 1, 1))),
+        )
+
+    def bank(self) -> FloatArray:
+        return single_column_bank(0.02, np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return (
+            f"a wide halo around the sensor's spot, of sd {value_with_sd(mean[1], sd[1])} mm, contributes "
+            f"{value_with_sd(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
+        )
+
+
+@dataclass(frozen=True)
+class EdgeShadow(NamedEffect[View]):
+    """A raised edge casts a shadow: u - amp exp(-d^2 / 2 w^2), d the sensor's distance from the nearest edge.
+
+    Here u is the seen white fraction. Patterns may be made in different ways, one glued on, another printed. `patterns`
+    are those with raised edges, () for all; `choices` are the candidate groups.
+    """
+
+    typical: float = 0.01
+    narrowest_mm: float = 1.0
+    widest_mm: float = 30.0
+    patterns: tuple[str, ...] = ()
+    choices: tuple[tuple[str, ...], ...] = ((),)
+
+    name = "edge_shadow"
+    words = "shadows along the edges"
+    stage = Stage.SEEN
+    units = ("1", "mm")
+    covariates = ("edge_distance",)
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with widths from a hundredth to a third of the length of the longest scan.
+
+        Raised edges may belong to all kinds of pattern, to one kind, or to all kinds but one.
+        """
+        kinds = _groups_of_edged_patterns(extent.plan)
+        but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
+        choices = tuple(dict.fromkeys([(), *kinds, *but_one])) if len(kinds) > 1 else ((),)
+        return cls(narrowest_mm=0.01 * extent.length_mm, widest_mm=extent.length_mm / 3, choices=choices)
+
+    @cached_property
+    def prior(self) -> Product:
+        return Product({"amp": HeavyTailedPrior(self.typical), "w": LogUniform(self.narrowest_mm, self.widest_mm)})
+
+    def apply(self, value: View, theta: FloatArray, plan: Plan) -> View:
+        everywhere = (1, len(plan))
+        x_mm, y_mm = (
+            np.broadcast_to(place, np.broadcast_shapes(place.shape, everywhere))
+            for place in (value.poses.x_mm, value.poses.y_mm)
+        )
+        parts = [
+            (rows, edge_distance(value.regions[name], x_mm[:, rows], y_mm[:, rows]))
+            for name, rows in plan.rows_by_pattern()
+            if not self.patterns or name in self.patterns
+        ]
+        distance = np.full((max((len(part) for _, part in parts), default=1), len(plan)), np.inf)
+        for rows, part in parts:
+            distance[:, rows] = part
+        return replace(value, seen=value.seen - theta[:, :1] * gaussian_bump(distance**2, theta[:, 1:2]))
+
+    def variants(self) -> tuple[Self, ...]:
+        return tuple(replace(self, patterns=choice) for choice in self.choices)
+
+    def bank(self) -> FloatArray:
+        return single_column_bank(self.typical, np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        kind = "darker" if mean[0] > 0 else "brighter"
+        where = f" of pattern {', '.join(self.patterns)}" if self.patterns else ""
+        why = "the edge casts a shadow" if mean[0] > 0 else "the edge reflects light"
+        return (
+            f"within {value_with_sd(mean[1], sd[1])} mm of an edge{where} the surface looks "
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: {why}"
+        )
+
+
+def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
+    """Return the names of patterns with edges under readings, one group for each type of pattern."""
+    kinds: dict[type, list[str]] = {}
+    for name, _ in plan.rows_by_pattern():
+        if isinstance(pattern := plan.patterns.get(name), HalfPlane | Quadrant | Disc | Polygon | Stripes):
+            kinds.setdefault(type(pattern), []).append(name)
+    return tuple(tuple(names) for names in kinds.values())
+
+
+@dataclass(frozen=True)
+class Reflection(NamedEffect[Footprint]):
+    """`share` of the light comes from a copy of the footprint, displaced by (dx_mm, dy_mm) in the lab frame."""
+
+    typical: float = 0.02
+    farthest_mm: float = 20.0
+
+    name = "reflection"
+    words = "a reflection beside the spot"
+    stage = Stage.FOOTPRINT
+    units = ("1", "mm", "mm")
+    covariates = ("place", "edge_distance")
+
+    @classmethod
+    def for_extent(cls, extent: Extent) -> Self | None:
+        """Return the effect with displacements up to half the length of the longest scan, along X and along Y."""
+        return cls(farthest_mm=0.5 * extent.length_mm)
+
+    @cached_property
+    def prior(self) -> Product:
+        reach = Uniform(-self.farthest_mm, self.farthest_mm)
+        return Product({"share": HeavyTailedPrior(self.typical, positive=True), "dx_mm": reach, "dy_mm": reach})
+
+    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        share = np.clip(theta[:, :1, None], 0.0, 1.0)
+        turn = plan.orientation_rad[None, :, None]
+        dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
+        u_mm = value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy
+        v_mm = value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy
+        return Footprint(
+            weight=_concatenated_components(value.weight * (1 - share), value.weight * share),
+            u_mm=_concatenated_components(value.u_mm, u_mm),
+            v_mm=_concatenated_components(value.v_mm, v_mm),
+            var_u=_concatenated_components(value.var_u, value.var_u),
+            var_v=_concatenated_components(value.var_v, value.var_v),
+            cov_uv=_concatenated_components(value.cov_uv, value.cov_uv),
+            brightness=value.brightness,
+        )
+
+    def bank(self) -> FloatArray:
+        angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES
+        far = self.farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
+        dx, dy = (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()
+        return single_column_bank(self.typical, dx, dy)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return (
+            f"a second spot, {value_with_sd(mean[1], sd[1])} mm along X and {value_with_sd(mean[2], sd[2])} mm along Y "
+            f"from the first, contributes {value_with_sd(mean[0], sd[0], factor=100)} % of the light: a reflection"
+        )
+
+
+def _concatenated_components(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Concatenate values of two sets of Gaussians, (n_samples, n_points, n_gaussians) each, along the last axis."""
+    shape = np.broadcast_shapes(first.shape, second.shape)
+    return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)

@@ -15,10 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.fitting.fit import Model, fit, starts_of_one_gaussian, starts_with_more_gaussians
-from probewise.diagnosis.fitting.free_form import FreeFormSensor
-from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.sensors import (
+    FreeFormSensor,
+    default_sensor,
+    starts_of_one_gaussian,
+    starts_with_more_gaussians,
+)
 from probewise.effects import VOCABULARY, Extent
 from probewise.inference import sd_floor
 from probewise.recordings import Recording, read_recording

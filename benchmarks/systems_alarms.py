@@ -25,9 +25,9 @@ import numpy as np
 from scipy import stats
 
 from probewise._progress import progress_shown
-from probewise.diagnosis.judgement.global_test import run_global_test
+from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.verdict import run_global_test
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.proof.campaign import run_campaign
 from probewise.proof.challenge.case import Task

@@ -203,7 +203,7 @@ def test_a_journal_is_refused(capsys, tmp_path):
 
 
 def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():
-    from probewise.diagnosis.system.diagnose import prepare_system
+    from probewise.diagnosis.diagnose_simulator import prepare_system
     from probewise.systems import Simulator
 
     x = np.arange(30.0)

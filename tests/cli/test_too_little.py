@@ -56,7 +56,7 @@ def test_a_fit_that_does_not_arrive_gives_no_verdict(recording_file, tmp_path, m
     def never(*_, **__):
         raise NotConvergedError("the fit of the model did not converge")
 
-    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.require_converged_fit", never)
+    monkeypatch.setattr("probewise.diagnosis.verdict.require_converged_fit", never)
     assert run("diagnose", recording_file, "--out", tmp_path / "out") == 1
     said = capsys.readouterr()
     assert said.err.splitlines()[-1] == "probewise diagnose: the fit of the model did not converge"

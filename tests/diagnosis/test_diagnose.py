@@ -95,7 +95,7 @@ def test_a_recording_without_effects_is_clean():
 def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value, n_asked):
     """One to three Gaussians and a free form are fitted, then fine structure; the next is asked on an alarm."""
     left = list(seen)
-    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.bayes_factor_p_value", lambda *_: left.pop(0))
+    monkeypatch.setattr("probewise.diagnosis.verdict.bayes_factor_p_value", lambda *_: left.pop(0))
     found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
     assert sorted(found.judged.order_probabilities) == [1, 2, 3, N_FREE_FORM]
     assert found.p_value == p_value
@@ -165,7 +165,7 @@ def test_a_recording_far_from_0_is_diagnosed_as_one_at_0():
 
 @pytest.mark.slow
 def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
-    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.bayes_factor_p_value", lambda *_: 0.2)
+    monkeypatch.setattr("probewise.diagnosis.verdict.bayes_factor_p_value", lambda *_: 0.2)
     found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
     assert (found.verdict, found.combination) == ("cannot_tell", ())
     assert found.hypotheses[0].effects == ("hysteresis",)
@@ -179,7 +179,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     found_out = Improvement(30.0, -4.0, 0.5, (("edge_0", -4.0),), 0.9, 0.6, 0.4)
     plain = Improvement(0.0, 0.0, 0.0, (), 0.9, 0.9, 1e-9)
     answers = [found_out, plain]
-    monkeypatch.setattr("probewise.diagnosis.repair.best_repair.improvement_of", lambda *_, **__: answers.pop(0))
+    monkeypatch.setattr("probewise.diagnosis.best_repair.improvement_of", lambda *_, **__: answers.pop(0))
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()
@@ -441,9 +441,7 @@ def asked_about(monkeypatch, of: Recording) -> tuple[list, float, Diagnosis]:
     def measurement_separating_rivals(rivals, sd, plan, apparatus):
         seen.append((list(rivals), sd))
 
-    monkeypatch.setattr(
-        "probewise.diagnosis.advice.rivals.measurement_separating_rivals", measurement_separating_rivals
-    )
+    monkeypatch.setattr("probewise.diagnosis.advice.measurement_separating_rivals", measurement_separating_rivals)
     found = diagnose(of, rng=np.random.default_rng(0))
     return *seen[0], found
 

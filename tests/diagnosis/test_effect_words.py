@@ -2,7 +2,7 @@
 
 import pytest
 
-from probewise.diagnosis.effect_words import effects_in_words, hypothesis_in_words, join_lists, parameter_in_words
+from probewise.diagnosis.words import effects_in_words, hypothesis_in_words, join_lists, parameter_in_words
 
 
 @pytest.mark.parametrize(

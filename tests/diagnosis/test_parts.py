@@ -11,9 +11,9 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
 from probewise.arm import readings_of_recording, recording_of_readings
-from probewise.diagnosis.advice.aliases import Alias, projected_cosine
-from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.laplace import (
+from probewise.diagnosis.aliases import Alias, projected_cosine
+from probewise.diagnosis.arm_scans import rows_as_new_scan
+from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,
     Linearised,
@@ -21,24 +21,15 @@ from probewise.diagnosis.evidence.laplace import (
     average_over_amplitude_scales,
     block_log_bayes_factors,
 )
-from probewise.diagnosis.evidence.templates import EffectTemplates, templates_of_effect
-from probewise.diagnosis.fitting.coordinates import (
-    default_sensor,
-    effect_coordinates,
-    effect_values,
-    theta_to_natural,
-)
-from probewise.diagnosis.fitting.fit import Fit, Model
-from probewise.diagnosis.fitting.free_form import FreeFormSensor
-from probewise.diagnosis.fitting.sensor_prior import sensor_from_posterior
+from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.joining import join, join_plans
-from probewise.diagnosis.judgement.judged import Hypothesis, credible_labels, verdict_from_probabilities
-from probewise.diagnosis.light_sensor.candidate_scans import rows_as_new_scan
-from probewise.diagnosis.light_sensor.covariates import covariate_of_effect
-from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
-from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
+from probewise.diagnosis.light_sensor import covariate_of_effect
+from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
+from probewise.diagnosis.noise_law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.sensors import FreeFormSensor, default_sensor, sensor_from_posterior, theta_to_natural
+from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
+from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.effects.reference import candidate_scan_groups, sign_of_motion
 from probewise.errors import ParameterError
@@ -206,7 +197,7 @@ def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, 
     found = Fit(model, z, model.predict(z[None, :])[0], np.zeros(len(plan)), np.zeros((len(plan), 7)), 1.0, 0.0)
     effect = VOCABULARY[name].for_extent(EXTENT).with_fewer_variants()
     whole = templates_of_effect(found, effect, usable)
-    monkeypatch.setattr("probewise.diagnosis.evidence.templates._AT_ONCE", 5 * len(plan))
+    monkeypatch.setattr("probewise.diagnosis.templates._AT_ONCE", 5 * len(plan))
     few = templates_of_effect(found, effect, usable, most=7)
     assert (len(few.columns), len(few.choice)) == (7, 7)
     at = np.linspace(0, len(whole.columns) - 1, 7).round().astype(int)

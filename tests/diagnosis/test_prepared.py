@@ -8,9 +8,9 @@ import pytest
 from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis import SensorAndShape, audit_plan
 from probewise.diagnosis.apparatus import Apparatus
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import prepare
-from probewise.diagnosis.repair.samples import ModelSamples
+from probewise.diagnosis.samples import ModelSamples
 from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Instrumentation, Recording, paper_plan

@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from probewise.diagnosis import PriorOdds
-from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import Stage

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from function_null import FunctionNull
 
-from probewise.diagnosis import diagnose
-from probewise.diagnosis.judgement.judged import Hypothesis
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
-from probewise.diagnosis.prepared import prepare
-from probewise.diagnosis.thinning import positions_in_stretches, rows_to_diagnose
-from probewise.diagnosis.verdict_report import findings
+from probewise.diagnosis import diagnose, findings
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.prepared import positions_in_stretches, prepare, rows_to_diagnose
+from probewise.diagnosis.verdict import Hypothesis
 from probewise.effects import VOCABULARY
 from probewise.priors import Normal, Product
 from probewise.recordings import HalfPlane, Plan, Recording

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from probewise._words import value_with_sd
-from probewise.diagnosis.verdict_report.findings import parameters_found
+from probewise.diagnosis.findings import parameters_found
 from probewise.effects import (
     RARE_EFFECTS,
     VOCABULARY,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.fit import Null
 from probewise.sensor import Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 

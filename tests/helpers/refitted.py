@@ -1,10 +1,8 @@
 """The state of a search after its nulls, and one effect refitted in it, as a diagnosis does."""
 
-from probewise.diagnosis.evidence.templates import TemplateCache
-from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.refits import Refits
-from probewise.diagnosis.search.state import SearchState
+from probewise.diagnosis.search.refits import NoiseModels, Refits
+from probewise.diagnosis.search.stepwise import SearchState, fit_nulls
+from probewise.diagnosis.templates import TemplateCache
 
 
 def state_with_nulls(prepared, on_noise=None):

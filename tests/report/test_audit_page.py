@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import EffectAudit
-from probewise.diagnosis.audit.plan_audit import DetectableSize
+from probewise.diagnosis.audit import DetectableSize
 from probewise.report.audit_table import audit_table
 from probewise.report.plots import audit_matrix
 

@@ -15,8 +15,8 @@ from probewise.diagnosis import (
     audit_plan_of_diagnosis,
     diagnose,
 )
-from probewise.diagnosis.advice.next_scans import NextMeasurement
-from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.diagnosis.advice import NextMeasurement
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page

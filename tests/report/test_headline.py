@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import EffectFound, Hypothesis
-from probewise.diagnosis.effect_words import EFFECTS_IN_WORDS, effect_in_words
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.words import EFFECTS_IN_WORDS, effect_in_words
 from probewise.effects import EFFECTS, NUISANCES, VOCABULARY
 from probewise.recordings import Instrumentation
 from probewise.report.headline import MOST_WORDS, headline
@@ -87,7 +87,7 @@ def test_a_headline_has_twenty_words_at_most_and_no_name_of_code():
 
 def test_every_effect_has_words_of_its_own():
     for name in (*EFFECTS, *NUISANCES):
-        assert name in EFFECTS_IN_WORDS, f"say {name} in words in diagnosis/effect_words.py"
+        assert name in EFFECTS_IN_WORDS, f"say {name} in words in diagnosis/words.py"
     assert len(set(EFFECTS_IN_WORDS.values())) == len(EFFECTS_IN_WORDS)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from heater import ABOUT, SIMULATOR, fitted, runs
 
-from probewise.diagnosis.system.commands import plan_of_sequence, possible_run_commands
+from probewise.diagnosis.simulator_rows import plan_of_sequence, possible_run_commands
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.systems import (
     FittedSystem,

@@ -5,42 +5,39 @@ finds a poor likelihood: it tests and locates residuals, explains them by named 
 the gain on held-out readings.
 """
 
-from probewise.diagnosis.advice.aliases import Alias
-from probewise.diagnosis.advice.next_scans import NextMeasurement
-from probewise.diagnosis.audit.document import CURE_PLAN, audit_json
-from probewise.diagnosis.audit.plan_audit import (
+from probewise.diagnosis.advice import NextMeasurement
+from probewise.diagnosis.aliases import Alias
+from probewise.diagnosis.apparatus import MOST_READINGS, SETTLED
+from probewise.diagnosis.audit import (
+    CURE_PLAN,
     Cure,
     DetectableSize,
     EffectAudit,
     PlanAudit,
+    audit_json,
     audit_plan,
     audit_plan_of_diagnosis,
 )
+from probewise.diagnosis.best_repair import Improvement
+from probewise.diagnosis.diagnose_simulator import diagnose_system, notes_on_calls
+from probewise.diagnosis.diagnosis import NEXT_PLAN, Diagnosis, VerdictReport, diagnosis_json, diagnosis_schema
 from probewise.diagnosis.engine import Thorough, diagnose
-from probewise.diagnosis.fitting.null import Null
-from probewise.diagnosis.fitting.sensor_prior import SensorPrior
+from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
+from probewise.diagnosis.fit import Null
+from probewise.diagnosis.fit_simulator import Evidence, SystemFit, calibrated_of, fit_json, fit_simulator, repaired_of
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
+from probewise.diagnosis.locate import ALARM, Place
 from probewise.diagnosis.model_with import model_with
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.repair.improvement import Improvement
-from probewise.diagnosis.repair.repair import PredictionAndResiduals, Repair
-from probewise.diagnosis.repair.samples import ModelSamples
-from probewise.diagnosis.residuals.locate import ALARM, Place
-from probewise.diagnosis.scheduling import MOST_READINGS, SETTLED
-from probewise.diagnosis.search.thorough import weigh_thoroughly
-from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.system.audit import audit_system
-from probewise.diagnosis.system.diagnose import diagnose_system, notes_on_calls
-from probewise.diagnosis.system.fit import Evidence, SystemFit, fit_json, fit_simulator
-from probewise.diagnosis.system.fitted import calibrated_of, repaired_of
+from probewise.diagnosis.reason import TO_SEPARATE
+from probewise.diagnosis.repair import PredictionAndResiduals, Repair
+from probewise.diagnosis.samples import ModelSamples
+from probewise.diagnosis.search.thorough import Weighing, weigh_thoroughly
+from probewise.diagnosis.sensors import SensorPrior
+from probewise.diagnosis.simulator_audit import audit_system
 from probewise.diagnosis.unknown_shape import SensorAndShape
-from probewise.diagnosis.verdict_report.beyond import Formula, Remainder
-from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
-from probewise.diagnosis.verdict_report.document import NEXT_PLAN, diagnosis_json, diagnosis_schema
-from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound, ParameterFound
-from probewise.diagnosis.verdict_report.reason import TO_SEPARATE
-from probewise.diagnosis.verdict_report.words import p_in_words
+from probewise.diagnosis.verdict import Hypothesis, Judged, Verdict
+from probewise.diagnosis.words import p_in_words
 
 __all__ = [
     "ALARM",

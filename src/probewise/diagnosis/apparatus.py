@@ -1,7 +1,7 @@
 """The interface between the engine and the apparatus that took the readings.
 
 The engine fits, compares, tests and repairs models; it knows nothing of lamps, arms or patterns. Those are the
-apparatus' part: a light sensor on an arm (`light_sensor`), or a user's simulator over a table.
+apparatus' part: a light sensor on an arm (`light_sensor`), or a user's simulator over a table (`simulator_rows`).
 """
 
 from __future__ import annotations
@@ -10,16 +10,54 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence.held_out import Parts
-from probewise.diagnosis.fitting.fit import Fit, Model
-from probewise.diagnosis.fitting.null import Null
-from probewise.diagnosis.fitting.ssf_forms import SsfForms
+from probewise.diagnosis.fit import Fit, Model, Null
+from probewise.diagnosis.held_out import Parts
+from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.scheduling import Command
+from probewise.diagnosis.sensors import SsfForms
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
+
+MOST_READINGS = 102
+SETTLED = 0.95
+"""Probability from which a hypothesis, or the fewest that hold it, leave no question open."""
+ENOUGH_NATS = 3.0
+"""Expected log Bayes factor that tells two hypotheses apart, as odds of 20 to 1; readings for less are not advised."""
+NOTHING_NATS = 0.5
+"""Expected log Bayes factor below which readings do not tell two hypotheses apart at all: they are aliases."""
+
+
+class Command(Protocol):
+    """A possible next measurement, to be proposed to the user: kind, description, rows and duration."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of measurement, in a word or two."""
+        ...
+
+    @property
+    def description(self) -> str:
+        """The measurement in words, as an instruction."""
+        ...
+
+    @property
+    def plan(self) -> Plan:
+        """Rows of the measurement."""
+        ...
+
+    @property
+    def minutes(self) -> float:
+        """Duration in minutes, including the break before it."""
+        ...
+
+
+def rows_by_command(commands: Sequence[Command]) -> list[IntArray]:
+    """Return the row numbers of each command in the plan that concatenates all commands, (n_rows,) each."""
+    ends = np.cumsum([len(command.plan) for command in commands])
+    return [np.arange(end - len(command.plan), end) for end, command in zip(ends.tolist(), commands, strict=True)]
 
 
 @dataclass(frozen=True)

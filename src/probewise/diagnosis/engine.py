@@ -14,31 +14,17 @@ import numpy as np
 
 from probewise._arrays import own_arithmetic
 from probewise._kinds import require_like, require_progress, require_rng
-from probewise.diagnosis.advice.next_scans import NextMeasurement
-from probewise.diagnosis.advice.rivals import choose_next_measurement, is_settled
-from probewise.diagnosis.effect_words import hypothesis_in_words
-from probewise.diagnosis.fitting.null import Null
-from probewise.diagnosis.fitting.sensor_prior import SensorPrior
-from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
-from probewise.diagnosis.judgement.judged import Judged, judge
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
-from probewise.diagnosis.names import Names
+from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
+from probewise.diagnosis.averaging import NullBestAndRepairedSamples, draw_models
+from probewise.diagnosis.best_repair import BestRepair, improvement_and_correction, judged_and_best_repair
+from probewise.diagnosis.diagnosis import Diagnosis, VerdictReport
+from probewise.diagnosis.findings import EffectFound, effects_found, formula_of, noise_found, remainder_of
+from probewise.diagnosis.fit import Null
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.locate import Place
 from probewise.diagnosis.prepared import Prepared, prepare
-from probewise.diagnosis.repair.best_repair import BestRepair, judged_and_best_repair
-from probewise.diagnosis.repair.correction import improvement_and_correction
-from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples, draw_models
-from probewise.diagnosis.repair.places import locate_effects_and_residuals
-from probewise.diagnosis.repair.repair import repair_of
-from probewise.diagnosis.residuals.locate import Place
-from probewise.diagnosis.search.formulas import search_with_formulas
-from probewise.diagnosis.search.search import search
-from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
-from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agreement
-from probewise.diagnosis.verdict_report.beyond import formula_of, remainder_of
-from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
-from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
-from probewise.diagnosis.verdict_report.reason import (
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.reason import (
     ALL,
     NOTHING,
     NOTHING_MORE,
@@ -46,6 +32,14 @@ from probewise.diagnosis.verdict_report.reason import (
     combinations_in_reason,
     reason_of,
 )
+from probewise.diagnosis.repair import locate_effects_and_residuals, repair_of
+from probewise.diagnosis.search.refits import effects_out_of_vocabulary
+from probewise.diagnosis.search.search import search, search_with_formulas
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
+from probewise.diagnosis.sensors import SensorPrior
+from probewise.diagnosis.verdict import GlobalTest, Judged, judge, run_global_test
+from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.effects.effect import require_effect_classes, sentence_from_samples
 from probewise.progress import Progress, silent

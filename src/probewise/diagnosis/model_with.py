@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from probewise._kinds import checked_texts, require_one_of, require_rng
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.repair.samples import ModelSamples, sample_model
+from probewise.diagnosis.samples import ModelSamples, sample_model
 from probewise.diagnosis.search.constants import MAX_ORDER
 from probewise.diagnosis.search.search import search
 from probewise.effects import EFFECTS, Extent, NamedEffect

@@ -1,4 +1,4 @@
-"""Prior odds of hypotheses."""
+"""Prior odds of hypotheses: combinations of effects on the mean and on the noise."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
-from probewise.diagnosis.names import Names
 from probewise.effects import RARE_EFFECTS, NamedEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
+
+Names: TypeAlias = tuple[str, ...]
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, read_only_floats
-from probewise.diagnosis.fitting.coordinates import FARTHEST, CalibratedSensor, cached_known_scene
-from probewise.diagnosis.fitting.sensor_prior import SensorPrior, sensor_from_samples
-from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
+from probewise.diagnosis.diagnosis import Diagnosis
+from probewise.diagnosis.fit import FARTHEST
+from probewise.diagnosis.sensors import CalibratedSensor, SensorPrior, cached_known_scene, sensor_from_samples
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
 from probewise.priors import Prior

@@ -262,7 +262,7 @@ def _most_probable_log_sd_ratios(counts: FloatArray, squares: FloatArray, spread
 
 
 LARGEST_SIZE = 40.0
-"""Largest sd of outlying readings, in noise sds; readings too far out for it are lost ones (`diagnosis.residuals`)."""
+"""Largest sd of outlying readings, in noise sds; readings too far out for it are lost ones (`diagnosis.outlying`)."""
 
 
 MOST_OUTLYING = 0.2

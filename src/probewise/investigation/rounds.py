@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from probewise._display import ShowsItself
 from probewise.diagnosis import SETTLED, Diagnosis
-from probewise.diagnosis.effect_words import hypothesis_in_words
+from probewise.diagnosis.words import hypothesis_in_words
 from probewise.recordings.plan import Recording
 
 SURE = SETTLED

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._words import count_with_noun
-from probewise.diagnosis.effect_words import effect_has_words, effect_in_words
+from probewise.diagnosis.words import effect_has_words, effect_in_words
 from probewise.proof.challenge import Bin
 from probewise.proof.study import ConcealedRow, Estimate, Summary
 from probewise.report.plots.canvas import (

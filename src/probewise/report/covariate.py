@@ -8,7 +8,7 @@ from probewise._arrays import FloatArray
 from probewise._words import UNITS as UNITS_OF_NAMES
 from probewise._words import unit_after_number, unit_of_name
 from probewise.diagnosis import Diagnosis, Place
-from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
 
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 DIRECTIONS = {-1.0: "backwards", 0.0: "at rest", 1.0: "forwards"}

@@ -22,7 +22,9 @@ from probewise.diagnosis import (
     notes_on_calls,
     p_in_words,
 )
-from probewise.diagnosis.effect_words import (
+from probewise.diagnosis.prepared import rows_to_diagnose
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
+from probewise.diagnosis.words import (
     effect_has_words,
     effect_in_words,
     hypothesis_in_words,
@@ -30,8 +32,6 @@ from probewise.diagnosis.effect_words import (
     join_names,
     parameter_in_words,
 )
-from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import name_without_copy_suffix
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import category_name_by_value, covariate_in_words_and_unit, term_family_in_words

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, IntArray
 from probewise._words import unit_after_number
 from probewise.diagnosis import Diagnosis, Place
-from probewise.diagnosis.effect_words import hypothesis_in_words
+from probewise.diagnosis.words import hypothesis_in_words
 from probewise.recordings import Plan
 from probewise.report.covariate import axis_label, covariate_values_by_place
 from probewise.report.covariate_view import (

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import IntArray
 from probewise.diagnosis import Diagnosis
-from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
+from probewise.diagnosis.light_sensor import held_out_parts
 
 
 def part_with_largest_gain(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from probewise._words import count_with_noun
 from probewise.diagnosis import p_in_words
-from probewise.diagnosis.effect_words import hypothesis_in_words
+from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import spoken_name
 from probewise.investigation import Investigation, Round
 from probewise.report import diagnosis as of_a_diagnosis

@@ -10,7 +10,7 @@ from probewise._display import render_html
 from probewise._words import count_with_noun, unit_after_number, unit_of_name
 from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
-from probewise.diagnosis.effect_words import effect_in_words, hypothesis_in_words
+from probewise.diagnosis.words import effect_in_words, hypothesis_in_words
 from probewise.experiment import Exploration, Step
 from probewise.investigation import Investigation
 from probewise.nested import NestedResult, Weighted

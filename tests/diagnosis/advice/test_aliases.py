@@ -7,13 +7,19 @@ import pytest
 from heater import SIMULATOR, runs
 from scipy.linalg import null_space
 
-from probewise.diagnosis.advice.aliases import Alias, pairs_with_separating_scans
-from probewise.diagnosis.advice.separating_readings import COUNTS, Amounts, EffectEntry, ReadingsWithEffects
-from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white_noise_of_recording
-from probewise.diagnosis.scheduling import MOST_READINGS
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.aliases import (
+    COUNTS,
+    Alias,
+    Amounts,
+    EffectEntry,
+    ReadingsWithEffects,
+    pairs_with_separating_scans,
+)
+from probewise.diagnosis.apparatus import MOST_READINGS
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.noise_law import white_noise_of_recording
 
 PREPARED = prepare_system(SIMULATOR, runs(rng=np.random.default_rng(3), n=20))
 RECORDING, PLAN, APPARATUS = PREPARED.recording, PREPARED.recording.plan, PREPARED.apparatus

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from heater import ABOUT, TABLE
 
-from probewise.diagnosis.advice.new_runs import slopes_split_by_run
-from probewise.diagnosis.advice.next_scans import Rival, measurement_separating_rivals
-from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.diagnosis.advice import Rival, measurement_separating_rivals, slopes_split_by_run
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.systems.forms import bind_forms
 
 APPARATUS = SimulatorApparatus(ABOUT)

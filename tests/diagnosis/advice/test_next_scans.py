@@ -12,21 +12,27 @@ import pytest
 from mixtures import fixed_mixture
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.advice.next_scans import (
+from probewise.diagnosis.advice import (
     PredictiveNormal,
     Rival,
+    choose_next_measurement,
+    is_settled,
     measurement_separating_rivals,
     mutual_information_lower_bound,
 )
-from probewise.diagnosis.advice.rivals import choose_next_measurement, is_settled
-from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, excerpts_of_scan
-from probewise.diagnosis.light_sensor.scheduling import plan_of_alternatives, plan_of_sequence, scan_started_after
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
-from probewise.diagnosis.light_sensor.target_swaps import target_swaps
-from probewise.diagnosis.residuals.locate import Place
-from probewise.diagnosis.scheduling import ENOUGH_NATS, MOST_READINGS, rows_by_command
+from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, rows_by_command
+from probewise.diagnosis.arm_scans import (
+    candidate_scans,
+    excerpts_of_scan,
+    plan_of_alternatives,
+    plan_of_sequence,
+    scan_started_after,
+    target_swaps,
+)
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.locate import Place
+from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene

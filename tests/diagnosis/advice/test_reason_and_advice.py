@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import TO_SEPARATE, diagnose_system
-from probewise.diagnosis.advice.next_scans import Rival, measurement_separating_rivals
+from probewise.diagnosis.advice import Rival, measurement_separating_rivals
 from probewise.systems import Noise, RunTable, Simulator
 
 
@@ -41,7 +41,7 @@ def diagnosis():
         return measurement_separating_rivals(rivals, *rest)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("probewise.diagnosis.advice.rivals.measurement_separating_rivals", compare)
+        patch.setattr("probewise.diagnosis.advice.measurement_separating_rivals", compare)
         return diagnose_system(SIMULATOR, table(), rng=np.random.default_rng(1))
 
 

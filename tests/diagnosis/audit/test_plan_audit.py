@@ -8,11 +8,10 @@ import pytest
 from mixtures import fixed_mixture
 
 from probewise.diagnosis import audit_plan, join
-from probewise.diagnosis.audit.detectability import ExpectedSensor, PlanTemplates, ProjectedTemplates
-from probewise.diagnosis.audit.plan_audit import _curing_step_by_effect
-from probewise.diagnosis.fitting.coordinates import default_sensor
+from probewise.diagnosis.arm_scans import candidate_scans
+from probewise.diagnosis.audit import ExpectedSensor, PlanTemplates, ProjectedTemplates, _curing_step_by_effect
 from probewise.diagnosis.joining import join_plans
-from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans
+from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import Backlash, EdgeMisplacement, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan

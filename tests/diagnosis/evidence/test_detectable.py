@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.special import log_ndtr
 
-from probewise.diagnosis.evidence.detectable import log_probability_effects_detectable
-from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
-from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.evidence import LEAST_VISIBLE, log_probability_effects_detectable
+from probewise.diagnosis.fit import Fit, Model, fit
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from probewise import nested
-from probewise.diagnosis.evidence.folded import FoldedNormal, fold_problem
-from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem, StandardNormal
-from probewise.diagnosis.evidence.laplace import laplace_evidence
-from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.noise.models import NoiseModel
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.hypothesis_problem import FoldedNormal, HypothesisProblem, StandardNormal, fold_problem
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import Extent
 from probewise.recordings import Recording, paper_plan
 

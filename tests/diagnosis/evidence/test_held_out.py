@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.evidence.held_out import are_of_part_alone, mean_gain_over_parts, sequential_log_densities
-from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
-from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.diagnosis.held_out import are_of_part_alone, mean_gain_over_parts, sequential_log_densities
+from probewise.diagnosis.light_sensor import held_out_parts
+from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.recordings import Recording, paper_plan
 
 PAPER = Recording(paper_plan(), np.zeros(len(paper_plan())))

@@ -8,14 +8,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.held_out import held_out_gain
-from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks, block_log_bayes_factors
-from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.noise.law import NoiseLaw, white_noise
-from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.locate import significant_places
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, block_log_bayes_factors
+from probewise.diagnosis.fit import Fit, Model, fit
+from probewise.diagnosis.held_out import held_out_gain
+from probewise.diagnosis.locate import Covariate, significant_places
+from probewise.diagnosis.noise_law import NoiseLaw, white_noise
+from probewise.diagnosis.templates import TemplateBank
 from probewise.systems import Simulator, table_for
 
 N = 60

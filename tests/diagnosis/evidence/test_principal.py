@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.bank import _gram_eigensystems
+from probewise.diagnosis.templates import _gram_eigensystems
 
 
 @pytest.mark.parametrize("width", [1, 2, 3])

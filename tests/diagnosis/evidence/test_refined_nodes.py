@@ -9,12 +9,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.laplace import laplace_evidence
-from probewise.diagnosis.evidence.refined_nodes import refined
-from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.noise.models import NoiseModel
+from probewise.diagnosis.evidence import laplace_evidence, refined
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.noises import NoiseModels
+from probewise.diagnosis.search.refits import NoiseModels
 from probewise.effects import CorrelatedNoise, DriftingNoise, Outliers, RandomWalk, SignalDependentNoise
 from probewise.recordings import Plan, Recording
 

@@ -7,13 +7,12 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
-from probewise.diagnosis.evidence.held_out import held_out_gain
-from probewise.diagnosis.evidence.laplace import laplace_evidence
-from probewise.diagnosis.fitting.coordinates import effect_coordinates
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white_noise_of_recording
-from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import Model, effect_coordinates, fit
+from probewise.diagnosis.held_out import held_out_gain
+from probewise.diagnosis.noise_law import white_noise_of_recording
+from probewise.diagnosis.noise_models import NoiseModel
 from probewise.systems import Simulator, table_for
 
 N_RUNS, N_EACH = 12, 30

@@ -4,18 +4,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from probewise.diagnosis.advice.aliases import Alias
-from probewise.diagnosis.judgement.judged import (
+from probewise.diagnosis.aliases import Alias
+from probewise.diagnosis.search.searched import Posterior
+from probewise.diagnosis.verdict import (
     Hypothesis,
     Judged,
     decided_rare_effects,
     hypotheses_with_verdict,
     ranked_hypotheses,
+    shared_effects,
     verdict_and_combination,
     with_shared_effects,
 )
-from probewise.diagnosis.judgement.shared_effects import shared_effects
-from probewise.diagnosis.search.searched import Posterior
 
 NOISE = frozenset({"outliers"})
 

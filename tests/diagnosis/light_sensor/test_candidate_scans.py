@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, rows_of_distinct_scans
-from probewise.diagnosis.light_sensor.covariates import varying_covariates
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.arm_scans import candidate_scans, rows_of_distinct_scans
+from probewise.diagnosis.light_sensor import LightSensorApparatus, varying_covariates
 from probewise.recordings import two_way_plan
 
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from function_null import FunctionNull
 
-from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.fitting.coordinates import cached_known_scene, default_sensor
-from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.fitting.free_form import FreeFormSensor
-from probewise.diagnosis.light_sensor.fine_structure import fine_structure_slopes
-from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Fit, Model, fit
+from probewise.diagnosis.light_sensor import fine_structure_slopes
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.sensors import FreeFormSensor, cached_known_scene, default_sensor
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import LogUniform, Product
 from probewise.recordings import Recording, paper_plan, two_way_plan

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
-from probewise.diagnosis.noise.law import (
+from probewise.diagnosis.noise_law import (
     n_rows_since_previous_usable,
     noise_statistics,
     order_by_scan,
     previous_usable,
 )
-from probewise.diagnosis.noise.models import NoiseModel, rough_sd
-from probewise.diagnosis.residuals.bases import bank_of_unknown_effects
+from probewise.diagnosis.noise_models import NoiseModel, rough_sd
+from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
 from probewise.effects import CorrelatedNoise
 from probewise.systems import RunTable, Simulator, as_recording
 

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.noise.memory import innovations_given_rest, walk_given_readings
-from probewise.diagnosis.noise.wide_readings import with_known_wide_readings
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_memory import innovations_given_rest, walk_given_readings, with_known_wide_readings
 
 _N = 40
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import gammaln, logsumexp
 
-from probewise.diagnosis.noise.law import NoiseLaw, white_noise
+from probewise.diagnosis.noise_law import NoiseLaw, white_noise
 from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, reading_variance
 from probewise.sensor import NoiseParameters
 

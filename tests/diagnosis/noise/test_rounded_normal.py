@@ -11,16 +11,15 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose, diagnose_system
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
-from probewise.diagnosis.noise.law import NoiseLaw, stacked_density
-from probewise.diagnosis.noise.models import NoiseModel, least_sd_given_rounding, rough_sd
-from probewise.diagnosis.noise.rounded_normal import RoundedNormal
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.noise_law import NoiseLaw, RoundedNormal, stacked_density
+from probewise.diagnosis.noise_models import NoiseModel, least_sd_given_rounding, rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import noise_sd_about_given_null
+from probewise.diagnosis.search.refits import NoiseModels
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.search.stepwise import noise_sd_about_given_null
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import Stage

@@ -11,10 +11,10 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.evidence.held_out import sequential_log_densities
-from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.noise.wide_readings import with_known_wide_readings
-from probewise.diagnosis.residuals.outlying import outlier_probabilities
+from probewise.diagnosis.held_out import sequential_log_densities
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_memory import with_known_wide_readings
+from probewise.diagnosis.outlying import outlier_probabilities
 
 N = 9
 OWN_SD = np.array([1.0, 0.7, 1.3, 1.0, 1.0, 0.8, 1.0, 1.2, 1.0])

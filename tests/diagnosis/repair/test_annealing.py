@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.diagnosis.repair.annealing import draw_by_annealing, importance_resample
+from probewise.diagnosis.posterior import draw_by_annealing, importance_resample
 
 
 def normal(center, factor, n, rng):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from heater import ABOUT
 
-from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.repair.averaging import can_share_one_model, mix_over_hypotheses, mix_over_orders
-from probewise.diagnosis.repair.samples import ModelSamples
+from probewise.diagnosis.averaging import can_share_one_model, mix_over_hypotheses, mix_over_orders
+from probewise.diagnosis.samples import ModelSamples
+from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import ACCURATE_NODES

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from refitted import refitted_with
 
-from probewise.diagnosis.repair.samples import sample_model
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.samples import sample_model
 from probewise.systems import RunTable, Simulator
 
 _N, _SD = 80, 0.02

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.laplace import SCALES, Linearised
-from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.repair.correction import correct_by_best_basis
+from probewise.diagnosis.best_repair import correct_by_best_basis
+from probewise.diagnosis.evidence import SCALES, Linearised
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.templates import TemplateBank
 
 _N = 120
 _BUMP = np.exp(-0.5 * ((np.arange(_N) - 60) / 15) ** 2)

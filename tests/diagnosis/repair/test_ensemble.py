@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.repair.ensemble import HypothesisSamples
+from probewise.diagnosis.averaging import HypothesisSamples
 from probewise.diagnosis.search.searched import Posterior
 
 

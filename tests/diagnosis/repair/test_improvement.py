@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.evidence.held_out import partition_into_blocks
+from probewise.diagnosis.held_out import partition_into_blocks
 from probewise.recordings import Recording, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.laplace import laplace_evidence
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.repair.linear_amplitudes import LinearAmplitudes
-from probewise.diagnosis.repair.samples import sample_model
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.linear_posterior import LinearAmplitudes
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.samples import sample_model
 from probewise.systems import RunTable, Simulator
 
 N, SD = 60, 0.1

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from probewise.diagnosis.repair.places import _controls_before_time
-from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.locate import Place
+from probewise.diagnosis.repair import _controls_before_time
 
 
 def place(covariate, values, start, end):

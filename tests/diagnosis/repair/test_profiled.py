@@ -5,9 +5,9 @@ import pytest
 from refitted import refitted_with
 from scipy.special import ndtr
 
-from probewise.diagnosis.repair.profiled import ProfiledDensity
-from probewise.diagnosis.repair.samples import sample_model
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.profiled import ProfiledDensity
+from probewise.diagnosis.samples import sample_model
 from probewise.systems import RunTable, Simulator
 
 _N, _SD = 80, 0.1

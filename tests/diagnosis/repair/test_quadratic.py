@@ -7,10 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.hypothesis_problem import log_likelihood_marginal_over_sigma
-from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.repair.quadratic import QuadraticPredictions
-from probewise.diagnosis.repair.surrogate import SurrogatePosterior
+from probewise.diagnosis.hypothesis_problem import log_likelihood_marginal_over_sigma
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.posterior import QuadraticPredictions, SurrogatePosterior
 
 CENTER = np.array([0.3, -0.2, 1.0])
 STEPS = np.array([[0.4, 0.1, 0.0], [0.0, 0.3, -0.2], [0.0, 0.0, 0.5]])

@@ -5,10 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.repair.repair import PredictionAndResiduals, Repair, repair_of
-from probewise.diagnosis.thinning import rows_to_diagnose
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
+from probewise.diagnosis.repair import PredictionAndResiduals, Repair, repair_of
 from probewise.recordings import Plan, Recording, Uniform
 
 LAG = SimpleNamespace(

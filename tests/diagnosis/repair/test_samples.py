@@ -9,13 +9,12 @@ import pytest
 from mixtures import total_variation
 
 from probewise.calibration import FittedSensor, predict
-from probewise.diagnosis.evidence.laplace import laplace_evidence
-from probewise.diagnosis.fitting.coordinates import FARTHEST, GaussianMixtureSensor, default_sensor
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.fitting.free_form import FreeFormSensor
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.repair.samples import ModelSamples, sample_model
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import FARTHEST, Model, fit
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.samples import ModelSamples, sample_model
+from probewise.diagnosis.sensors import FreeFormSensor, GaussianMixtureSensor, default_sensor
 from probewise.effects import AmbientGradient, DriftingNoise, Extent, GainDrift
 from probewise.recordings import Recording, Uniform, two_way_plan
 

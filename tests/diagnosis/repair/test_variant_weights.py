@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.repair.samples import sample_model
-from probewise.diagnosis.repair.variant_weights import weights_beside_other_effects
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.samples import sample_model, weights_beside_other_effects
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.systems import RunTable, Simulator
 
 _N, _AT, _SD = 150, 90, 0.08

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.light_sensor.covariates import varying_covariates
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.residuals.bases import (
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.light_sensor import varying_covariates
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.templates import TemplateBank
+from probewise.diagnosis.unknown_bases import (
     PRODUCTS,
     bank_of_unknown_effects,
     bases_unlike_named,
     without_products_like,
 )
-from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.recordings import two_way_plan
 
 PLAN = two_way_plan()

@@ -7,10 +7,9 @@ import pytest
 from scipy.stats import betabinom
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.locate import window_columns_and_bounds
-from probewise.diagnosis.residuals.outlying import clustering_log_bayes_factors, outlier_probabilities
+from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.recordings import Recording, paper_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World

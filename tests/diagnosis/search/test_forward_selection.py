@@ -7,7 +7,7 @@ import pytest
 
 from probewise.calibration import read_sensor, write_sensor
 from probewise.diagnosis import Diagnosis, diagnose
-from probewise.diagnosis.fitting.sensor_prior import sensor_from_samples
+from probewise.diagnosis.sensors import sensor_from_samples
 from probewise.experiment import experiment_for
 from probewise.proof.challenge import NullRefit
 from probewise.proof.sensors import Case, draw_case

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.systems import Noise, Simulator, table_for
 
 N_ROWS = 160

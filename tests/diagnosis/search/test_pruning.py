@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.search.pruning import prune_out_of_vocabulary
-from probewise.diagnosis.search.unknown import UnknownEffects
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.search.search import UnknownEffects, prune_out_of_vocabulary
 
 N = 50
 NAME, PUSH = ("sensor_tilt",), ("arm_knock",)

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from refitted import state_with_nulls
 
+from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.search import search as searching
-from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, is_significantly_better
+from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, are_proportional, is_significantly_better
 from probewise.diagnosis.search.searched import Evidences, posterior_of
-from probewise.diagnosis.search.twins import are_proportional
-from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.effects import CorrelatedNoise, Extent, RandomWalk
 from probewise.priors import LogUniform, Uniform
 from probewise.progress import silent

@@ -7,13 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.search import formulas as weighing_formulas
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.search import search as searching
-from probewise.diagnosis.search.formulas import search_with_formulas
 from probewise.diagnosis.search.refits import Refits
+from probewise.diagnosis.search.search import search_with_formulas
 from probewise.diagnosis.search.searched import Evidences, posterior_of
-from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.progress import silent
 from probewise.systems import Law, RunTable, Simulator
 
@@ -113,8 +112,7 @@ def test_a_start_of_its_own_in_each_run_does_not_make_every_effect_be_refitted(p
 
 
 def test_no_formula_is_searched_for_beside_a_name_that_explains_everything(searched_line, monkeypatch):
-    monkeypatch.setattr(weighing_formulas, "search", lambda *a, **k: pytest.fail("searched once more"))
-    assert searching.search is not weighing_formulas.search
+    monkeypatch.setattr(searching, "search", lambda *a, **k: pytest.fail("searched once more"))
     assert search_with_formulas(searched_line) is searched_line
 
 
@@ -127,7 +125,7 @@ def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):
 
     searched = searching.search(_line(change))
     asked = []
-    monkeypatch.setattr(weighing_formulas, "search", lambda more, **k: asked.append(more.effects) or searched)
+    monkeypatch.setattr(searching, "search", lambda more, **k: asked.append(more.effects) or searched)
     search_with_formulas(searched)
     assert asked
     assert any(name.startswith("formula:") and "room" in name for name in asked[0])

@@ -11,11 +11,11 @@ from mixtures import fixed_mixture
 
 from probewise import nested
 from probewise.diagnosis import diagnose, diagnosis_json, weigh_thoroughly
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
+from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agreement
+from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.effects import VOCABULARY, Extent, Flicker
 from probewise.priors import Normal, Product
 from probewise.recordings import Plan, Recording, paper_plan

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from heater import runs
 
-from probewise.diagnosis.advice.next_scans import Rival, measurement_separating_rivals
-from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.diagnosis.system.commands import (
+from probewise.diagnosis.advice import Rival, measurement_separating_rivals
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.simulator_rows import (
+    SimulatorApparatus,
     _minutes_of_runs,
     plan_of_alternatives,
     plan_of_sequence,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.system.diagnose import diagnose_system
+from probewise.diagnosis.diagnose_simulator import diagnose_system
 from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.binding import extract_stored_fit

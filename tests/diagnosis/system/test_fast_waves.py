@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.system.diagnose import diagnose_system
+from probewise.diagnosis.diagnose_simulator import diagnose_system
 from probewise.systems import RunTable, Simulator
 
 

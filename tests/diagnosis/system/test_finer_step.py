@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from probewise.diagnosis import diagnose_simulator as finer_step
+from probewise.diagnosis.diagnose_simulator import prepare_system, searched_at_step
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.system import finer_step
-from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.system.finer_step import searched_at_step
 from probewise.systems import Law, RunTable, Simulator
 
 N, SD = 40, 1e-3

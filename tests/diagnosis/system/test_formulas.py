@@ -7,14 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.engine import diagnose_prepared
-from probewise.diagnosis.judgement.global_test import run_global_test
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
-from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.search.formulas import needs_more_than_memoryless_noise
-from probewise.diagnosis.search.search import search
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.search.search import needs_more_than_memoryless_noise, search
 from probewise.diagnosis.search.searched import Posterior
-from probewise.diagnosis.system.diagnose import diagnose_system, prepare_system
+from probewise.diagnosis.verdict import run_global_test
 from probewise.systems import RunTable, Simulator, table_for
 
 SD = 0.05

@@ -8,10 +8,10 @@ import pytest
 from scipy.special import ndtri
 
 from probewise.diagnosis import diagnose_system
-from probewise.diagnosis.evidence.detectable import log_probability_effects_detectable
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import log_probability_effects_detectable
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.noise_law import white_noise
 from probewise.systems import Simulator, table_for
 
 N, SD = 50, 0.02

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.system.diagnose import _notes_on_integration, prepare_system
-from probewise.diagnosis.system.first_fit import fit_system
-from probewise.diagnosis.system.left_out import recording_from_table
-from probewise.diagnosis.system.likely_step import with_step_for_likely_parameters
+from probewise.diagnosis.diagnose_simulator import _notes_on_integration, prepare_system
+from probewise.diagnosis.left_out import recording_from_table
+from probewise.diagnosis.simulator_fit import fit_system, with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
 from probewise.systems.calls import IntegrationTally
 from probewise.systems.system import with_converged_step

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from probewise.diagnosis.evidence.held_out import held_out_gain
-from probewise.diagnosis.evidence.laplace import Linearised, laplace_evidence
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white_noise, white_noise_of_recording
-from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.system.left_out import readings_near_ends, recording_from_table
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import Linearised, laplace_evidence
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.held_out import held_out_gain
+from probewise.diagnosis.left_out import readings_near_ends, recording_from_table
+from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
+from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import CorrelatedNoise, Dropouts, Extent
 from probewise.errors import ParameterError
 from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system, table_for

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system, fit_simulator
-from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.system.fitted import repaired_of
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.systems import Simulator, predict_system, table_for
 
 TRUE = {"tau_s": 40.0, "gain": 55.0, "start_c": 20.0}

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
-from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.repair.samples import ModelSamples
-from probewise.diagnosis.residuals.bases import bank_of_unknown_effects
-from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.locate import places_of_effect, significant_places
-from probewise.diagnosis.residuals.outlying import FAR_OUT, clustering_log_bayes_factors
-from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.verdict_report.document import diagnosis_json
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.diagnosis import diagnosis_json
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
+from probewise.diagnosis.samples import ModelSamples
+from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
 from probewise.systems import Law, Simulator, table_for
 from probewise.systems.forms import bind_forms
 from probewise.systems.forms.formulas import formula_forms

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
-from probewise.diagnosis.system.fitted import repaired_of
+from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.systems import Noise, Simulator, predict_system
 
 _N = 240

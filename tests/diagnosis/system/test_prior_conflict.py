@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import fit_simulator
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.systems import Noise, Simulator, table_for
 
 X = np.linspace(1, 20, 40)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import audit_system, diagnose_system
-from probewise.diagnosis.evidence.templates import templates_of_effect
-from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.noise.models import NoiseModel
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.templates import templates_of_effect
 from probewise.effects import Dropouts, Extent
 from probewise.systems import Simulator, table_for
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.system.first_fit import fit_system
-from probewise.diagnosis.system.left_out import recording_from_table
+from probewise.diagnosis.left_out import recording_from_table
+from probewise.diagnosis.simulator_fit import fit_system
 from probewise.systems import Law, RunTable, Simulator, System
 
 

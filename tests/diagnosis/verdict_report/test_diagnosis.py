@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, SensorAndShape, VerdictReport
-from probewise.diagnosis.judgement.judged import Hypothesis
-from probewise.diagnosis.light_sensor.sensor import LightSensorApparatus
-from probewise.diagnosis.search.weighed_twice import Weighing
-from probewise.diagnosis.verdict_report.document import _weighing_json
-from probewise.diagnosis.verdict_report.findings import EffectFound
+from probewise.diagnosis.diagnosis import _weighing_json
+from probewise.diagnosis.findings import EffectFound
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.search.thorough import Weighing
+from probewise.diagnosis.verdict import Hypothesis
 from probewise.recordings import Plan, Uniform
 from probewise.scene import Circle
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import PriorOdds
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.systems import Law, Simulator, table_for
 from probewise.systems.forms.rates import names_in_definitions
 

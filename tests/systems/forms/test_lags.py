@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from probewise.diagnosis.evidence.templates import EffectTemplates
-from probewise.diagnosis.system.diagnose import diagnose_system, prepare_system
+from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
+from probewise.diagnosis.templates import EffectTemplates
 from probewise.systems import Law, RunTable, Simulator
 from probewise.systems.forms.readings import Spline, delayed_readings, lagged_readings
 

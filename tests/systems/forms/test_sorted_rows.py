@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.systems import Simulator, table_for
 from probewise.systems.forms.binding import names_of_jumps_in_sorted_rows, sorting_column
 

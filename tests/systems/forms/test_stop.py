@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
-from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.system.fitted import repaired_of
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.systems import Noise, RunTable, Simulator, as_recording, predict_system, table_for
 from probewise.systems.forms.stop import find_meter_stop_and_mask
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.effect_words import FORMS_IN_WORDS, effect_has_words, effect_in_words
+from probewise.diagnosis.words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.effects import name_without_copy_suffix
 from probewise.proof.systems.vocabulary import FAMILIES
 from probewise.systems import Law, Noise, RunTable, Simulator, System

@@ -1,38 +1,391 @@
-"""Joint nonlinear refits with Laplace evidence: of a model, or of a candidate with one more effect."""
+"""Joint nonlinear refits of combinations of effects with Laplace evidence, under competing noise models."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.convergence import checked_finite_fit
-from probewise.diagnosis.evidence.detectable import log_probability_effects_detectable
-from probewise.diagnosis.evidence.laplace import SCALES, Linearised
-from probewise.diagnosis.evidence.screening import log_bayes_factors_by_label, log_mean_exp
-from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateCache
-from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
-from probewise.diagnosis.fitting.null import Null
-from probewise.diagnosis.names import Names
-from probewise.diagnosis.noise.law import NoiseLaw
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence import (
+    SCALES,
+    Linearised,
+    NoiseEvidence,
+    laplace_evidence,
+    log_probability_effects_detectable,
+    refined,
+)
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_start
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_models import NoiseModel, least_sd_given_rounding, rough_sd, rounding_hides_noise
+from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.constants import (
     ALIASED_NATS,
     FEW_VARIANTS,
     HOPELESS,
+    MOST_FAULTS,
+    NOISE_NODES_REFINED_WITHIN,
+    NOISE_PAIR_WITHIN,
     SAME_MODE,
     STEERING,
     VARIANTS_TRIED,
 )
-from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.twins import TwinSwap, are_proportional
-from probewise.diagnosis.search.weighed_fit import WeighedFit
-from probewise.effects import NamedEffect
+from probewise.diagnosis.templates import (
+    EffectTemplates,
+    TemplateBank,
+    TemplateCache,
+    combinations_up_to,
+    log_bayes_factors_by_label,
+    log_mean_exp,
+)
+from probewise.effects import (
+    NUISANCES,
+    CorrelatedNoise,
+    NamedEffect,
+    NoiseEffect,
+    Quantisation,
+    RandomWalk,
+    is_out_of_vocabulary,
+    lattice_step,
+)
 from probewise.effects.priors import SharedScalePrior
+from probewise.errors import NotConvergedError
+from probewise.recordings.plan import Recording
+
+
+def or_impossible(log_z: float) -> float:
+    """Return a log evidence, minus infinity for one that is no number: all probabilities would be none."""
+    return -math.inf if math.isnan(log_z) else log_z
+
+
+@dataclass(frozen=True, eq=False)
+class WeighedFit:
+    """A candidate: effects on the mean refitted with an SSF of some number of Gaussians; evidence by noise effects."""
+
+    found: Fit
+    law: NoiseLaw  # noise distribution of the fit
+    evidence: Mapping[Names, NoiseEvidence]
+    log_share: float  # log prior factor of the effects' discrete choices (variants)
+    log_detectable: float  # log probability that all effects have a detectable size
+    weights: Mapping[str, FloatArray]  # weights of each effect's variants
+
+    @property
+    def names(self) -> Names:
+        """Names of its effects on the mean, sorted."""
+        return tuple(sorted(self.found.model.names))
+
+    @classmethod
+    def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_detectable: float) -> WeighedFit:
+        """Build from a fit and its `plain` evidence by noise model: of its parameters alone, without prior factors."""
+        return cls(found, law, {}, 0.0, log_detectable, {}).with_evidence(plain)
+
+    @property
+    def log_prior_factor(self) -> float:
+        """Log prior factor in its evidence: of its effects' discrete choices, and of their detectable sizes."""
+        return self.log_share + self.log_detectable
+
+    def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
+        """Return a copy with new evidence, by noise model: `plain`, of its parameters alone, plus its prior factor."""
+        return replace(self, evidence=plain).with_log_evidence_shifted(self.log_prior_factor)
+
+    def with_variant_factor_and_weights(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
+        """Return a copy with other log prior factor and weights of its effects' variants (discrete choices)."""
+        return replace(self.with_log_evidence_shifted(log_share - self.log_share), log_share=log_share, weights=weights)
+
+    def with_log_evidence_shifted(self, by: float) -> WeighedFit:
+        """Return a copy with its log evidence shifted by these nats under every noise model.
+
+        An evidence that is no number counts as minus infinity: it must not spoil the probabilities of all others.
+        """
+        return replace(
+            self,
+            evidence={noise: replace(e, log_z=or_impossible(e.log_z + by)) for noise, e in self.evidence.items()},
+        )
+
+    @property
+    def n_gaussians(self) -> int:
+        """Number of Gaussians of its SSF (SSF order)."""
+        return self.found.model.sensor.n_gaussians
+
+    @property
+    def whitened_sd(self) -> float:
+        """Noise sd of a whitened reading, in reading units, including rounding but not a tail."""
+        return self.found.sd * self.law.sd_factor_of_rounding
+
+    @property
+    def ssf_degrees_of_freedom(self) -> int:
+        """Effective degrees of freedom of its SSF, counted in Gaussians."""
+        return self.found.model.sensor.effective_n_gaussians
+
+    @property
+    def log_z(self) -> float:
+        """Log evidence under the best noise model."""
+        return max(e.log_z for e in self.evidence.values())
+
+    def possible_noise(self, noise: Names) -> Names:
+        """Return a noise model or, where it is impossible about this fit, the best of those with part of its effects.
+
+        Lost readings, for instance, are not seen about a fit that is far off.
+        """
+        if np.isfinite(self.evidence[noise].log_z):
+            return noise
+        parts = [names for names in self.evidence if {*names} < {*noise}]
+        return max(parts, key=lambda names: self.evidence[names].log_z, default=noise)
+
+    def leading_noises(self) -> Iterator[tuple[Names, NoiseEvidence]]:
+        """Iterate over the noise models within three nats of the best, and the simplest one: names and evidence.
+
+        A missing effect on the mean can look like any noise effect, and be detectable under white noise only.
+        """
+        best, plain = self.log_z, min(self.evidence, key=len)
+        return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
+
+
+def expected_log_bayes_factor(first: WeighedFit, second: WeighedFit) -> float:
+    """Return the log Bayes factor expected between two candidates if the first is true, in nats.
+
+    This is half the squared distance between their predictions, whitened, in noise sds of the first.
+    """
+    apart = first.law((first.found.residuals - second.found.residuals)[:, None])
+    return 0.5 * float(np.sum(apart**2)) / first.whitened_sd**2
+
+
+def noise_effects_in_vocabulary(noise: Names) -> Names:
+    """Return the effects of a noise model without nuisances, which have no name in the vocabulary."""
+    return tuple(name for name in noise if name not in NUISANCES)
+
+
+def effects_out_of_vocabulary(mean: Names) -> Names:
+    """Return the effects on the mean, of those named, that are out of vocabulary."""
+    return tuple(name for name in mean if is_out_of_vocabulary(name))
+
+
+WITH_MEMORY = frozenset({CorrelatedNoise.name, RandomWalk.name})
+"""Effects on the noise of which a noise distribution can contain only one."""
+
+
+@dataclass(eq=False)
+class NoiseModels:
+    """The noise models of one recording: each noise effect alone, and pairs and triples if fewer are significant.
+
+    `models`: noise models by the names of their effects; `certain`: noise effects that the readings show beyond doubt,
+    part of every model; `least_sd`: the least plausible sd of a reading.
+
+    `sd_about_fit` is the noise sd about a first fit, infinite without one. Rounding is judged by it too, since
+    successive readings tell the noise only if the signal varies little from one to the next.
+    """
+
+    recording: Recording
+    effects: Mapping[str, NoiseEffect]
+    prior: PriorOdds
+    sd_about_fit: float = math.inf
+    least_sd: float = field(init=False)
+    certain: Names = field(init=False)
+    models: dict[Names, NoiseModel] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.least_sd = least_sd_given_rounding(self.recording)
+        self._step = lattice_step(self.recording.readings[self.recording.usable])
+        # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
+        sd = min(rough_sd(self.recording) or math.inf, self.sd_about_fit)
+        seen = Quantisation.seen_above * sd < self._step
+        rounded = {Quantisation.name: np.array([self._step])} if Quantisation.name in self.effects and seen else {}
+        shown = {
+            name: effect.parameters_known_before_fit
+            for name, effect in self.effects.items()
+            if effect.parameters_known_before_fit is not None
+        }
+        self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
+        self.certain = tuple(sorted(self._known))
+        self._hidden = rounding_hides_noise(self._step, sd)
+        others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
+        single = [tuple(sorted({*names, *self.certain})) for names in combinations_up_to(others, 1)]
+        self.models = {names: self._build_model(names) for names in single}
+
+    def _build_model(
+        self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None
+    ) -> NoiseModel:
+        # Certain effects are not re-estimated about each fit, whose own residual may be larger.
+        effects = tuple(self.effects[n] for n in names)
+        rounding = self._step if self._hidden and names == self.certain else 0.0
+        return NoiseModel(effects, self.recording, {**self._known, **(likely or {})}, rounding, self.least_sd)
+
+    def log_prior(self, names: Names) -> float:
+        """Return the log prior probability of a noise model; certain effects do not count."""
+        return self.prior.log_prior_on_noise(self._uncertain_names(names))
+
+    def average_log_evidence(self, log_z: Mapping[Names, float]) -> float:
+        """Return the log of the evidences' average over noise models, by prior; minus infinity without any."""
+        values = [value + self.log_prior(names) for names, value in log_z.items()]
+        return float(logsumexp(values)) if values else -math.inf
+
+    def evidence_by_noise(self, found: Fit) -> dict[Names, NoiseEvidence]:
+        """Compute the evidence of a fit under every noise model, by the names of its effects.
+
+        Those that may come near the best have nodes about their peak, where those of the prior lie too far apart.
+        """
+        evidence = {names: laplace_evidence(found, model) for names, model in self.models.items()}
+        best = max((e.log_z + self.log_prior(names) for names, e in evidence.items()), default=-math.inf)
+        return {
+            names: refined(found, own, least=best - self.log_prior(names) - NOISE_NODES_REFINED_WITHIN)
+            for names, own in evidence.items()
+        }
+
+    def best_evidence(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
+        """Return the evidence, of those given by noise model, whose noise model is most probable, priors included."""
+        return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))]
+
+    def add_significant_pairs(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
+        """Add pairs of noise effects to the models if a single one is significant about a fit; triples if a pair is.
+
+        Only those within three nats of the best are added.
+
+        Returns
+        -------
+        Whether any pair was tried.
+        """
+        known, singles = dict(evidence), list(evidence)
+        for size in range(1, MOST_FAULTS):
+            of_size = {names: e for names, e in known.items() if len(self._uncertain_names(names)) == size}
+            first = max(of_size, key=lambda names: of_size[names].log_z, default=self.certain)
+            parts = [n for n in known if set(n) < set(first)]
+            if not parts or known[first].log_z < max(known[n].log_z for n in parts) + NOISE_PAIR_WITHIN:
+                return size > 1
+            # Beside another effect the likeliest values may be others: nodes about them alone would lie too close.
+            of_first = laplace_evidence(found, self.models[first])
+            likely = {name: of_first.likeliest_nodes_of_effect(name) for name in self._uncertain_names(first)}
+            best = max(e.log_z + self.log_prior(names) for names, e in known.items())
+            for other in singles:
+                both = tuple(sorted({*first, *other}))
+                if len(self._uncertain_names(both)) != size + 1 or set(both) >= WITH_MEMORY:
+                    continue
+                coarse = self.models[other].coarse_nodes_by_effect()
+                nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
+                least = best - NOISE_PAIR_WITHIN - self.log_prior(both)
+                own = refined(found, nearby, least=least)
+                if own.log_z > least:
+                    recentred = self._nodes_beside(found, nearby, self._uncertain_names(first))
+                    self.models[both], known[both] = self._build_model(both, recentred | coarse), own
+        return True
+
+    def _nodes_beside(
+        self, found: Fit, evidence: NoiseEvidence, names: Names
+    ) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return the likeliest nodes of each effect named, of all its nodes, beside the likeliest nodes of the others.
+
+        `evidence` is that of a fit under all effects together, of which each has only few nodes.
+        """
+        effects = self._uncertain_names(evidence.noise.names)
+        likely = {name: evidence.likeliest_nodes_of_effect(name) for name in effects}
+        out = {}
+        for name in names:
+            beside = {other: nodes for other, nodes in likely.items() if other != name}
+            again = laplace_evidence(found, self._build_model(evidence.noise.names, beside))
+            out[name] = again.likeliest_nodes_of_effect(name)
+        return out
+
+    def _uncertain_names(self, names: Names) -> Names:
+        return tuple(n for n in names if n not in self.certain)
+
+
+_PROPORTIONAL = 1e-9  # one minus the cosine of two templates
+_SAME_READINGS = 1e-3  # noise sds, the largest difference of two predictions
+_SAME_SLOPES = 1e-3  # of the norm of a slope
+
+
+def are_proportional(first: EffectTemplates, second: EffectTemplates) -> bool:
+    """Return whether all corresponding templates of two effects are proportional; False if both are one object."""
+    if first is second or [a.shape for a in first.settings] != [b.shape for b in second.settings]:
+        return False
+    if len(first.variants) != len(second.variants):
+        return False
+    a, b = (np.concatenate(templates.columns, axis=1) for templates in (first, second))
+    norms = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
+    return bool(np.all(np.abs(np.einsum("ij,ij->j", a, b)) >= (1 - _PROPORTIONAL) * norms) and np.all(norms > 0))
+
+
+@dataclass(frozen=True, eq=False)
+class TwinSwap:
+    """The exchange of an effect `name` for its `twin`, with the templates of both."""
+
+    name: str
+    of_first: EffectTemplates
+    twin: str
+    of_twin: EffectTemplates
+
+    def candidate_with_twin(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
+        """Return a candidate with the twin in place of the effect; None if this changes predictions or slopes."""
+        found = self._fit_with_twin(candidate.found, usable)
+        if found is None:
+            return None
+        weights = {self.twin if name == self.name else name: own for name, own in candidate.weights.items()}
+        return replace(candidate, found=found, weights=weights)
+
+    def _fit_with_twin(self, found: Fit, usable: IntArray) -> Fit | None:
+        effects, of = list(found.model.effects), self.of_first.variants
+        pair = next(((i, k) for i, held in enumerate(effects) for k, each in enumerate(of) if each is held), None)
+        if pair is None:
+            return None
+        at, variant = pair
+        held, effects[at] = effects[at], self.of_twin.variants[variant]
+        model = replace(found.model, effects=tuple(effects))
+        amplitudes = np.array(held.amplitudes, dtype=np.int64) + found.model.coordinate_slice(held.name).start
+        for sign in (1.0, -1.0):
+            z, slopes = found.z.copy(), found.slopes.copy()
+            z[amplitudes] *= sign
+            slopes[:, amplitudes] *= sign
+            predicted, own = (values[usable] for values in model.predict_and_differentiate(z))
+            if _has_same_predictions(predicted, own, replace(found, slopes=slopes)):
+                residuals = found.residuals + found.predicted - predicted
+                return replace(found, model=model, z=z, predicted=predicted, residuals=residuals, slopes=own)
+        return None
+
+
+def _has_same_predictions(predicted: FloatArray, slopes: FloatArray, found: Fit) -> bool:
+    if not np.abs(predicted - found.predicted).max() <= _SAME_READINGS * found.sd:
+        return False
+    apart, norms = np.linalg.norm(slopes - found.slopes, axis=0), np.linalg.norm(found.slopes, axis=0)
+    return bool(np.all(apart <= _SAME_SLOPES * norms + _SAME_READINGS * found.sd))
+
+
+_FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
+
+
+def checked_finite_fit(found: Fit) -> Fit:
+    """Return a fit after checking that its predictions are finite.
+
+    Raises
+    ------
+    NotConvergedError
+        If they are not, with the fit as its `partial`.
+    """
+    if not np.isfinite(found.objective):
+        raise NotConvergedError("the model predicts readings that are not finite; check the model and its prior", found)
+    return found
+
+
+def require_converged_fit(found: Fit, problem: Linearised) -> None:
+    """Refuse a fit that one more step would improve by over ten nats, unless it is at the bounds of its prior.
+
+    Raises
+    ------
+    NotConvergedError
+        With the fit as its `partial`.
+    """
+    shift = problem.absorbing_shift(found, np.zeros(len(found.residuals)))
+    slopes = problem.whiten(found.slopes)
+    left = 0.5 * float(np.sum((slopes @ shift) ** 2) + shift @ shift)
+    if left > _FAR and np.abs(found.z).max() < FARTHEST - 0.1:
+        raise NotConvergedError(
+            f"the fit of the model did not converge: one more step would still gain about {left:.0f} nats; "
+            "a narrower prior or more informative readings would help",
+            found,
+        )
+
 
 Extended: TypeAlias = tuple[WeighedFit, dict[Names, float]]
 """A candidate with one more effect, and the closed-form scores of the effect by noise model."""

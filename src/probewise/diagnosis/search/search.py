@@ -2,22 +2,30 @@
 
 Hypotheses are combinations of effects on the mean, under every noise model and several SSF orders, with or without an
 unknown effect. Templates screen them; a beam of the best is refitted jointly and nonlinearly, with Laplace evidences.
+A second search follows with formulas, unless noise without memory explains the readings: effects out of vocabulary that
+the apparatus proposes, short expressions of a table's columns and states.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.templates import TemplateCache
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
-from probewise.diagnosis.search.backward_elimination import eliminate_backward
+from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.constants import (
+    ALIASED_NATS,
     EXTENDED_WITHIN,
     FEW_READINGS,
     MAX_ORDER,
@@ -27,18 +35,159 @@ from probewise.diagnosis.search.constants import (
     SAME_MODE,
     WITH_UNKNOWN,
 )
-from probewise.diagnosis.search.forward_selection import proposals_for, select_forward
-from probewise.diagnosis.search.noises import NoiseModels
-from probewise.diagnosis.search.nulls import fit_nulls, noise_sd_about_given_null
-from probewise.diagnosis.search.orders import refit_at_other_orders
-from probewise.diagnosis.search.pruning import prune_out_of_vocabulary
-from probewise.diagnosis.search.refits import Refits
+from probewise.diagnosis.search.refits import (
+    WITH_MEMORY,
+    NoiseModels,
+    Refits,
+    WeighedFit,
+    effects_out_of_vocabulary,
+    expected_log_bayes_factor,
+)
 from probewise.diagnosis.search.searched import Evidences, MisfitTemplates, Posterior, Searched, posterior_of
-from probewise.diagnosis.search.state import SearchState
-from probewise.diagnosis.search.unknown import UnknownEffects
-from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
+from probewise.diagnosis.search.stepwise import (
+    SearchState,
+    eliminate_backward,
+    fit_nulls,
+    noise_sd_about_given_null,
+    proposals_for,
+    refit_at_other_orders,
+    select_forward,
+)
+from probewise.diagnosis.templates import TemplateBank, TemplateCache, log_bayes_factors_by_label, log_mean_exp
+from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
 from probewise.effects import PROPOSAL, NamedEffect, NoiseEffect
 from probewise.progress import Progress, silent
+
+Key = tuple[int, Names]
+
+
+def prune_out_of_vocabulary(
+    candidates: Mapping[Key, WeighedFit], noises: NoiseModels
+) -> tuple[dict[Key, WeighedFit], set[Names]]:
+    """Drop or penalise combinations out of vocabulary that compete with named ones of no more effects.
+
+    A combination is dropped if it predicts so much the same as a named one that its expected lead is below three nats.
+    If its observed lead is below three nats, its evidence is reduced to that of the best named one.
+
+    Returns
+    -------
+    The candidates that stay, and the combinations that were dropped.
+    """
+
+    def average_log_evidence(candidate: WeighedFit) -> float:
+        return noises.average_log_evidence({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
+
+    leading = {c.names: c for c in sorted(candidates.values(), key=average_log_evidence) if c.names}
+    stay, pruned = dict(candidates), set()
+    for names, candidate in leading.items():
+        if not effects_out_of_vocabulary(names):
+            continue
+        rivals = [c for c in leading.values() if not effects_out_of_vocabulary(c.names) and len(c.names) <= len(names)]
+        if any(expected_log_bayes_factor(candidate, c) < ALIASED_NATS for c in rivals):
+            pruned.add(names)
+        ahead = average_log_evidence(candidate) - max((average_log_evidence(c) for c in rivals), default=-np.inf)
+        if 0 < ahead < ALIASED_NATS:
+            for key in [key for key in stay if key[1] == names]:
+                stay[key] = stay[key].with_variant_factor_and_weights(stay[key].log_share - ahead, stay[key].weights)
+    return {key: c for key, c in stay.items() if key[1] not in pruned}, pruned
+
+
+@dataclass(eq=False)
+class UnknownEffects:
+    """Evidence of an unknown effect, by basis functions, added to candidates, under each of their leading noise models.
+
+    Parameters
+    ----------
+    scores
+        Function of a fit, a noise distribution and a bank: log Bayes factors of its templates, by label.
+    bases
+        Bank of the basis functions.
+    covariates
+        Covariates in which outlying readings may cluster.
+    noises
+        The noise models.
+    complexity_penalty
+        Function of the degrees of freedom of an SSF: penalty in nats of an unknown effect added to the null.
+    log_n_choices
+        Function of names: log of the number of combinations of this size, relative to single names.
+    """
+
+    scores: Callable[[Fit, NoiseLaw, TemplateBank], Mapping[str, FloatArray]]
+    bases: TemplateBank
+    covariates: tuple[Covariate, ...]
+    noises: NoiseModels
+    complexity_penalty: Callable[[int], float]
+    log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
+    """Log evidence by (order, mean, noise)."""
+    shares: dict[str, float] = field(default_factory=dict)
+    """Share of each family of bases, beside the null with the largest evidence of an unknown effect."""
+    log_n_choices: Callable[[Names], float] = lambda names: 0.0
+
+    def weigh_beside(self, candidates: Iterable[WeighedFit]) -> None:
+        """Compute and store (`log_z`) the log evidence of each candidate with an unknown effect added."""
+        best = -np.inf
+        for candidate in candidates:
+            for noise, evidence in candidate.leading_noises():
+                scores = self.scores(candidate.found, evidence.likeliest_law, self.bases)
+                by_family = {family: log_mean_exp(own) for family, own in scores.items()}
+                if evidence.likeliest_law.share > 0:
+                    far_out = outlier_probabilities(candidate.found.residuals, evidence.likeliest_law)
+                    by_family |= clustering_log_bayes_factors(far_out, self.covariates)
+                if not by_family:
+                    continue
+                value = evidence.log_z + log_mean_exp(np.array(list(by_family.values())))
+                if not candidate.names:
+                    value -= self.complexity_penalty(candidate.ssf_degrees_of_freedom)
+                self.log_z[candidate.n_gaussians, candidate.names, noise] = value
+                if value > best and not candidate.names:
+                    best = value
+                    total = logsumexp(list(by_family.values()))
+                    self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
+
+    def drop_superfluous(self, candidates: Collection[WeighedFit]) -> None:
+        """Drop an unknown effect, alone or with one named effect, if one or two more named effects explain as much.
+
+        An unknown effect added to the named ones must then be insignificant. A basis of many columns, such as one value
+        per scan, can imitate named effects. Two names are chosen from many more combinations than one, so they must
+        explain correspondingly more.
+        """
+        named = [c for c in candidates if not effects_out_of_vocabulary(c.names)]
+        for known in dict.fromkeys(c.names for c in named if len(c.names) <= 1):
+            rivals = [c for c in named if set(c.names) > set(known) and len(c.names) <= 2]
+            if any(key[1] == known for key in self.log_z) and self._is_superfluous(known, rivals, candidates):
+                self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
+
+    def _is_superfluous(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
+        """Return whether one of the `rivals` makes an unknown effect added to `known` superfluous.
+
+        The rival's evidence is at most three nats lower, and an unknown effect adds less than three to it.
+        """
+        most = max((self._log_evidence_with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
+        believed = {c: self._log_evidence_less_choices(c, len(known)) for c in rivals}
+        for candidate in sorted(believed, key=lambda c: -believed[c]):
+            if believed[candidate] < most - ALIASED_NATS:
+                return False
+            if self._log_evidence_with_unknown(candidate) == -np.inf:
+                self.weigh_beside([candidate])
+            if (
+                self._log_evidence_with_unknown(candidate) - self._log_evidence_without_unknown(candidate)
+                < ALIASED_NATS
+            ):
+                return True
+        return False
+
+    def _log_evidence_less_choices(self, candidate: WeighedFit, n_known: int) -> float:
+        several = len(candidate.names) - n_known > 1
+        return self._log_evidence_without_unknown(candidate) - (self.log_n_choices(candidate.names) if several else 0.0)
+
+    def _log_evidence_without_unknown(self, candidate: WeighedFit) -> float:
+        return self.noises.average_log_evidence(
+            {noise: evidence.log_z for noise, evidence in candidate.evidence.items()}
+        )
+
+    def _log_evidence_with_unknown(self, candidate: WeighedFit) -> float:
+        own = candidate.n_gaussians, candidate.names
+        return self.noises.average_log_evidence({key[2]: value for key, value in self.log_z.items() if key[:2] == own})
 
 
 def search(
@@ -238,3 +387,72 @@ def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTem
     named = state.templates.coarse_bank(null.found, _effects_in_vocabulary(state))
     unlike = bases_unlike_named(bases, named, problem)
     return MisfitTemplates(state.templates, null.found, unlike, tuple(covariates))
+
+
+_LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
+_MOST = 8  # formulas that are refitted
+# Nats behind the best of what was refitted, within which screening must see a formula: alone, where an effect of
+# hundreds of nats is seen wrongly by a dozen, and beside the best single effect or the leader, whose fits are near.
+_WITHIN_ALONE = 12.0
+_WITHIN_BESIDE = 3.0
+
+
+def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> Searched:
+    """Return a second search that includes the formulas favoured by screening; the given one if there are none.
+
+    The given search is also returned if noise without memory explains the readings, or the budget of refits is spent.
+    Named effects can partly explain what one formula explains, and then predict other runs badly: a square law an
+    exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
+    """
+    prepared = searched.prepared
+    if not needs_more_than_memoryless_noise(searched) or prepared.apparatus.is_refit_budget_spent():
+        return searched
+    proposals = prepared.apparatus.proposed_formulas()
+    if not proposals:
+        return searched
+    progress("weighing formulas")
+    every = {**prepared.effects, **proposals}
+    prior = prepared.apparatus.prior_odds(every)
+    promises = _promise_by_formula(searched, proposals)
+    own = {name: prior.log_prior_on_mean((name,)) - prior.log_prior_on_mean(()) for name in promises}
+    odds = {name: value + own[name] for name, value in promises.items()}
+    best = max(
+        fit.log_z + searched.prior.log_prior_on_mean(names) for (_, names), fit in searched.evidences.fits.items()
+    )
+    ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
+    kept = {name: proposals[name] for name in ranked if odds[name] > best}
+    if not kept:
+        return searched
+    more = replace(prepared, effects={**prepared.effects, **kept})
+    again = search(more, prior=prior, after=searched, progress=progress)
+    return searched if prepared.apparatus.is_refit_budget_spent() else again
+
+
+def needs_more_than_memoryless_noise(searched: Searched) -> bool:
+    """Return whether effects on the mean, or noise with memory, together have a probability above 0.1."""
+    plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
+    return 1.0 - sum(plain) > _LEFT_FROM
+
+
+def _promise_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
+    """Return for each formula its largest screened log evidence beside the null, the best single effect or the leader.
+
+    The leader is the most probable combination. The log prior of what the formula stands beside is included, that of
+    the formula is not. The nats by which a formula may trail there are added.
+    """
+    usable, null = searched.prepared.usable_rows, searched.null
+    singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]
+    fits = sorted(singles, key=lambda f: -f.log_z)[:1]
+    leader = max(searched.evidences.fits.values(), key=lambda f: f.log_z + searched.prior.log_prior_on_mean(f.names))
+    if len(leader.names) > 1:
+        fits.append(leader)
+    parents = [(null, _WITHIN_ALONE), *((fit, _WITHIN_BESIDE) for fit in fits)]
+    memory, out = TemplateCache(usable), dict[str, float]()
+    bank: TemplateBank = memory.coarse_bank(null.found, list(proposals.values()))
+    for parent, within in parents:
+        for _, evidence in parent.leading_noises():
+            scores = log_bayes_factors_by_label(Linearised.of(parent.found, evidence.likeliest_law), bank)
+            for name, own in scores.items():
+                value = evidence.log_z + searched.prior.log_prior_on_mean(parent.names) + log_mean_exp(own) + within
+                out[name] = max(value, out.get(name, value))
+    return out

@@ -9,25 +9,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise.diagnosis.evidence.bank import TemplateBank
-from probewise.diagnosis.evidence.templates import TemplateCache
-from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.fitting.null import Null
-from probewise.diagnosis.names import Names
-from probewise.diagnosis.noise.models import NoiseModel
+from probewise.diagnosis.fit import Fit, Null
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.outlying import outlier_probabilities
+from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.constants import ALIASED_NATS
-from probewise.diagnosis.search.refits import Refits
-from probewise.diagnosis.search.weighed_fit import (
+from probewise.diagnosis.search.refits import (
+    Refits,
     WeighedFit,
     effects_out_of_vocabulary,
     expected_log_bayes_factor,
     noise_effects_in_vocabulary,
     or_impossible,
 )
+from probewise.diagnosis.templates import TemplateBank, TemplateCache
 from probewise.effects import PROPOSAL, Outliers, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
 

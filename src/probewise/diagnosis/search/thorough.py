@@ -1,7 +1,7 @@
 """The evidence of the leading hypotheses once more, by nested sampling, which replaces Laplace's where that fails.
 
-Model, priors and noise are those of `probewise.diagnosis.evidence.laplace`; only the integral over the parameters
-differs: here over the whole prior, there for one Gaussian mode.
+Model, priors and noise are those of `probewise.diagnosis.evidence`; only the integral over the parameters differs: here
+over the whole prior, there for one Gaussian mode.
 """
 
 from __future__ import annotations
@@ -18,16 +18,68 @@ import numpy as np
 from probewise import nested
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_rng
-from probewise.diagnosis.evidence.folded import fold_problem
-from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
-from probewise.diagnosis.evidence.laplace import covariance_root
-from probewise.diagnosis.fitting.coordinates import FARTHEST
-from probewise.diagnosis.names import Names
+from probewise.diagnosis.evidence import covariance_root
+from probewise.diagnosis.fit import FARTHEST
+from probewise.diagnosis.hypothesis_problem import HypothesisProblem, fold_problem
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import WeighedFit, noise_effects_in_vocabulary
-from probewise.diagnosis.search.weighed_twice import Weighing
+from probewise.effects import name_without_copy_suffix
 from probewise.errors import DoubtfulResultWarning
 from probewise.progress import Progress, silent
+
+A_NAT = 1.0
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Log evidence of one hypothesis by both methods, with the same model, priors and noise.
+
+    `effects` on the mean and on the noise, sorted; `n_gaussians` of the SSF; `laplace` and `nested`: the log evidences
+    in nats; `error`: standard error of `nested`; `doubts`: warnings of the nested runs.
+    """
+
+    effects: tuple[str, ...]
+    n_gaussians: int
+    laplace: float
+    nested: float
+    error: float
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Effects joined by "+", or "clean"."""
+        return "+".join(sorted(map(name_without_copy_suffix, self.effects))) or "clean"
+
+    @property
+    def gap(self) -> float:
+        """Log evidence by nested sampling minus that by Laplace, in nats."""
+        return self.nested - self.laplace
+
+    @property
+    def agree(self) -> bool:
+        """Whether the two log evidences differ by at most a nat plus one standard error of nested sampling."""
+        return abs(self.gap) <= A_NAT + self.error
+
+
+def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
+    """Extend a verdict's reason by whether nested sampling agrees, by how many nats not, and its first warning."""
+    if not weighings:
+        return reason
+    apart = ", ".join(f"{w.label} by {_signed(w.gap)} nats" for w in weighings if not w.agree)
+    doubt = next((f"{w.label}: {doubt}" for w in weighings for doubt in w.doubts), None)
+    if not apart:
+        said = "nested sampling agrees to within a nat plus its standard error"
+    elif doubt is not None:
+        said = f"nested sampling would move {apart}, and probabilities are left as they were"
+    else:
+        said = f"nested sampling moves {apart}, and the probabilities are by its evidence"
+    return f"{reason.rstrip('.')}; {said}{'' if doubt is None else f', but its runs gave a warning ({doubt})'}."
+
+
+def _signed(nats: float) -> str:
+    return f"{nats:+.1f}".replace("-", "−")
+
 
 N_LIVE = 100
 

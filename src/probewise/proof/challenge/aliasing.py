@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
-from probewise.diagnosis.evidence.templates import EffectTemplates, templates_of_effect
-from probewise.diagnosis.fitting.fit import Fit, fit
-from probewise.diagnosis.noise.law import white_noise
+from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks
+from probewise.diagnosis.fit import Fit, fit
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.templates import EffectTemplates, templates_of_effect
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.proof.challenge.null_refit import NullRefit
 from probewise.recordings.plan import Recording

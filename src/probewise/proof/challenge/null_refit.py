@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.laplace import laplace_evidence
-from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.fitting.fit import Fit, Model, fit, starts_of_one_gaussian, starts_with_more_gaussians
-from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.noise.models import NoiseModel
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import Fit, Model, fit
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.sensors import default_sensor, starts_of_one_gaussian, starts_with_more_gaussians
 from probewise.effects import Extent
 from probewise.recordings.plan import Recording
 

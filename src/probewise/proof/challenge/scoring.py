@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from probewise.diagnosis.names import Names
+from probewise.diagnosis.prior_odds import Names
 from probewise.proof.sensors import NO_PHYSICS, NOISE_NAMES
 
 NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation", "random_walk", "noise_per_run"}

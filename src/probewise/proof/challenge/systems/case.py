@@ -12,7 +12,7 @@ from typing import Any
 
 from probewise._arrays import own_arithmetic
 from probewise.diagnosis import Diagnosis
-from probewise.diagnosis.system.diagnose import diagnose_system
+from probewise.diagnosis.diagnose_simulator import diagnose_system
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.proof.challenge.case import Task, statements_to_score
 from probewise.proof.challenge.coverage import effect_truths_and_intervals

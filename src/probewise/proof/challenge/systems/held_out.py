@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, ModelSamples
-from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import NotConvergedError
 from probewise.proof.systems import SystemCase, right_predictions

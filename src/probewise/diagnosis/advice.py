@@ -1,0 +1,419 @@
+"""The next readings, chosen by their mutual information with the true hypothesis.
+
+The index of the true hypothesis and the readings have a mutual information; between hypotheses whose predictions are
+normal it has a lower bound in closed form, from the Bhattacharyya distance of each two (Kolchinsky & Tracey 2017,
+"Estimating mixture entropy with pairwise distances", Entropy 19, 361: Chernoff's divergence, alpha = 1/2). Scans are
+added greedily by information per minute, as long as there is information to gain.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.apparatus import (
+    ENOUGH_NATS,
+    MOST_READINGS,
+    NOTHING_NATS,
+    SETTLED,
+    Apparatus,
+    Command,
+    rows_by_command,
+)
+from probewise.diagnosis.evidence import covariance_root
+from probewise.diagnosis.fit import Fit, Model, residual_degrees_of_freedom
+from probewise.diagnosis.locate import Place
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.search.refits import WeighedFit
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.words import hypothesis_in_words
+from probewise.recordings.plan import Plan, Recording
+
+
+def slopes_split_by_run(slopes: FloatArray, of_run: IntArray, plan: Plan) -> tuple[FloatArray, FloatArray]:
+    """Split slopes of planned readings into those by values already fitted, and those by values of the new runs.
+
+    A planned run is predicted at the values of a recorded run, by whose coordinates the slopes are.
+
+    Parameters
+    ----------
+    slopes
+        Slopes by a model's coordinates, (n_points, n_params).
+    of_run
+        Indices of the coordinates of which each run has a value of its own, with a standard normal prior.
+    plan
+        The planned runs, (n_points,).
+
+    Returns
+    -------
+    The slopes with 0 in the columns `of_run`, (n_points, n_params); and, for each run and each of these columns that
+    acts there, a column that is 0 in all other runs, (n_points, n_columns).
+    """
+    shared = slopes.copy()
+    shared[:, of_run] = 0.0
+    if not of_run.size:
+        return shared, np.zeros((len(slopes), 0))
+    inside = plan.scan[:, None] == np.arange(len(plan.scan_names))  # (n_points, n_runs)
+    own = (inside[:, :, None] * slopes[:, None, of_run]).reshape(len(slopes), -1)
+    return shared, own[:, np.any(own != 0, axis=0)]
+
+
+_STRIDES = (2, 4)
+_PROMISING = 4  # scans per pair of rivals whose full predictive distribution is computed
+_ENOUGH = 40.0  # squared distance of predictions, in noise sds, beyond which more separation adds nothing
+_SETTLED = 0.05  # share of the entropy that may remain
+_LEAST_NOISE_2 = 1e-12  # of the largest variance of a reading
+_WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove
+_ANYTHING = 1e-6  # the same for the first scan
+NO_NAME = "what has no name"
+_NEAR = 0.05  # of a setting's range: how near a planned reading is to a recorded one that it repeats
+_LEAST_WEIGHT = 0.05  # least weight of a rival, since its probability may be wrong
+
+
+@dataclass(frozen=True, eq=False)
+class NextMeasurement:
+    """Scans to take next, as one plan, with the information that they are expected to give.
+
+    `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
+    true; rivals that the readings cannot tell apart count as one. `between`: each of the hypotheses, in words;
+    `effects`: the effects of each; `probabilities`: of each, as used here, (n_rivals,); `nats` (n_rivals, n_rivals):
+    expected log Bayes factor of each, if true, over each other. `minutes`: duration with breaks; of a table without a
+    time in a known unit, a guess of one second per row.
+    """
+
+    plan: Plan
+    description: str
+    minutes: float
+    expected_log_bayes_factor: float
+    between: tuple[str, ...]
+    effects: tuple[Names, ...]
+    probabilities: FloatArray
+    nats: FloatArray
+
+    def classes_among(self, hypotheses: Collection[Names]) -> list[list[int]]:
+        """Return the classes into which the readings separate some of the hypotheses, by their indices in `effects`.
+
+        Two hypotheses share a class if the expected log Bayes factor of one over the other is below `NOTHING_NATS`,
+        directly or through a chain of others. Hypotheses that were not compared are in no class.
+        """
+        return _classes_told_apart(self.nats, [k for k, names in enumerate(self.effects) if names in hypotheses])
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A hypothesis about the mean readings (not their noise): label, model with best point z (n_params,), probability.
+
+    `label` is its name in words; `root` (n_params, n_params) a square root of the covariance of z: root root^T.
+    `of_run` are the indices of the coordinates of which each run has a value of its own: in a new run it is not known.
+    """
+
+    label: str
+    model: Model
+    z: FloatArray
+    root: FloatArray
+    probability: float
+    of_run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def predictive_distribution(self, plan: Plan, sd: float) -> PredictiveNormal:
+        """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
+        mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
+        shared, own = slopes_split_by_run(slopes, self.of_run, plan)
+        return PredictiveNormal(mean / sd, np.concatenate([shared @ self.root, own], axis=1) / sd)
+
+
+@dataclass(frozen=True, eq=False)
+class PredictiveNormal:
+    """Normal predictive distribution in noise sds: mean (n_points,), covariance of the readings I + factor factor^T."""
+
+    mean: FloatArray
+    factor: FloatArray
+
+    def take_readings(self, rows: IntArray) -> PredictiveNormal:
+        """Return the predictive distribution of the readings with these row numbers."""
+        return PredictiveNormal(self.mean[rows], self.factor[rows])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the readings, (n_points, n_points).
+
+        The noise counts as at least 1e-6 of the largest sd: that of readings that are exact is lost to rounding.
+        """
+        of_factor = self.factor @ self.factor.T
+        noise_2 = max(1.0, _LEAST_NOISE_2 * float(of_factor.diagonal().max(initial=0.0)))
+        return np.asarray(noise_2 * np.eye(len(self.mean)) + of_factor)
+
+
+def measurement_separating_rivals(
+    rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Apparatus
+) -> NextMeasurement | None:
+    """Choose scans, of at most 102 readings in all, that separate the rivals; None if none is possible or informative.
+
+    Parameters
+    ----------
+    rivals
+        Two or more hypotheses.
+    sd
+        Noise sd of a reading, in the unit of the readings.
+    plan
+        The plan already measured.
+    apparatus
+        The apparatus that can measure more.
+    """
+    leader = max(rivals, key=lambda rival: rival.probability)
+    level = leader.model.predict(leader.z[None, :])[0]
+    offered = apparatus.candidate_measurements(plan, strides=_STRIDES, level=level)
+    weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
+    weights /= weights.sum()
+    offered = [offered[k] for k in _shortlisted_command_indices(rivals, sd, offered, plan, apparatus)]
+    if not offered:
+        return None
+    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
+    predictives = [rival.predictive_distribution(everywhere, sd) for rival in rivals]
+
+    chosen: list[int] = []
+    taken: IntArray = np.zeros(0, dtype=np.int64)
+    told, uncertain = 0.0, float(-np.sum(weights * np.log(weights)))
+    while uncertain - told > _SETTLED * uncertain:
+        gains = np.zeros(len(offered))
+        for k in range(len(offered)):
+            together = np.concatenate([taken, rows[k]])
+            if k not in chosen and len(together) <= MOST_READINGS:
+                gains[k] = (
+                    mutual_information_lower_bound(
+                        [predictive.take_readings(together) for predictive in predictives], weights
+                    )
+                    - told
+                )
+        gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
+        best = int(np.argmax(gains / [option.minutes for option in offered]))
+        if gains[best] == 0.0:
+            break
+        chosen.append(best)
+        taken, told = np.concatenate([taken, rows[best]]), told + gains[best]
+        if apparatus.takes_one_measurement_at_a_time:
+            break
+    if not chosen:
+        return None
+    scans = [offered[k] for k in chosen]
+    nats = _expected_log_bayes_factors([predictive.take_readings(taken) for predictive in predictives])
+    return NextMeasurement(
+        apparatus.plan_of_sequence(scans, plan),
+        "; then ".join(scan.description for scan in scans),
+        sum(scan.minutes for scan in scans),
+        _mean_over_closest(nats, weights),
+        tuple(rival.label for rival in rivals),
+        tuple(tuple(sorted(rival.model.names)) for rival in rivals),
+        weights,
+        nats,
+    )
+
+
+def measurement_at_place(
+    place: Place, null: Fit, everything: Recording, sd: float, plan: Plan, apparatus: Apparatus
+) -> NextMeasurement | None:
+    """Choose the readings that would show an unknown effect again, if it stays where its residuals lie.
+
+    A planned reading repeats the recorded one with the nearest settings, and its mean residual, if that is in the
+    place. The readings with most nats per minute are chosen, of those with three nats over no effect; None if none has.
+
+    Parameters
+    ----------
+    place
+        A place in all readings of `everything`, with its curve of mean residuals.
+    null
+        The null fit.
+    sd
+        Noise sd of a reading.
+    plan, apparatus
+        The plan already measured, and the apparatus that can measure more.
+    """
+    from scipy.spatial import KDTree  # a tenth of a second, which few diagnoses need
+
+    commands = apparatus.candidate_measurements(plan, strides=_STRIDES, level=null.model.predict(null.z[None, :])[0])
+    if not commands or place.values is None:
+        return None
+    usable = np.flatnonzero(everything.usable)
+    inside = place.rows_among(everything.plan, usable)
+    shown = np.where(inside, np.interp(place.values, place.curve_at, place.curve_mean) / sd, 0.0)
+    known = apparatus.settings_of(everything.plan.take(usable))
+    scale = np.ptp(known, axis=0)
+    varies = scale > 0
+    planned = apparatus.settings_of(apparatus.plan_of_alternatives(commands, plan))[:, varies] / scale[varies]
+    apart, nearest = KDTree(known[:, varies] / scale[varies]).query(planned, p=np.inf)
+    squares = np.where(apart <= _NEAR, shown[nearest], 0.0) ** 2
+    nats = np.array([0.5 * float(squares[rows].sum()) for rows in rows_by_command(commands)])
+    per_minute = np.where(nats >= ENOUGH_NATS, nats, 0.0) / [command.minutes for command in commands]
+    best = int(np.argmax(per_minute))
+    if per_minute[best] == 0.0:
+        return None
+    return NextMeasurement(
+        apparatus.plan_of_sequence([commands[best]], plan),
+        commands[best].description,
+        commands[best].minutes,
+        float(nats[best]),
+        (f"{apparatus.words.null} as calibrated", NO_NAME),
+        ((), ("unknown",)),
+        np.full(2, 0.5),
+        nats[best] * (1 - np.eye(2)),
+    )
+
+
+def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
+    """Return a lower bound on the mutual information of hypothesis and readings, in nats.
+
+    Parameters
+    ----------
+    predictives
+        Predictive distribution of the same readings under each hypothesis.
+    weights
+        Probabilities (n_hypotheses,), which sum to one.
+    """
+    covariances = [predictive.covariance for predictive in predictives]
+    log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
+    distances = np.zeros((len(predictives), len(predictives)))
+    for a, b in itertools.combinations(range(len(predictives)), 2):
+        middle, apart = (covariances[a] + covariances[b]) / 2, predictives[a].mean - predictives[b].mean
+        log_det = np.linalg.slogdet(middle)[1] - (log_dets[a] + log_dets[b]) / 2
+        distances[a, b] = distances[b, a] = apart @ np.linalg.solve(middle, apart) / 8 + log_det / 2
+    return float(-weights @ logsumexp(-distances, b=weights, axis=1))
+
+
+def _shortlisted_command_indices(
+    rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
+) -> list[int]:
+    """Return the indices of the four scans, for each pair of rivals, that separate it most per minute."""
+    if not offered:
+        return []
+    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
+    means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
+    minutes = np.array([option.minutes for option in offered])
+    leader = max(rivals, key=lambda rival: rival.probability)
+    model = replace(leader.model, plan=everywhere)
+    of_run = model.predict_and_differentiate(leader.z, by=leader.of_run)[1] / sd if leader.of_run.size else None
+    kept: dict[int, None] = {}
+    for a, b in itertools.combinations(range(len(rivals)), 2):
+        apart = means[a] - means[b]
+        squares = [_squared_distance(apart[own], None if of_run is None else of_run[own]) for own in rows]
+        # Separation beyond this adds nothing.
+        worth = np.minimum(squares, _ENOUGH) / minutes
+        kept |= dict.fromkeys(np.argsort(-worth, kind="stable")[:_PROMISING].tolist())
+    return list(kept)
+
+
+def _squared_distance(apart: FloatArray, of_run: FloatArray | None) -> float:
+    """Return the squared distance of predictions, in noise sds, that unknown values of one new run leave.
+
+    `apart` is the difference of the predictions, (n_points,), `of_run` the slopes by those values, (n_points, k).
+    """
+    square = float(apart @ apart)
+    if of_run is None:
+        return square
+    along = of_run.T @ apart
+    return square - float(along @ np.linalg.solve(np.eye(len(along)) + of_run.T @ of_run, along))
+
+
+def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> FloatArray:
+    """Return the expected log Bayes factor of each hypothesis, if true, over each other, (n, n), in nats."""
+    covariances = [predictive.covariance for predictive in predictives]
+    inverse = [np.linalg.inv(covariance) for covariance in covariances]
+    log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
+    out = np.zeros((len(predictives), len(predictives)))
+    for a, b in itertools.permutations(range(len(predictives)), 2):
+        apart = predictives[a].mean - predictives[b].mean
+        trace = float(np.sum(inverse[b] * covariances[a])) - len(apart)
+        out[a, b] = 0.5 * (trace + log_dets[b] - log_dets[a] + apart @ inverse[b] @ apart)
+    return out
+
+
+def _classes_told_apart(nats: FloatArray, members: Sequence[int]) -> list[list[int]]:
+    """Group members that the readings cannot tell apart, by their expected log Bayes factors, `nats` (n, n)."""
+    classes: list[list[int]] = []
+    for k in members:
+        alike = [own for own in classes if any(min(nats[k, j], nats[j, k]) < NOTHING_NATS for j in own)]
+        classes = [own for own in classes if own not in alike] + [sorted([k, *itertools.chain(*alike)])]
+    return sorted(classes)
+
+
+def _mean_over_closest(nats: FloatArray, weights: FloatArray) -> float:
+    """Return the log Bayes factor of the truth over its closest rival, averaged by weights (n,); `nats` (n, n).
+
+    Rivals in one class count as one, unless all rivals are in one class.
+    """
+    classes = _classes_told_apart(nats, range(len(nats)))
+    others = np.where(np.eye(len(nats), dtype=np.bool_), np.inf, nats)
+    for own in classes if len(classes) > 1 else []:
+        others[np.ix_(own, own)] = np.inf
+    return max(float(weights @ others.min(axis=1) / weights.sum()), 0.0)
+
+
+_MOST_RIVALS = 5
+
+
+def choose_next_measurement(
+    searched: Searched, null: WeighedFit, *, unknown_shows_in: Place | None, is_unknown: bool
+) -> NextMeasurement | None:
+    """Choose the readings that answer what is open; None if nothing is, or if none answers it.
+
+    What is open is which of the fewest hypotheses on the mean that hold .95 is true. So a leader with .95 needs no more
+    readings, however well these would confirm it; nor do aliases that have .95 together, since a plan is taken only if
+    it promises three nats between classes of hypotheses that it can tell apart. What has no name predicts nothing: if
+    it is the verdict (`is_unknown`), or the only rival of the null, the readings go where its residuals are largest,
+    `unknown_shows_in`, if anywhere.
+    """
+    prepared = searched.prepared
+    plan, apparatus = prepared.recording.plan, prepared.apparatus
+    by_mean = searched.posterior.marginal_over_noise
+    unknown = by_mean.get(("unknown",), 0.0)
+    # An unknown effect makes no prediction beyond the null.
+    probabilities: dict[Names, float] = {(): by_mean.get((), 0.0) + unknown}
+    probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
+    ranked = sorted(probabilities, key=lambda names: -probabilities[names])
+    found = _fits_of_open_hypotheses(searched, null, {names: probabilities[names] for names in ranked})
+    sd = found[0].whitened_sd
+    if is_unknown or (len(found) == 1 and found[0] is null and unknown > 1 - SETTLED):
+        if unknown_shows_in is None:
+            return None
+        return measurement_at_place(unknown_shows_in, null.found, prepared.everything, sd, plan, apparatus)
+    if is_settled(searched) or len(found) == 1:
+        return None
+    as_calibrated = f"{apparatus.words.null} as calibrated"
+    rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated, apparatus) for candidate in found]
+    asked = measurement_separating_rivals(rivals, sd, plan, apparatus)
+    return asked if asked is not None and asked.expected_log_bayes_factor >= ENOUGH_NATS else None
+
+
+def is_settled(searched: Searched) -> bool:
+    """Return whether one hypothesis on the mean, other than an unknown effect, has .95, whatever the noise."""
+    by_mean = searched.posterior.marginal_over_noise
+    return any(p >= SETTLED and names != ("unknown",) for names, p in by_mean.items())
+
+
+def _fits_of_open_hypotheses(searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]) -> list[WeighedFit]:
+    """Return the refits of the fewest hypotheses on the mean that hold .95, at most five, the most probable first."""
+    found: list[WeighedFit] = []
+    held = 0.0
+    for names, probability in ranked.items():
+        candidate = searched.best_refit_of(names, searched.certain) if names else null
+        if candidate is not None:
+            found.append(candidate)
+        held += probability
+        if found and (held >= SETTLED or len(found) == _MOST_RIVALS):
+            break
+    return found
+
+
+def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str, apparatus: Apparatus) -> Rival:
+    label, found = hypothesis_in_words(candidate.names, nothing=as_calibrated), candidate.found
+    of_run = apparatus.coordinates_of_new_run(found.model)
+    return Rival(label, found.model, found.z, _covariance_root_of_fit(candidate), probability, of_run)
+
+
+def _covariance_root_of_fit(candidate: WeighedFit) -> FloatArray:
+    """Return a square root of the covariance of a fit's coordinates under white noise, (n_params, n_params)."""
+    slopes, sd = candidate.found.slopes, candidate.whitened_sd
+    return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd, len(slopes)))

@@ -1,1 +1,0 @@
-"""Advice on the next measurement: aliased effects, possible scans, and the most informative of them."""

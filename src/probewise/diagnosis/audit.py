@@ -1,0 +1,739 @@
+"""Audit of a plan before any data: undetectable effects, aliased effects, and readings that would help.
+
+About a typical (or calibrated) sensor, every effect of the vocabulary becomes a set of templates at many settings, with
+the sensor's own parameters projected out. The norm of a projected template measures detectability; the cosine of two,
+how well they are separated: by lambda^2 (1 - cosine^2) / 2 nats. Cures are the fewest extra scans, chosen greedily.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Self, TypeAlias, get_args
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray, own_arithmetic, read_only_floats
+from probewise._display import ShowsItself
+from probewise._kinds import require_one_of
+from probewise.calibration import FittedSensor
+from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.arm_scans import Scan, candidate_scans, scan_started_after, target_swaps
+from probewise.diagnosis.diagnosis import Diagnosis
+from probewise.diagnosis.evidence import orthonormalise_groups
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
+from probewise.diagnosis.joining import join_plans
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.sensors import (
+    LEAST_READINGS,
+    CalibratedSensor,
+    FreeFormSensor,
+    SensorPrior,
+    default_sensor,
+    require_same_unit,
+    require_sensor_prior,
+    sensor_from_samples,
+)
+from probewise.diagnosis.templates import templates_of_effect
+from probewise.diagnosis.words import substitute_reading_unit
+from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.errors import ParameterError
+from probewise.progress import Progress, silent
+from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
+from probewise.sensor import Stage, is_free_form
+
+LAMBDA = 8.0  # size of an effect at which a plan is judged
+LEAST_NATS = 3.0  # least evidence that separates two effects
+ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which the evidence is LEAST_NATS
+LEAST_SHARE = 0.05  # least share of an effect's template that the sensor's parameters must not absorb
+_MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
+
+
+def nats_from_cosine(cosine: float) -> float:
+    """Return the expected log Bayes factor between two effects of lambda 8 with this cosine of projected templates."""
+    return 0.5 * LAMBDA**2 * (1 - cosine**2)
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedSensor:
+    """The expected sensor: `null` with its prior, point `z` (n_params,) of linearisation, low and high level, sd."""
+
+    null: Null
+    z: FloatArray
+    levels: tuple[float, float]
+    sd: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlanTemplates:
+    """The templates of all effects under one plan: changes of its readings, in noise sds.
+
+    `columns` (n_points, n_columns) are grouped in entries: one for each setting (parameter values) of an effect's
+    bank. `entry` (n_columns,) is the entry of each column, `owner` (n_entries,) the index of its effect in `names`,
+    `settings` its parameter values. `slopes` (n_points, n_params) are those of the sensor. `built`: effects by name.
+    """
+
+    slopes: FloatArray
+    columns: FloatArray
+    entry: IntArray
+    owner: IntArray
+    names: tuple[str, ...]
+    built: Mapping[str, NamedEffect[Any]]
+    settings: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(
+        cls,
+        expected: ExpectedSensor,
+        plan: Plan,
+        effects: Mapping[str, type[NamedEffect[Any]]],
+        *,
+        most: int | None = None,
+    ) -> Self:
+        """Scale the effects to a plan and build their templates, without effects on the noise or that cannot act there.
+
+        Each has at most `most` settings, evenly spread; by default as many as hold two million numbers, but 64 or more.
+        """
+        extent = Extent(*expected.levels, plan)
+        maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
+        return cls.of_scaled_effects(
+            expected, plan, {name: effect for name, effect in maybe.items() if effect is not None}, most=most
+        )
+
+    @classmethod
+    def of_scaled_effects(
+        cls, expected: ExpectedSensor, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
+    ) -> Self:
+        """Build the templates of effects that are already scaled to the plan, as `of` does."""
+        most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
+        model = Model(expected.null, (), plan)
+        predicted, slopes = model.predict_and_differentiate(expected.z)
+        found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, sd=expected.sd, objective=0.0)
+        columns = [np.zeros((len(plan), 0))]
+        settings: list[FloatArray] = []
+        owner: list[int] = []
+        for at, effect in enumerate(built.values()):
+            if effect.stage is Stage.NOISE:
+                continue
+            templates = templates_of_effect(found, effect, np.arange(len(plan)), most=most)
+            columns += templates.columns
+            settings += templates.settings
+            owner += [at] * len(templates.columns)
+        entry = np.repeat(np.arange(len(settings)), [c.shape[1] for c in columns[1:]])
+        return cls(
+            slopes / expected.sd,
+            np.concatenate(columns, axis=1) / expected.sd,
+            entry,
+            np.array(owner, dtype=np.int64),
+            names=tuple(built),
+            built=built,
+            settings=tuple(settings),
+        )
+
+    def norms_of_entries(self, columns: FloatArray) -> FloatArray:
+        """Return the root of the sum of squares of each entry's columns, (n_points, n_columns) -> (n_entries,)."""
+        return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectedTemplates:
+    """Templates on some rows with the sensor's parameters projected out, in noise sds: `left` (n_rows, n_columns).
+
+    Rows are `n_points` readings, then one for each parameter's prior. `basis` holds each entry's columns
+    orthonormalised; `raw` and `kept` (n_entries,) are the norms before and after the projection.
+    """
+
+    laid: PlanTemplates
+    left: FloatArray
+    basis: FloatArray
+    raw: FloatArray
+    kept: FloatArray
+    n_points: int
+
+    @classmethod
+    def of(cls, laid: PlanTemplates, rows: IntArray) -> Self:
+        """Project the sensor's parameters, with their prior, out of the templates on these row numbers."""
+        slopes, columns = laid.slopes[rows], laid.columns[rows]
+        n_points, n_params = slopes.shape
+        own, _ = np.linalg.qr(np.concatenate([slopes, np.eye(n_params)]))
+        left = -own @ (own[:n_points].T @ columns)
+        left[:n_points] += columns
+        return cls(
+            laid,
+            left,
+            _orthonormalise_entries(left, laid.entry),
+            laid.norms_of_entries(columns),
+            laid.norms_of_entries(left),
+            n_points,
+        )
+
+    def detectable_shares_and_cosines(
+        self, asked: Sequence[str] | None = None
+    ) -> dict[str, tuple[float, dict[str, float]]]:
+        """Return, by effect, its detectable share (of the norm), and its cosine to every other effect, by name.
+
+        Both are medians over the effect's settings; the cosine is to the best-imitating setting of the other effect.
+        Only effects in `asked` have cosines, by default all, and only between shares of 0.05 or more.
+        """
+        laid = self.laid
+        present = {name: self._active_entry_indices(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
+        shares = {
+            name: float(np.median(self.kept[mine] / self.raw[mine])) if mine.size else 0.0
+            for name, mine in present.items()
+        }
+        visible = [name for name, share in shares.items() if share >= LEAST_SHARE]
+        wanted = [name for name in (visible if asked is None else asked) if name in visible]
+        out: dict[str, tuple[float, dict[str, float]]] = {name: (share, {}) for name, share in shares.items()}
+        if not wanted:
+            return out
+        mine = np.concatenate([present[name] for name in wanted])
+        columns = np.flatnonzero(np.isin(laid.entry, mine))
+        onto = (self.basis.T @ self.left[:, columns]) ** 2  # of each column, on every direction of the others
+        onto = np.add.reduceat(onto, _run_start_indices(laid.entry), axis=0)
+        onto = np.add.reduceat(onto, _run_start_indices(laid.entry[columns]), axis=1)
+        mine = np.unique(laid.entry[columns])
+        best = np.maximum.reduceat(onto, _run_start_indices(laid.owner), axis=0) / np.maximum(
+            self.kept[mine] ** 2, 1e-300
+        )
+        cosines = np.sqrt(np.minimum(best, 1.0))
+        owners = [laid.names[k] for k in laid.owner[_run_start_indices(laid.owner)]]
+        for name in wanted:
+            typical = np.median(cosines[:, laid.owner[mine] == laid.names.index(name)], axis=1)
+            like = dict(zip(owners, typical.tolist(), strict=True))
+            out[name] = (shares[name], {other: like[other] for other in visible if other != name})
+        return out
+
+    def _active_entry_indices(self, effect: int) -> IntArray:
+        """Return the indices of the entries of an effect, given by its index, that act on these rows."""
+        mine = np.flatnonzero(self.laid.owner == effect)
+        return mine[self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)]
+
+    def smallest_detectable_amplitudes(self, effect: NamedEffect[Any]) -> tuple[float | None, ...]:
+        """Return each amplitude's value at which an effect has lambda 8, median over settings; None if it has none."""
+        at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
+        columns = np.flatnonzero(np.isin(self.laid.entry, at))
+        settings = np.concatenate([self.laid.settings[k] for k in at])
+        lengths = np.linalg.norm(self.left[:, columns], axis=0)
+        out: list[float | None] = []
+        for k in effect.amplitudes:
+            significant = (settings[:, k] != 0) & (lengths > 1e-3)
+            sizes = np.abs(settings[significant, k]) * LAMBDA / lengths[significant]
+            out.append(float(np.median(sizes)) if sizes.size else None)
+        return tuple(out)
+
+
+def _run_start_indices(codes: IntArray) -> IntArray:
+    return np.flatnonzero(np.diff(codes, prepend=-1))
+
+
+def _orthonormalise_entries(columns: FloatArray, entry: IntArray) -> FloatArray:
+    """Orthonormalise each entry's columns; directions below a thousandth of the longest become zero."""
+    out = np.zeros_like(columns)
+    widths = np.bincount(entry)
+    for width in np.unique(widths):  # all entries of one width at a time
+        mine = np.flatnonzero(widths[entry] == width)
+        out[:, mine], _ = orthonormalise_groups(columns[:, mine], int(width), least=1e-18, share=1e-6)
+    return out
+
+
+Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
+
+_MOST_READINGS = 4000  # readings of a recording that are used; of a longer one every second, third, ...
+_LINE = 100  # characters of a line of the summary
+_SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis
+_LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
+_READING_GUIDE = (
+    "(fine: detected, and told from every other effect. aliased (X c): detected, but X can imitate it, with a cosine",
+    " of c; the reverse need not hold. invisible: not detected.)",
+)
+_NOISE = 0.01  # noise as a share of the span between the levels, likewise
+# Two Gaussians, a core and a faint halo, off-centre and not round, so that no effect is invisible by symmetry.
+_TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.2, 0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class DetectableSize:
+    """The value of one amplitude (`amount` in `unit`) that gives an effect lambda 8; None if no value does.
+
+    Lambda is the norm of the effect's change of the readings in noise sds, after a refit of the sensor.
+    """
+
+    parameter: str
+    unit: str
+    amount: float | None
+
+
+@dataclass(frozen=True)
+class EffectAudit:
+    """Detectability of one effect under a plan: fine, aliased or invisible.
+
+    Fine: the readings detect the effect and tell it from every other. Aliased: another effect imitates it with a cosine
+    of 0.95 or more (at lambda 8 less than 3 nats apart). Invisible: it cannot act here, or the sensor's own parameters
+    absorb over 95 % of its change of the readings. An effect on the noise is fine from 24 readings on, else invisible.
+
+    Attributes
+    ----------
+    name, detectability
+        The effect, and whether it is invisible, aliased or fine.
+    share
+        Share of its change of the readings that the model's parameters do not absorb, median over its settings; 0 if it
+        cannot act here. Of a noise effect: 1 if fine, 0 if invisible.
+    alike
+        Effects that imitate a typical setting of this one, with cosines, largest first.
+    smallest
+        The value of each amplitude at which it has lambda 8 (norm in noise sds, after a refit).
+    reason
+        Why it is invisible, or "".
+    rows
+        Number of rows like these that detect it if it changes readings by one noise sd rms; None if not computed.
+    """
+
+    name: str
+    detectability: Detectability
+    share: float
+    alike: tuple[tuple[str, float], ...] = ()
+    smallest: tuple[DetectableSize, ...] = ()
+    reason: str = ""
+    rows: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Cure:
+    """One scan to add: description, plan, duration in minutes, and the effects that it makes fine.
+
+    `kind` is "repeat", "reverse", "respeed", "rotate", "relight", "raise", "across" or, with another sheet, "lay".
+    """
+
+    kind: str
+    description: str
+    plan: Plan
+    minutes: float
+    cured: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanAudit(ShowsItself):
+    """Audit of a plan: which effects its readings detect and tell apart, and scans to add for the others.
+
+    Attributes
+    ----------
+    plan
+        The plan.
+    assumed
+        The assumed sensor, in words.
+    effects, after
+        Every effect, under the plan and under the plan with all cures.
+    cosines
+        Cosine of each effect (row) with its best imitation by each other (column), (n_effects, n_effects), in the order
+        of `effects`; on the diagonal, the detectable share.
+    cures
+        Scans to add, in the order chosen.
+    words
+        Words for the apparatus.
+    classes
+        Groups of effects aliased with one another; None if not requested.
+    """
+
+    plan: Plan
+    assumed: str
+    effects: tuple[EffectAudit, ...]
+    cosines: FloatArray
+    cures: tuple[Cure, ...]
+    after: tuple[EffectAudit, ...]
+    words: Words = LightSensorApparatus.words
+    classes: tuple[tuple[str, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cosines", read_only_floats(self.cosines))
+
+    def effects_with_detectability(
+        self, detectability: Detectability, *, after: bool = False
+    ) -> tuple[EffectAudit, ...]:
+        """Return the effects that are "fine", "aliased" or "invisible" under the plan, or `after` all cures.
+
+        Raises
+        ------
+        ParameterError
+            If `detectability` is none of the three.
+        """
+        require_one_of("detectability", detectability, get_args(Detectability))
+        return tuple(
+            effect for effect in (self.after if after else self.effects) if effect.detectability == detectability
+        )
+
+    @property
+    def cure_plan(self) -> Plan | None:
+        """All cures as one plan; None if there are none."""
+        if not self.cures:
+            return None
+        return join_plans([cure.plan for cure in self.cures])
+
+    @property
+    def extra_readings(self) -> int:
+        """Number of readings of the cures."""
+        return sum(len(cure.plan) for cure in self.cures)
+
+    @property
+    def extra_minutes(self) -> float:
+        """Duration of the cures in minutes, including the breaks before each scan."""
+        return sum(cure.minutes for cure in self.cures)
+
+    def summary(self) -> str:
+        """Return a plain-text summary of the audit."""
+        n_runs = len(self.plan.scan_names)
+        lines = [f"{len(self.plan)} readings in {n_runs} {self.words.run}{'' if n_runs == 1 else 's'}; {self.assumed}"]
+        lines += _wrapped_lines("fine", [e.name for e in self.effects_with_detectability("fine")])
+        lines += _wrapped_lines("aliased", [_name_with_alias(e) for e in self.effects_with_detectability("aliased")])
+        lines += _wrapped_lines("invisible", [e.name for e in self.effects_with_detectability("invisible")])
+        lines += _READING_GUIDE
+        if not self.cures:
+            cured = (
+                "not needed"
+                if len(self.effects_with_detectability("fine")) == len(self.effects)
+                else self.words.no_cure
+            )
+            return "\n".join([*lines, f"cure       {cured}"])
+        minutes = "1 minute" if self.extra_minutes < 1.5 else f"{self.extra_minutes:.0f} minutes"
+        lines.append(f"cure       {self.extra_readings} more readings, about {minutes}:")
+        for k, cure in enumerate(self.cures, start=1):
+            so_that = ", ".join(cure.cured) or "prepares the next"
+            said = f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}"
+            lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
+        left = [e.name for e in self.after if e.detectability != "fine"]
+        return "\n".join([*lines, *_wrapped_lines("left", left or ["nothing"])])
+
+
+def _name_with_alias(effect: EffectAudit) -> str:
+    return f"{effect.name} ({effect.alike[0][0]} {effect.alike[0][1]:.2f})"
+
+
+def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:
+    """Write a list of names after a label, in lines of up to 100 characters; no lines without names."""
+    lines, line = [], f"{label:<10} "
+    for k, name in enumerate(names):
+        piece = name + (", " if k + 1 < len(names) else "")
+        if len(line) + len(piece) > _LINE:
+            lines.append(line.rstrip())
+            line = " " * 11
+        line += piece
+    return [*lines, line.rstrip()] if names else []
+
+
+@own_arithmetic
+def audit_plan(
+    plan: Plan | Recording,
+    *,
+    sensor: SensorPrior | None = None,
+    noise_sd: float | None = None,
+    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    progress: Progress = silent,
+) -> PlanAudit:
+    """Determine for each effect whether a plan detects it and tells it from every other, and which readings would help.
+
+    Parameters
+    ----------
+    plan
+        The plan to be measured, or that of a recording.
+    sensor
+        A calibrated sensor, whose posterior becomes the prior; None: a typical one.
+    noise_sd
+        Noise of one reading, in its unit; None: the calibrated sensor's, or a hundredth of the span between black and
+        white.
+    effects
+        The vocabulary, by name.
+    progress
+        Called for the plan, before each choice of a cure, and for the plan with each cure.
+
+    Returns
+    -------
+    PlanAudit
+        Detectability of every effect, and up to five scans to add.
+
+    Raises
+    ------
+    ParameterError
+        If the plan has no row, or an undescribed pattern, or another unit than the sensor, or the noise is not above 0.
+    """
+    if isinstance(plan, Recording):
+        plan = plan.plan
+    require_plan(plan)
+    if sensor is not None:
+        require_sensor_prior(sensor)
+    if len(plan) == 0:
+        raise ParameterError("plan", "no row", "at least one")
+    require_patterns_described(plan)
+    if sensor is not None:
+        require_same_unit(sensor, plan)
+    if noise_sd is None and isinstance(sensor, FittedSensor):
+        noise_sd = float(sensor.noise_sd.mean())
+    expected, said = _expected_sensor_and_description(plan, sensor, noise_sd)
+    unit = plan.instrumentation.unit
+    progress("judging the plan")
+    before, cosines = audits_and_cosines(PlanTemplates.of(expected, plan, effects), effects, unit)
+    ailing = [effect.name for effect in before if effect.detectability != "fine"]
+    chosen = choose_cure_scans(plan, expected, effects, ailing, progress)
+    steps, current = [before], plan
+    for k, command in enumerate(chosen):
+        progress("judging the plan with its cures", k, len(chosen))
+        current = join_plans([current, command.plan])
+        steps.append(audits_and_cosines(PlanTemplates.of(expected, current, effects), effects, unit)[0])
+    cured = _curing_step_by_effect(steps)
+    n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
+    cures = tuple(
+        Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
+        for k, c in enumerate(chosen[:n_kept], start=1)
+    )
+    return PlanAudit(plan, said, before, cosines, cures, steps[n_kept])
+
+
+def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
+    """Return, for each effect that added scans make fine to the end, the number of scans (1, 2, ...) from which it is.
+
+    `steps` are the audits with 0, 1, 2, ... scans added; scans after the last one that cures do not count.
+    """
+    fine = [{effect.name for effect in step if effect.detectability == "fine"} for step in steps]
+
+    def fine_since(last: int) -> dict[str, int]:
+        names = [effect.name for effect in steps[0] if effect.name in fine[last] - fine[0]]
+        return {name: max(k for k in range(last) if name not in fine[k]) + 1 for name in names}
+
+    return fine_since(max(fine_since(len(steps) - 1).values(), default=0))
+
+
+def audit_plan_of_diagnosis(
+    diagnosis: Diagnosis,
+    *,
+    sensor: SensorPrior | None = None,
+    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+) -> PlanAudit:
+    """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
+
+    Parameters
+    ----------
+    diagnosis
+        Diagnosis of a light sensor over known patterns; of more than 4,000 usable readings, every second (third, ...).
+    sensor
+        The earlier sensor that was the prior of the diagnosis, if any.
+    effects
+        The vocabulary, by name.
+    """
+    known, usable = diagnosis.null, np.flatnonzero(diagnosis.recording.usable)
+    plan = diagnosis.recording.plan.take(usable[:: -(-len(usable) // _MOST_READINGS)])
+    names, mean = list(known.chain.names), known.theta.mean(axis=0)
+    low, high = (float(mean[names.index(name)]) for name in ("I_min", "I_max"))
+    low, high = _in_order(low, high)
+    extent = Extent.of(diagnosis.recording)
+    own = mean[None, : 6 * known.n_gaussians + 2]
+    null: CalibratedSensor
+    if sensor is not None:
+        null = sensor_from_samples(sensor)
+    elif is_free_form(own[:, :-2]):
+        null = FreeFormSensor.from_one_gaussian(default_sensor(extent, 1))
+    else:
+        null = default_sensor(extent, known.n_gaussians)
+    z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
+    expected = ExpectedSensor(null, z, (low, high), float(known.noise_sd.mean()))
+    effects_seen, cosines = audits_and_cosines(
+        PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
+    )
+    return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
+
+
+def _in_order(low: float, high: float) -> tuple[float, float]:
+    """Return two levels in rising order, apart by a little at least if they are equal."""
+    low, high = min(low, high), max(low, high)
+    return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
+
+
+def _expected_sensor_and_description(
+    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None
+) -> tuple[ExpectedSensor, str]:
+    """Return the expected sensor, and its description in words with its noise sd."""
+    if sensor is not None:
+        mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
+        null = sensor_from_samples(sensor)
+        z = np.zeros(null.n_params)
+        low, high = (float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
+        low, high = _in_order(low, high)
+        said = "the sensor as calibrated"
+    else:
+        inst = plan.instrumentation
+        bottom, top = (0.0 if inst.min is None else inst.min), (100.0 if inst.max is None else inst.max)
+        span = top - bottom if top > bottom else 1e-6
+        low, high = (bottom + share * span for share in _LEVELS)
+        null = default_sensor(Extent(low, high, plan), 2)
+        z = _TYPICAL.copy()
+        said = f"a typical sensor of {low:g} to {high:g}"
+    sd = _NOISE * (high - low) if noise_sd is None else noise_sd
+    if not sd > 0:
+        raise ParameterError("noise_sd", sd, "greater than 0")
+    return ExpectedSensor(
+        null, z, (low, high), sd
+    ), f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
+
+
+def audits_and_cosines(
+    laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
+) -> tuple[tuple[EffectAudit, ...], FloatArray]:
+    """Return the audit of every effect, and the matrix of cosines (row imitated by column; shares on the diagonal)."""
+    seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
+    detectability = seen.detectable_shares_and_cosines()
+    names = list(effects)
+    cosines = np.zeros((len(names), len(names)))
+    out = []
+    for own, name in enumerate(names):
+        effect = laid.built.get(name)
+        if effect is None:
+            out.append(EffectAudit(name, "invisible", 0.0, reason="its covariate does not vary here"))
+        elif effect.stage is Stage.NOISE:
+            enough = seen.n_points >= LEAST_READINGS
+            reason = "" if enough else f"{seen.n_points} readings do not show the scatter; {LEAST_READINGS} would"
+            out.append(EffectAudit(name, "fine" if enough else "invisible", float(enough), reason=reason))
+        else:
+            share, like = detectability[name]
+            for other, cosine in like.items():
+                cosines[own, names.index(other)] = cosine
+            out.append(_audit_of_effect(effect, share, like, seen.smallest_detectable_amplitudes(effect), unit))
+        cosines[own, own] = out[-1].share
+    return tuple(out), cosines
+
+
+def _audit_of_effect(
+    effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...], unit: str
+) -> EffectAudit:
+    if share < LEAST_SHARE:
+        reason = "the model's own parameters absorb it" if share > 0 else "it leaves no trace here"
+        return EffectAudit(effect.name, "invisible", share, reason=reason)
+    alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
+    smallest = tuple(
+        DetectableSize(effect.prior.names[k], substitute_reading_unit(effect.units[k], unit), amount)
+        for k, amount in zip(effect.amplitudes, amounts, strict=True)
+    )
+    return EffectAudit(effect.name, "aliased" if alike else "fine", share, tuple(alike), smallest)
+
+
+_MOST_SETTINGS = 48  # bank entries per effect, since a hundred scans are tried at every step
+_MOST_SCANS = 5
+_WORTHWHILE = 0.15  # least reduction of the summed deficit by an added scan
+_WORTHWHILE_EACH = 0.005  # and per reading: at most 200 readings are spent on one effect
+_STRIDES = (1, 4)
+
+
+def choose_cure_scans(
+    plan: Plan,
+    expected: ExpectedSensor,
+    effects: Mapping[str, type[NamedEffect[Any]]],
+    ailing: Sequence[str],
+    progress: Progress = silent,
+) -> list[Scan]:
+    """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
+
+    They are timed one after another, in the order chosen. The deficit of an effect is 0 if it is detected and told from
+    others, up to 1 if aliased, 1 to 2 if invisible.
+
+    Parameters
+    ----------
+    plan
+        The plan.
+    expected
+        The expected sensor.
+    effects
+        The vocabulary, by name.
+    ailing
+        Names of the effects that are aliased or invisible under the plan.
+    progress
+        Called before every choice.
+    """
+    every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
+    chosen: list[Scan] = []
+    current = plan
+    while len(chosen) < _MOST_SCANS:
+        progress("looking for readings that cure", len(chosen), _MOST_SCANS)
+        taken = {command.plan.scan_names for command in chosen}
+        offered = [c for c in every if c.plan.scan_names not in taken]
+        options = [scan_started_after(command, current) for command in offered]
+        if not options:
+            break
+        together = join_plans([current, *(option.plan for option in options)])
+        laid = PlanTemplates.of(expected, together, effects, most=_MOST_SETTINGS)
+        now = np.arange(len(current))
+        trouble = _total_detectability_deficit(laid, now, ailing)
+        worth = []
+        for start, end in itertools.pairwise(np.cumsum([len(current), *(len(o.plan) for o in options)]).tolist()):
+            gained = trouble - _total_detectability_deficit(laid, np.concatenate([now, np.arange(start, end)]), ailing)
+            readings = end - start
+            worth.append(gained / readings if gained >= max(_WORTHWHILE, _WORTHWHILE_EACH * readings) else 0.0)
+        best = int(np.argmax(worth))
+        if worth[best] == 0.0:
+            break
+        chosen.append(options[best])
+        current = join_plans([current, options[best].plan])
+    return chosen
+
+
+def _total_detectability_deficit(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
+    """Return the summed deficit of the ailing effects on these rows: 0 fine, up to 1 aliased, 1 to 2 invisible."""
+    detectability = ProjectedTemplates.of(laid, rows).detectable_shares_and_cosines(ailing)
+    total = 0.0
+    for name in ailing:
+        share, like = detectability.get(name, (0.0, {}))
+        if share < LEAST_SHARE:
+            total += 2.0 - share / LEAST_SHARE
+        else:
+            total += max(1.0 - nats_from_cosine(max(like.values(), default=0.0)) / LEAST_NATS, 0.0)
+    return total
+
+
+CURE_PLAN = "cure_plan.csv"
+
+
+def audit_json(audit: PlanAudit) -> dict[str, Any]:
+    """Convert an audit to the content of audit.json.
+
+    The `amount` of a smallest size is null if no size is detectable, `cure` if there is none; `rows` and alias classes
+    that were not computed are left out.
+    """
+    plan = audit.cure_plan
+    return {
+        "format": "audit/1",
+        "readings": len(audit.plan),
+        "assumed": audit.assumed,
+        "effects": _effects_json(audit.effects),
+        "cure": None
+        if plan is None
+        else {
+            "plan": CURE_PLAN,
+            "readings": len(plan),
+            "minutes": audit.extra_minutes,
+            "scans": [
+                {
+                    "kind": cure.kind,
+                    "description": cure.description,
+                    "scan": cure.plan.scan_names[0],
+                    "readings": len(cure.plan),
+                    "cures": list(cure.cured),
+                }
+                for cure in audit.cures
+            ],
+        },
+        "after": _effects_json(audit.after),
+        **({} if audit.classes is None else {"alias_classes": [list(names) for names in audit.classes]}),
+    }
+
+
+def _effects_json(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": effect.name,
+            "sight": effect.detectability,
+            "surviving_share": effect.share,
+            "alike": [{"effect": name, "cosine": cosine} for name, cosine in effect.alike],
+            "smallest": [{"parameter": s.parameter, "unit": s.unit, "amount": s.amount} for s in effect.smallest],
+            "reason": effect.reason,
+            **({} if effect.rows is None else {"rows": effect.rows}),
+        }
+        for effect in effects
+    ]

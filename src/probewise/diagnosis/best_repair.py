@@ -1,0 +1,345 @@
+"""The refitted hypothesis that repairs the model, its gain over the null, and a correction where it has no name.
+
+The correction, by basis functions, is a Gaussian process of finite rank: amplitudes have normal priors, and the model's
+own parameters are refitted along with the amplitudes. It applies to the recording's rows and covariates only, and names
+no physics, so sensor.json does not contain it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.evidence import SCALES, Linearised
+from probewise.diagnosis.fit import Fit, fit_each_start
+from probewise.diagnosis.held_out import (
+    HeldOutGain,
+    held_out_gain,
+    mean_gain_over_parts,
+    partition_into_blocks,
+    sequential_log_densities,
+)
+from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_memory import walk_given_readings
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.search.refits import WeighedFit
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.templates import TemplateBank
+from probewise.diagnosis.verdict import GlobalTest, Judged
+from probewise.recordings.plan import Recording
+
+
+def fit_under_noise(candidate: WeighedFit, law: NoiseLaw, recording: Recording) -> Fit:
+    """Return a candidate's fit, repeated under a noise distribution if that or its own contains a random walk.
+
+    A walk begins at 0 before the first row: it ties the mean to the first readings and leaves it far from the others.
+    So a fit with a walk shows no model without one, and other noise hardly moves a fit. Without a walk, the null's
+    starts are tried too.
+    """
+    found, own = candidate.found, candidate.law
+    if not (law.walk.size or own.walk.size) or law.is_practically_equal(own):
+        return found
+    sensor = found.model.sensor
+    starts = [found.z]
+    if not law.walk.size:
+        starts += [np.concatenate([start, found.z[sensor.n_params :]]) for start in sensor.starts]
+    again = min(fit_each_start(found.model, recording, starts, law), key=lambda each: each.objective)
+    return again if np.isfinite(again.objective) else found
+
+
+def residuals_beside_walk(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
+    """Return residuals without the random walk that they all together show, if the noise has one, (n_usable,)."""
+    return residuals - walk_given_readings(law, residuals)
+
+
+N_DRAWS = 499
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The gain of the repaired model over the null.
+
+    `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading,
+    `heldout_by_scan` the mean by part; rms residuals (`Recording.rms`) in the unit of the readings, beside a random
+    walk if the noise has one; `p_value_after` of the global test of the repaired model.
+    """
+
+    log_evidence: float
+    heldout_log_density_per_reading: float
+    heldout_sd: float
+    heldout_by_scan: tuple[tuple[str, float], ...]
+    rms_before: float
+    rms_after: float
+    p_value_after: float
+
+
+def improvement_of(
+    searched: Searched,
+    test: GlobalTest,
+    best: WeighedFit,
+    noise: Names,
+    after: Linearised,
+    *,
+    shown: tuple[Fit, Fit],
+    rng: np.random.Generator,
+) -> Improvement:
+    """Measure the gain of the best fit over the null: in evidence and, under the same noise, on held-out parts, in rms.
+
+    Parameters
+    ----------
+    searched, test
+        Result of the search; global test of the null.
+    best, noise, after
+        The best fit, its noise model, and its linearisation.
+    shown
+        The null and the best fit under that noise.
+    rng
+        Random generator, for the null distribution of the test of the repaired model.
+    """
+    null = test.null
+    law = best.evidence[noise].likeliest_law
+    rms = [searched.prepared.recording.rms(residuals_beside_walk(found.residuals, law)) for found in shown]
+    log_evidence = best.evidence[noise].log_z - null.evidence[searched.certain].log_z
+    if best is null:
+        return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value_after=test.p_value)
+    prepared = searched.prepared
+    parts = prepared.apparatus.held_out_parts(prepared.recording)
+    # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
+    own = null.evidence[null.possible_noise(noise)].likeliest_law
+    own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
+    held = held_out_gain(*shown, prepared.recording, law, parts, law_of_null=own)
+    p_after = bayes_factor_p_value(
+        after, searched.template_banks_for_global_test(best.found), after.draw_null_residuals(N_DRAWS, rng=rng)
+    )
+    return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_value_after=p_after)
+
+
+_RUIN = -1.0  # nats per held-out reading below which named effects are withdrawn
+
+
+@dataclass(frozen=True, eq=False)
+class BestRepair:
+    """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null.
+
+    `calibrated` and `repaired`: the null and that fit as they are under the noise found, which figures show.
+    `out_of_vocabulary`: if the verdict is `unknown`, its effects with a formula but no name in the vocabulary.
+    """
+
+    fit: WeighedFit
+    noise: Names
+    problem: Linearised
+    improvement: Improvement
+    calibrated: Fit
+    repaired: Fit
+    out_of_vocabulary: Names = ()
+
+    @classmethod
+    def of(
+        cls,
+        searched: Searched,
+        test: GlobalTest,
+        fit: WeighedFit,
+        noise: Names,
+        *,
+        out_of_vocabulary: Names = (),
+        rng: np.random.Generator,
+    ) -> BestRepair:
+        """Build from a fit and its noise effects, and measure the fit's gain over the null."""
+        noise = fit.possible_noise(noise)
+        law, recording = fit.evidence[noise].likeliest_law, searched.prepared.recording
+        repaired = fit_under_noise(fit, law, recording)
+        calibrated = repaired if fit is test.null else fit_under_noise(test.null, law, recording)
+        after = Linearised.of(repaired, law)
+        gain = improvement_of(searched, test, fit, noise, after, shown=(calibrated, repaired), rng=rng)
+        return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
+
+
+def predicts_far_worse(gain: Improvement) -> bool:
+    """Return whether a repair predicts held-out readings worse than the null by over one nat per reading."""
+    return gain.heldout_log_density_per_reading < _RUIN
+
+
+def judged_and_best_repair(
+    searched: Searched, test: GlobalTest, judged: Judged, *, rng: np.random.Generator
+) -> tuple[Judged, BestRepair]:
+    """Choose the fit that belongs to a verdict; the null if nothing was found.
+
+    Returns
+    -------
+    The verdict, withdrawn if the named effects predict held-out readings far worse; and the fit.
+    """
+    null, noise = test.null, test.noise
+    if judged.verdict == "unknown":
+        leading = searched.leading_combination_out_of_vocabulary()
+        fit = (
+            searched.best_refit_of(leading, noise) if leading else searched.likeliest_fit_beside_unknown(noise)
+        ) or null
+        return judged, BestRepair.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
+    on_noise = searched.prepared.noise_effect_names
+    if judged.verdict in ("named", "noise", "clean"):
+        stated = tuple(name for name in judged.repaired_by if name in on_noise)
+        noise = searched.posterior.likeliest_noise(stated)
+    on_mean = tuple(name for name in judged.repaired_by if name not in on_noise)
+    best = BestRepair.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
+    if judged.verdict == "named" and predicts_far_worse(
+        best.improvement
+    ):  # a fit that fails on held-out readings is no repair
+        return judged.with_verdict_withdrawn(), BestRepair.of(searched, test, null, noise, rng=rng)
+    return judged, best
+
+
+_ABOUT_EQUAL = 5.0  # nats
+_MOST_BASES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """A correction: `change` of the readings (n_usable,), by basis `columns` (n_usable, k), and gain when held out."""
+
+    change: FloatArray
+    columns: FloatArray
+    held_out: HeldOutGain
+
+    @property
+    def gains_nothing(self) -> bool:
+        """Whether the correction fails to improve predictions of held-out readings, where there are any."""
+        return bool(self.held_out.by_scan) and self.held_out.per_reading <= 0
+
+
+def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, part: IntArray) -> Correction:
+    """Return the correction of a fit by one basis, with its gain on held-out parts.
+
+    Of the bases whose evidence is within 5 nats of the best, that of the fewest columns is taken.
+
+    Parameters
+    ----------
+    found, problem
+        The fit, and its linearisation under the noise model found.
+    bases
+        The candidate bases, as templates of several columns.
+    part
+        Number of the part of each usable row, to hold parts out in turn, (n_usable,).
+    """
+    scores = bases.log_bayes_factors(problem)[:, 0]
+    # Among bases of about equal evidence, the one with the fewest columns: a basis with one amplitude per scan cannot
+    # predict the next scan.
+    rivals = np.flatnonzero(scores > scores.max() - _ABOUT_EQUAL)
+    columns = bases[min(map(int, rivals), key=lambda i: (int(bases.widths[i]), -float(scores[i])))]
+    norms = np.sqrt(np.mean(columns**2, axis=0))
+    columns = columns[:, norms > 0] / norms[norms > 0]
+    plain = np.zeros((len(columns), 0))
+    amount, _ = _amounts_and_covariance(found, problem, columns, np.ones(len(columns), dtype=np.bool_))
+    change = np.concatenate([found.slopes, columns], axis=1) @ amount
+
+    def gain_per_reading(out: BoolArray) -> FloatArray:
+        return _held_out_log_densities(found, problem, columns, out) - _held_out_log_densities(
+            found, problem, plain, out
+        )
+
+    return Correction(change, columns, mean_gain_over_parts(part, gain_per_reading))
+
+
+def improvement_and_correction(
+    searched: Searched, test: GlobalTest, best: BestRepair, *, rng: np.random.Generator
+) -> tuple[Improvement, FloatArray]:
+    """Correct the residuals of the best fit by basis functions, if this improves held-out predictions.
+
+    Bases are added one at a time, at most six, until the global test finds nothing or the next one gains less than the
+    gain's sd. If the first gains nothing on other scans, blocks within scans are held out instead, for residuals that
+    are local in time. Where nothing can be held out, one basis is added without that check.
+
+    Returns
+    -------
+    improvement, change
+        The improvement of `best` including the correction, and the correction of the usable readings, (n_usable,).
+    """
+    prepared, bases, problem = searched.prepared, searched.misfit_templates.unknown_bases, best.problem
+    found, gain = best.repaired, best.improvement
+    parts, part_names = prepared.apparatus.held_out_parts(prepared.recording)
+    fixed = correct_by_best_basis(found, problem, bases, parts)
+    if fixed.gains_nothing:
+        parts, part_names = partition_into_blocks(prepared.recording)
+        fixed = correct_by_best_basis(found, problem, bases, parts)
+        gain = replace(gain, heldout_by_scan=())
+    change = np.zeros(len(fixed.change))
+    if fixed.gains_nothing:
+        return best.improvement, change
+    plain_z = test.null.evidence[test.null.possible_noise(best.noise)].log_z
+    key = (best.fit.n_gaussians, best.fit.names, best.noise)
+    log_evidence = searched.evidences.unknown.get(key, plain_z) - plain_z
+    for step in range(_MOST_BASES):
+        if step:
+            fixed = correct_by_best_basis(found, problem, bases, parts)
+        held = fixed.held_out
+        if step and held.per_reading <= held.sd:
+            break
+        found = replace(
+            found,
+            residuals=found.residuals - fixed.change,
+            slopes=np.concatenate([found.slopes, fixed.columns], axis=1),
+            z=np.concatenate([found.z, np.zeros(fixed.columns.shape[1])]),
+        )
+        change = change + fixed.change
+        problem = Linearised.of(found, problem.law)
+        before = dict(gain.heldout_by_scan)
+        by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
+        gain = replace(
+            gain,
+            log_evidence=log_evidence,
+            heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
+            heldout_sd=math.hypot(gain.heldout_sd, held.sd),
+            heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
+            rms_after=searched.prepared.recording.rms(residuals_beside_walk(found.residuals, problem.law)),
+            p_value_after=bayes_factor_p_value(
+                problem,
+                searched.template_banks_for_global_test(best.fit.found),
+                problem.draw_null_residuals(N_DRAWS, rng=rng),
+            ),
+        )
+        if gain.p_value_after >= ALARM or not held.by_scan:
+            break
+    return gain, change
+
+
+def _amounts_and_covariance(
+    found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Fit shifts of the parameters, and amplitudes, to the `kept` readings; return means and covariance of both.
+
+    Readings count by their own sd and by what they have in common with others; lost ones do not count.
+    """
+    sd, p, law = problem.sd, found.slopes.shape[1], problem.law.take_readings(kept)
+    design = law(np.concatenate([found.slopes, columns], axis=1)[kept])
+    left = law(found.residuals[kept])
+    center = np.concatenate([-found.z, np.zeros(columns.shape[1])])
+    # Amplitudes first have a wide prior, then one with their own common size as scale (empirical Bayes): the
+    # uncertainty for a new scan equals the scatter of the known ones.
+    size = sd * SCALES[5]
+    for _ in range(3):
+        precision = np.concatenate([np.ones(p), np.full(columns.shape[1], size**-2)])
+        covariance = np.linalg.inv(design.T @ design / sd**2 + np.diag(precision))
+        amount = covariance @ (design.T @ left / sd**2 + precision * center)
+        if columns.shape[1] > 1:
+            size = max(float(np.sqrt(np.mean(amount[p:] ** 2))), 1e-3 * sd)
+    return np.asarray(amount), np.asarray(covariance)
+
+
+def _held_out_log_densities(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
+    """Return the log density of each held-out reading from a correction fitted to the others, 0 for lost ones."""
+    law = problem.law.without_tail_or_rounding()
+    amount, covariance = _amounts_and_covariance(found, problem, columns, ~out)
+    design = np.concatenate([found.slopes, columns], axis=1)
+    rest, own = law.take_readings(~out), law.take_readings(out)
+    kept_miss = rest((found.residuals - design @ amount)[~out])
+    sigma_2 = float(kept_miss @ kept_miss) / max(rest.n_kept - design.shape[1], 1)
+    if law.has_memory:
+        return sequential_log_densities(law, out, found.residuals, design, amount, covariance, sigma_2)
+    miss = (found.residuals - design @ amount)[out]
+    total = sigma_2 * own.sd**2 + np.einsum("ij,jk,ik->i", design[out], covariance, design[out])
+    # At an end of the range a likelihood is relative to its peak, as for fits (`held_out_gain`).
+    peak = np.where(own.is_censored, 0.0, -0.5 * np.log(2 * math.pi * total))
+    return np.asarray((peak - 0.5 * miss**2 / total) * own.kept)

@@ -1,0 +1,390 @@
+"""Diagnosis of a user's simulator against a table: fit it, scale the effects to the fit, run the engine.
+
+The integration step is chosen for the residuals of the law without effects. The repaired law's are smaller, and its
+predictions may change by more than their noise where the step is halved: then what has a chance is refitted at a finer
+step, or the search is made again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+from scipy.special import ndtr
+
+from probewise._arrays import FloatArray, own_arithmetic
+from probewise._kinds import require_progress, require_rng
+from probewise.diagnosis.diagnosis import Diagnosis
+from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
+from probewise.diagnosis.fit import Fit, Model
+from probewise.diagnosis.left_out import (
+    NEAR_END,
+    readings_near_ends,
+    recording_from_table,
+    without_readings_at_scattered_stop,
+    without_readings_at_stop,
+    without_readings_near_ends,
+    without_unpredictable_readings,
+)
+from probewise.diagnosis.noise_law import NoiseLaw, white_noise_of_recording
+from probewise.diagnosis.outlying import find_lost_readings
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.search.refits import WeighedFit
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.thorough import A_NAT
+from probewise.diagnosis.simulator_fit import fit_system, is_noise_sd_known_beside_misfit
+from probewise.diagnosis.simulator_rows import CALLS_OF_A_SEARCH, SimulatorApparatus
+from probewise.effects import NamedEffect
+from probewise.errors import NotConvergedError, ParameterError
+from probewise.priors import LogUniform, Normal, Uniform
+from probewise.progress import Progress, silent
+from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, table_for
+from probewise.systems.calls import IntegrationTally
+from probewise.systems.forms import ReferenceFit
+from probewise.systems.forms.binding import sorting_column
+from probewise.systems.forms.reference import note_on_row_order
+from probewise.systems.system import STANDS_STILL, with_converged_step
+
+_FAR = 4.0  # sds; if the truth is at the end of its prior, one recording in 30,000 is this far beyond it
+_MUCH = 1.1  # factor by which the noise differs from what was declared
+
+
+def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterator[str]:
+    """Yield a note on each parameter of a fitted system, without effects, whose prior the readings contradict.
+
+    With the prior of one parameter removed, the readings alone move its standard-normal coordinate z by a step, known
+    to within an sd; both are linear approximations. A bounded prior is uniform in the probability Phi(z), so its end is
+    Phi(-|z|) / phi(z) away, measured in z.
+    """
+    slopes = law(found.slopes[:, : system.n_params]) / found.sd
+    z, curvature = found.z[: system.n_params], slopes.T @ slopes + np.eye(system.n_params)
+    downhill = slopes.T @ law(found.residuals[:, None])[:, 0] / found.sd - z
+    covariance = np.linalg.inv(curvature)
+    variance = np.diag(covariance)
+    with np.errstate(all="ignore"):  # of what the readings do not tell: no number, and no note
+        # Row k of the inverse without the prior of parameter k is that with it over 1 - variance (Sherman-Morrison).
+        steps = (covariance @ downhill + z * variance) / (1 - variance)
+        sds = np.sqrt(variance / (1 - variance))
+    for k, (name, prior) in enumerate(system.marginals.items()):
+        step, sd = float(steps[k]), float(sds[k])
+        if isinstance(prior, Uniform | LogUniform):
+            end = float(ndtr(-abs(z[k])) / (np.exp(-0.5 * z[k] ** 2) / np.sqrt(2 * np.pi)))
+            if np.sign(z[k]) * step - end > _FAR * sd:
+                where, more = ("upper", "larger") if z[k] > 0 else ("lower", "smaller")
+                yield f"{name} is at the {where} end of its prior, {prior}, but the readings ask for a {more} value"
+        elif isinstance(prior, Normal):
+            away = z[k] + step
+            if abs(away) > _FAR * np.hypot(1, sd):
+                way = "above" if away > 0 else "below"
+                yield f"the readings ask for {name} {abs(away):.1f} sds {way} the mean of its prior, {prior}"
+
+
+def notes_on_declared_noise(simulator: Simulator, noise_sd: FloatArray) -> Iterator[str]:
+    """Yield a note if samples of the noise sd, (n_samples,), contradict the number that was declared."""
+    declared = simulator.noise.sd
+    if declared is None or isinstance(declared, str):
+        return
+    mean, sd = float(np.mean(noise_sd)), float(np.std(noise_sd))
+    if abs(mean - declared) > max(_FAR * sd, (_MUCH - 1) * declared):
+        unit = f" {simulator.unit}" if simulator.unit else ""
+        yield f"the noise sd of a reading is {mean:.3g} ± {sd:.1g}{unit}, though {declared:g} was declared"
+
+
+@own_arithmetic
+def diagnose_system(
+    simulator: Simulator,
+    table: RunTable | Mapping[str, Any],
+    *,
+    source: str = "",
+    notes: Sequence[str] = (),
+    thorough: Thorough | None = None,
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> Diagnosis:
+    """Diagnose which physics a simulator leaves out, from a table of readings.
+
+    Parameters
+    ----------
+    simulator
+        The model that predicts the readings.
+    table
+        The recorded rows, with the predicted column: a table, a dict of arrays, or a DataFrame.
+    source, notes
+        Name of the table, and notes on it for the report.
+    thorough
+        As in `diagnose`.
+    rng
+        Source of randomness.
+    progress
+        Called with each stage, and with the number of calls of `simulate`.
+
+    Returns
+    -------
+    Diagnosis
+        As that of `diagnose`.
+
+    Raises
+    ------
+    ParameterError
+        If the table lacks a column that the simulator names, has too few readings, or time falls within a run; if
+        readings are not finite, or change when `simulate` is called again; or if no affordable step integrates the law.
+    FileError
+        If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
+    ShapeError
+        If `simulate` or `observe` does not return one reading per row.
+    NotConvergedError
+        If the fit of the simulator did not converge.
+    """
+    table = table_for(simulator, table)
+    require_rng(rng)
+    require_progress(progress)
+
+    def fit_and_diagnose(simulator: Simulator, *, stiff: bool = False) -> tuple[Searched, Diagnosis]:
+        prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
+        told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
+        searched = search_prepared(prepared, progress=told)
+        return searched, diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
+
+    searched, diagnosis = fit_and_diagnose(simulator)
+    needed = finer_step_for_repair(diagnosis)
+    if needed is None:
+        return diagnosis
+    step, stiff = needed
+    assert simulator.law is not None
+    progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
+    finer = searched_at_step(searched, step, stiff=stiff, progress=progress)
+    if finer is not None:
+        return diagnosis_of_search(finer, thorough=thorough, progress=progress, rng=rng)
+    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff)[1]
+
+
+def prepare_system(
+    simulator: Simulator,
+    table: RunTable,
+    *,
+    source: str = "",
+    notes: Sequence[str] = (),
+    progress: Progress = silent,
+    with_effects: bool = True,
+    stiff: bool = False,
+) -> Prepared:
+    """Fit the simulator, and build the engine's input; effects are scaled to the fit, none unless `with_effects`.
+
+    A law is integrated by a linearly implicit method if `stiff`, or where it needs one.
+    """
+    recording = replace(
+        recording_from_table(simulator, table),
+        source=source or simulator.source,
+        notes=(*table.notes, *notes, *note_on_row_order(simulator, table)),
+    )
+    system = System.of(simulator, table, stiff=stiff)
+    if with_effects and len(table) < 2:  # nothing can change along it
+        raise ParameterError("the table", "one row", f"{system.least_readings} rows or more, not all readings equal")
+    plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)
+    if recording.plan is not plan:
+        table = replace(table, columns=cast(RunTable, recording.plan).columns)
+    recording, stop = without_readings_at_stop(simulator, table, recording)
+    if not recording.usable.any():
+        raise ParameterError(
+            "usable readings", 0, f"{system.least_readings} or more; column {simulator.reading} has none"
+        )
+    n_within = int((recording.usable & ~recording.censored).sum())
+    if recording.censored.any() and n_within < system.least_readings:
+        allowed = f"{system.least_readings} or more: readings at its ends do not determine the noise"
+        raise ParameterError("readings within the declared range", n_within, allowed)
+    told = _progress_with_call_count(progress, system)
+    told("fitting the simulator")
+    if stop is None:
+        recording, stop = without_readings_at_scattered_stop(system, recording)
+    plain = system
+    system, found, sd = fit_system(plain, recording)
+    first = SimulatorApparatus(ReferenceFit(system, table, found.z, sd))
+    lost = find_lost_readings(
+        found.model,
+        recording,
+        found,
+        list(system.starts),
+        lambda fitted: first.covariates_and_predicted_slope(fitted, recording)[0],
+        sd=sd,
+    )
+    effect = None if lost is None else lost.effect(recording)
+    if lost is not None:
+        told("fitting the simulator without lost readings")
+        recording = cast(RunRecording, lost.left_out_of(recording))
+        system, found, sd = fit_system(plain, recording)
+    near_ends = readings_near_ends(system, found, sd, recording)
+    if near_ends.any():
+        recording = without_readings_near_ends(system, recording, near_ends)
+        known = is_noise_sd_known_beside_misfit(simulator, table)
+        system = replace(system, first=found.z, slack=NEAR_END * sd if known else 0.0)
+        system, found, sd = fit_system(system, recording)
+    misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
+    conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
+    recording = replace(recording, notes=(*recording.notes, *conflicts))
+    apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop, lost=effect)
+    sorting = sorting_column(apparatus.about)
+    if sorting is not None:
+        note = f"rows are sorted by {sorting}: what jumps or wanders from row to row may change with {sorting} instead"
+        recording = replace(recording, notes=(*recording.notes, note))
+    begun = replace(system, first=found.z)
+    told("building the effects")
+    effects = apparatus.effects(recording, begun) if with_effects else {}
+    return Prepared(recording, effects, begun, apparatus, recording)
+
+
+def _progress_with_call_count(progress: Progress, system: System) -> Progress:
+    """Return a progress that also shows the number of calls of `simulate`, if the system has this function."""
+    return progress if system.caller is None else ProgressWithCallCount(progress, system.caller)
+
+
+def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return notes on calls of a simulator or integration of its law (cut short, failed, interpolated, stiff); else ().
+
+    With those on its declared noise.
+    """
+    apparatus = diagnosis.apparatus
+    if not isinstance(apparatus, SimulatorApparatus):
+        return ()
+    white = diagnosis.report.noise.model == "white"
+    out = [*notes_on_declared_noise(apparatus.system.simulator, diagnosis.repaired.noise_sd)] if white else []
+    caller, tally = apparatus.system.caller, apparatus.system.tally
+    if caller is None:
+        law = apparatus.system.simulator.law
+        sets_step = law is not None and law.max_step_s is not None
+        return (*out, *_notes_on_integration(tally, apparatus.evaluations_of_a_search, sets_step=sets_step))
+    if caller.cut_short:
+        out.append(
+            f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls some promising combinations of "
+            "effects were not fitted; if simulate takes arrays, the search is complete"
+        )
+    if caller.n_failed:
+        out.append(f"simulate raised an error for {caller.n_failed:,} parameter vectors, which count as impossible")
+    if caller.interpolated:
+        names = ", ".join(sorted(caller.interpolated))
+        out.append(
+            f"simulate takes no array of {names}: each reading is interpolated between fixed values, as if the "
+            "parameter had had that row's value from the start; if earlier rows affect later ones, let simulate take "
+            "arrays, or write a law"
+        )
+    return tuple(out)
+
+
+def _notes_on_integration(tally: IntegrationTally, most: int, *, sets_step: bool) -> Iterator[str]:
+    if tally.cut_short:
+        way_out = "a larger max_step_s, shorter runs" if sets_step else "shorter runs"
+        yield (
+            f"integrating the law takes long: after {most:,} evaluations of its rates some promising combinations of "
+            f"effects were not fitted; with {way_out} or fewer rows the search is complete"
+        )
+    if tally.too_stiff:
+        yield (
+            "the law is stiff: parameters that may fit the readings would need more integration steps than are taken, "
+            "and count as impossible; their intervals may be too narrow; set a shorter max_step_s, or write simulate "
+            "with an integrator of your own"
+        )
+    if tally.n_failed:
+        yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"
+
+
+_N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
+_HAS_A_CHANCE = 0.01  # probability from which a combination is refitted at the finer step
+
+
+def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
+    """Return the finer integration step that the repaired law needs, or the finest within reach, and if it is stiff.
+
+    None if the step used was fine enough, or the simulator has no law, or the repair no effects.
+    """
+    system = cast(SimulatorApparatus, diagnosis.apparatus).system
+    model, table = diagnosis.repaired, cast(RunTable, diagnosis.recording.plan)
+    effects = cast(Sequence[NamedEffect[Any]], model.chain.effects)
+    if system.simulator.law is None or not effects:
+        return None
+    tolerance = STANDS_STILL * float(np.median(model.noise_sd))
+    try:
+        theta = model.theta[:_N_HALVED]
+        still = with_converged_step(system, table, theta, effects, tolerance=tolerance, or_finest=True)
+    except ParameterError:  # a friction or a bound that no step meets exactly
+        return None
+    needed = still.max_step, still.stiff
+    return needed if needed != (system.max_step, system.stiff) else None
+
+
+def searched_at_step(
+    searched: Searched, max_step: float, *, stiff: bool = False, progress: Progress = silent
+) -> Searched | None:
+    """Return a search with the combinations that have a chance refitted at another step, from their own parameters.
+
+    None if one of them, the most probable first, gains or loses more than a nat: then errors of the integration may
+    have led the search, and it has to be made again.
+
+    Parameters
+    ----------
+    searched
+        The search of a law.
+    max_step, stiff
+        The step, in the unit of time, and whether a linearly implicit method takes it.
+    progress
+        Called at every refit.
+    """
+    prepared = searched.prepared
+    apparatus = cast(SimulatorApparatus, prepared.apparatus)
+    finer = replace(cast(System, prepared.null), max_step=max_step, stiff=stiff)
+    fits, unknown = dict(searched.evidences.fits), dict(searched.evidences.unknown)
+    with_a_chance = _combinations_with_a_chance(searched)
+    asked = [*with_a_chance, *([] if () in with_a_chance else [()])]  # the null is part of every report
+    keys = [key for names in asked for key in searched.evidences.fits if key[1] == names]
+    for k, key in enumerate(keys):
+        progress("refitting at a finer step", k, len(keys))
+        held = searched.evidences.fits[key]
+        try:
+            again = _refitted(searched, held, finer)
+        except NotConvergedError:
+            return None
+        moved = {noise: again.evidence[noise].log_z - e.log_z for noise, e in held.evidence.items()}
+        if key[1] in with_a_chance and not abs(again.log_z - held.log_z) < A_NAT:
+            return None
+        fits[key] = again
+        unknown |= {
+            (n, names, noise): value + moved[noise]
+            for (n, names, noise), value in unknown.items()
+            if (n, names) == key and math.isfinite(moved[noise])
+        }
+    return replace(
+        searched,
+        prepared=replace(
+            prepared,
+            null=finer,
+            apparatus=replace(apparatus, finer=replace(apparatus.system, max_step=max_step, stiff=stiff)),
+        ),
+        nulls=dict.fromkeys(searched.nulls, finer),
+    ).with_evidences(replace(searched.evidences, fits=fits, unknown=unknown))
+
+
+def _combinations_with_a_chance(searched: Searched) -> list[Names]:
+    """List the refitted combinations with a probability of 0.01 or more, most probable first.
+
+    With or without an unknown effect beside: if that is probable, so are the fits that it is most probable beside.
+    """
+    chance = searched.posterior.marginal_over_noise
+    unknown, beside = chance.get(("unknown",), 0.0), dict[Names, float]()
+    for (_, names, _), value in searched.evidences.unknown.items():
+        beside[names] = max(value + searched.prior.log_prior_with_unknown(names), beside.get(names, -math.inf))
+    most = max(beside.values(), default=0.0)
+    refitted = dict.fromkeys(names for _, names in searched.evidences.fits)
+    own = {
+        names: max(chance.get(names, 0.0), unknown * math.exp(beside.get(names, -math.inf) - most))
+        for names in refitted
+    }
+    return sorted((names for names in refitted if own[names] >= _HAS_A_CHANCE), key=lambda names: -own[names])
+
+
+def _refitted(searched: Searched, held: WeighedFit, system: System) -> WeighedFit:
+    """Refit a combination over another system of the same parameters, from where it was."""
+    model = Model(system, held.found.model.effects, held.found.model.plan)
+    again = searched.refits.fit_and_weigh(model, held.found.z[None, :], held.law)
+    return again.with_variant_factor_and_weights(held.log_share, held.weights)

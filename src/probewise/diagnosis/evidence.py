@@ -1,0 +1,568 @@
+"""Laplace evidence of a fit under noise models, and closed-form Bayes factors of templates to add to it.
+
+The nodes of a noise model's prior serve every fit. Many readings determine the noise better than its nodes lie apart:
+all nodes miss the peak, the evidence is too low, and the tests of the fit assume a noise that is wrong. There adaptive
+Gauss-Hermite quadrature (Naylor & Smith 1982) finds the peak and puts three nodes there along each such parameter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import log_ndtr, logsumexp
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.fit import Fit, log_multiplicity, residual_degrees_of_freedom
+from probewise.diagnosis.noise_law import NoiseLaw, stacked_density
+from probewise.diagnosis.noise_models import NoiseModel, NoiseNodes
+from probewise.effects import NoiseEffect
+from probewise.sensor.stages import effects_with_columns
+
+SCALES = np.geomspace(0.05, 25.0, 8)
+"""Prior scales of an effect's rms, in noise sds: a mixture with a heavy tail."""
+
+LEAST_VISIBLE = 4.0
+"""Least size (lambda) of a detectable effect: there the test at level .01 has a power above one half."""
+
+_INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
+
+
+_ROUNDING = 1e-12
+_MOST_NUMBERS = 4_000_000  # numbers in memory, for the slopes under several noise models
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseEvidence:
+    """Log evidence of a fit under one noise model, in total and by node (a setting of the model's parameters).
+
+    An impossible model (none of its nodes fits these readings) has no nodes and log evidence minus infinity.
+    """
+
+    noise: NoiseModel
+    log_z: float
+    log_z_nodes: FloatArray
+    nodes: NoiseNodes
+
+    @property
+    def weights(self) -> FloatArray:
+        """Posterior probability of each node, (n_nodes,)."""
+        return np.exp(self.log_z_nodes - logsumexp(self.log_z_nodes))
+
+    def likeliest_nodes_of_effect(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Return the (up to) four likeliest settings of one noise effect, (n_nodes, n_params), and log prior weights.
+
+        These weights are raised by a constant, so that the evidence of the returned settings alone is that of all.
+        """
+        own = self.nodes.settings[:, self.noise.columns_of_effect(name)]
+        settings, node_of = np.unique(own, axis=0, return_inverse=True)
+        node_of = node_of.ravel()
+        weights = np.bincount(node_of, self.weights)
+        top = float(self.nodes.log_weights.max())
+        log_prior = top + np.log(np.bincount(node_of, np.exp(self.nodes.log_weights - top)))
+        best = np.argsort(-weights)[:4]
+        return settings[best], log_prior[best] - math.log(float(weights[best].sum()))
+
+    @property
+    def likeliest_law(self) -> NoiseLaw:
+        """Noise distribution at the most probable node."""
+        return self.nodes.laws[int(np.argmax(self.log_z_nodes))]
+
+    @property
+    def with_likeliest_node_alone(self) -> NoiseEvidence:
+        """A copy with the most probable node alone; `log_z` remains that of all nodes."""
+        at = [int(np.argmax(self.log_z_nodes))]
+        own = NoiseNodes(self.nodes.settings[at], (self.likeliest_law,), self.nodes.log_weights[at])
+        return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], own)
+
+
+def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
+    """Integrate a fit's likelihood over its parameters and the noise sd (Laplace) and the nodes of the noise model.
+
+    At each node the linearised model moves the fit to its new optimum, which avoids the bias of residuals fitted as if
+    white. If the floor of the sd exceeds the residuals, the integral over the sd is taken as wide as without a floor.
+    """
+    every = noise.nodes_for_predictions(found.predicted)
+    out = log_evidence_under(found, every.laws) + every.log_weights
+    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every)
+
+
+def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw]) -> FloatArray:
+    """Return the log evidence of a fit under each noise distribution, (n_laws,); minus infinity if impossible."""
+    joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
+    if not np.isfinite(joined).all():  # a fit at the edge of what its formula predicts
+        return np.full(len(laws), -math.inf)
+    out = np.empty(len(laws))
+    normal = [node for node, law in enumerate(laws) if law.whitened_density.is_normal]
+    chunk = max(_MOST_NUMBERS // joined.size, 1)
+    for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
+        out[nodes] = _normal_log_evidences(found, [laws[node] for node in nodes], joined)
+    tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # grouped by whitening, rounded noise separately
+    for node in sorted({*range(len(out))} - {*normal}):
+        law = laws[node]
+        tailed.setdefault((law.whitening_key, law.flat > 0), []).append(node)
+    for nodes in tailed.values():
+        out[nodes] = _tailed_log_evidences(found, [laws[node] for node in nodes], joined)
+    out += np.array([law.log_extra for law in laws]) + log_multiplicity(found.model.sensor)
+    out[np.isnan(out)] = -math.inf  # slopes or residuals whose squares overflow: impossible
+    return out
+
+
+def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
+    """Return a square root of the Laplace covariance of a fit's coordinates, (n_params, n_params).
+
+    Arguments: whitened slopes (n_points, n_params), and the variance of a whitened reading.
+    """
+    curvature = slopes.T @ slopes / variance + np.eye(slopes.shape[1])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(curvature)).T)
+
+
+def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
+    """Return the log evidence under Gaussian noise, (n_laws,); `joined` (n_points, n_params + 1): slopes, residual."""
+    p, n_points = joined.shape[1] - 1, np.array([law.n_kept for law in laws])
+    if any(law.walk.size or law.before.size for law in laws):
+        turned = np.stack([law(joined) for law in laws])
+    else:
+        turned = joined * np.stack([law.kept / law.sd for law in laws])[:, :, None]
+    if any(law.carry.any() for law in laws) and not any(law.walk.size or law.before.size for law in laws):
+        carry = np.stack([law.carry for law in laws])[:, 1:, None]
+        turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
+    gram = turned.transpose(0, 2, 1) @ turned
+    jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
+    steps, least = np.zeros_like(jr), np.array([law.sigma_floor**2 for law in laws])
+
+    def sums_of_squares() -> FloatArray:
+        rss = rr - 2 * np.sum(steps * jr, axis=1) + np.einsum("lp,lpq,lq->l", steps, jj, steps)
+        return np.asarray(np.maximum(rss, 0.0))
+
+    for _ in range(3):
+        variance = np.maximum(sums_of_squares() / n_points, least)
+        curvature = jj / variance[:, None, None] + np.eye(p)
+        steps = _newton_steps(curvature, jr / variance[:, None] - found.z)
+    fit_and_prior = _laplace_terms(found.z + steps, curvature, n_points) - [law.half_log_det() for law in laws]
+    rss = sums_of_squares()
+    variance = np.maximum(rss / n_points, least)
+    misfit = 0.5 * n_points * np.log(variance) + 0.5 * rss / variance
+    return np.asarray(fit_and_prior - misfit + 0.5 * np.log(math.pi / n_points))
+
+
+def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
+    """Return the log evidence, (n_laws,), under noise models that whiten alike but differ in tail or rounding."""
+    turned = laws[0](joined)
+    p, n_points = turned.shape[1] - 1, laws[0].n_kept
+    slopes, residual = turned[:, :p], turned[:, p:]
+    gram = slopes.T @ slopes
+    tail, least = stacked_density(laws), laws[0].sigma_floor
+    steps, sigma = np.zeros((p, len(laws))), tail.likeliest_sigma(residual, n_points, floor=least)
+    for _ in range(3):
+        left = residual - slopes @ steps
+        sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
+        variance = sigma**2 / tail.fisher_information
+        curvature = gram / variance[:, None, None] + np.eye(p)
+        downhill = slopes.T @ tail.normal_pseudo_residuals(left, sigma) / variance - found.z[:, None] - steps
+        steps += _newton_steps(curvature, downhill.T).T
+    left = residual - slopes @ steps
+    sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
+    fit_and_prior = _laplace_terms((found.z[:, None] + steps).T, curvature, n_points) - laws[0].half_log_det()
+    scale = 0.5 * np.log(2 * math.pi / tail.log_sigma_curvature(left, sigma, n_points))
+    return np.asarray(fit_and_prior - tail.minus_log_likelihood(left, sigma, n_points) + scale)
+
+
+def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+    """Return the Newton steps to the modes, (n_laws, n_params); `downhill` are minus the gradients."""
+    try:
+        return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
+    except np.linalg.LinAlgError:  # readings fitted exactly: the prior is lost in rounding
+        size = np.trace(curvature, axis1=1, axis2=2)[:, None, None] / curvature.shape[1]
+        ridge = _ROUNDING * size * np.eye(curvature.shape[1])
+        return np.asarray(np.linalg.solve(curvature + ridge, downhill[:, :, None])[:, :, 0])
+
+
+def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
+    """Return the log evidence without the misfit, (n_laws,), for modes z (n_laws, n_params) and their curvatures."""
+    widths = -0.5 * np.linalg.slogdet(curvature)[1]
+    return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A fit linearised to a Gaussian problem with its parameters, including their prior, projected out.
+
+    Rows are the whitened readings in units of the noise sd, then one row for each parameter's prior, and one more if
+    the sd is known. Under the null every row is standard normal, so that residuals are drawn by projection alone.
+    """
+
+    basis: FloatArray  # Q of the augmented slopes, (n_rows, n_params)
+    residual: FloatArray  # P r, (n_rows,)
+    law: NoiseLaw
+    sd: float
+    n_points: int
+
+    @classmethod
+    def of(cls, found: Fit, law: NoiseLaw, beside: FloatArray | None = None) -> Linearised:
+        """Linearise a fit under noise `law`; `beside` are slopes (n_points, k) by additional coordinates of 0."""
+        law, slopes, z = law.without_readings_beyond_end(found.residuals), found.slopes, found.z
+        if beside is not None:
+            slopes, z = np.concatenate([slopes, beside], axis=1), np.concatenate([z, np.zeros(beside.shape[1])])
+        n_points, p = slopes.shape
+        whitened = law(found.residuals)[:, None]
+        turned, sigma = law(slopes), law.likeliest_sigma(whitened)
+        known = bool(law.flat) or (law.least > 0 and float(sigma[0]) <= law.sigma_floor)
+        sigma = np.where(sigma > 0, sigma, found.sd)
+        free = residual_degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.fisher_information), law.n_kept)
+        sigma = sigma if known else sigma * math.sqrt(law.n_kept / free)
+        sd = float(sigma[0]) / math.sqrt(law.fisher_information)
+        basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
+        augmented = np.concatenate([law.bounded_pseudo_residuals(whitened, sigma)[:, 0] / sd, -z])
+        residual = augmented - basis @ (basis.T @ augmented)
+        if known:
+            # Rounded readings carry less information, which must not make the noise sd smaller.
+            rest = math.sqrt(max(free - float(residual @ residual), 0.0))
+            basis, residual = np.concatenate([basis, np.zeros((1, p))]), np.append(residual, rest)
+        return cls(basis, residual, law, sd, n_points)
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(self.basis)
+
+    @property
+    def n_kept(self) -> int:
+        """Number of readings that are not lost; rows of lost ones are 0 and carry no information."""
+        return self.law.n_kept
+
+    def whiten(self, columns: FloatArray) -> FloatArray:
+        """Whiten columns of readings and divide them by the noise sd, (n_points, k) both."""
+        return self.law(columns) / self.sd
+
+    def project(self, columns: FloatArray) -> FloatArray:
+        """Whiten columns of readings (n_points, k) and project the fit's parameters out: (n_rows, k)."""
+        return self.project_whitened(self.whiten(columns))
+
+    def project_whitened(self, whitened: FloatArray) -> FloatArray:
+        """Project the fit's parameters out of columns in units of the noise sd: (n_points, k) -> (n_rows, k)."""
+        out = -self.basis @ (self.basis[: self.n_points].T @ whitened)
+        out[: self.n_points] += whitened
+        return out
+
+    def absorbing_shift(self, found: Fit, change: FloatArray) -> FloatArray:
+        """Return the shift of coordinates, (n_params,), at which predictions plus `change` (n_points,) fit best."""
+        slopes = self.whiten(found.slopes)
+        left = self.law(found.residuals - change)[:, None]
+        normal = self.law.normal_pseudo_residuals(left, np.array([self.sd * math.sqrt(self.law.fisher_information)]))[
+            :, 0
+        ]
+        shift = slopes.T @ (normal / self.sd) - found.z
+        return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
+
+    def draw_null_residuals(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw projected residuals under the null, in noise sds, (n_rows, n_draws)."""
+        eps = np.concatenate(
+            [
+                self.law.draw_pseudo_residuals(n_draws, rng=rng),
+                rng.standard_normal((self.n_rows - self.n_points, n_draws)),
+            ]
+        )
+        return np.asarray(eps - self.basis @ (self.basis.T @ eps))
+
+
+@dataclass(frozen=True, eq=False)
+class OrthonormalBlocks:
+    """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, one for each template.
+
+    Rows are those of `Linearised`. `gain` (n_columns,): squared lengths before normalisation, of templates scaled to
+    unit rms; their sum in a block is n_kept if the fit absorbs nothing. `starts` (n_blocks,): first columns.
+    """
+
+    u: FloatArray
+    gain: FloatArray
+    starts: IntArray
+
+    @classmethod
+    def of(cls, problem: Linearised, templates: Sequence[FloatArray]) -> OrthonormalBlocks:
+        """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
+        return cls.of_projected_templates(scale_and_project(problem, templates), [t.shape[1] for t in templates])
+
+    @classmethod
+    def of_projected_templates(cls, projected: FloatArray, widths: Sequence[int]) -> OrthonormalBlocks:
+        """Orthonormalise each of the concatenated templates from `scale_and_project`, (n_rows, n_columns)."""
+        starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
+        u, gain = np.empty_like(projected), np.empty(projected.shape[1])
+        for width in set(widths):  # all templates of one width at a time
+            columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
+            u[:, columns], gain[columns] = orthonormalise_groups(projected[:, columns], width)
+        return cls(u, gain, starts)
+
+
+def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
+    """Whiten templates (n_points, k), scale to unit rms, project the fit out; concatenated, (n_rows, n_columns)."""
+    widths = [t.shape[1] for t in templates]
+    whitened = problem.law(np.concatenate(templates, axis=1))
+    per_column = np.repeat(widths, widths)
+    norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+    whitened *= np.sqrt(problem.n_kept / per_column) / np.where(norms > 0, norms, 1.0)
+    return problem.project_whitened(whitened)
+
+
+def orthonormalise_groups(
+    columns: FloatArray, width: int, *, least: float = 1e-12, share: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Orthonormalise groups of `width` adjacent columns, (n_rows, n_columns); return also squared lengths (n_columns,).
+
+    It uses the eigenvectors of the Gram matrices. Directions with squared length up to `least`, or up to `share` times
+    the greatest in the group, become zero columns.
+    """
+    blocks = columns.reshape(len(columns), -1, width)
+    squares, axes = np.linalg.eigh(np.einsum("ibj,ibk->bjk", blocks, blocks, optimize=True))
+    there = squares > np.maximum(share * squares[:, -1:], least)
+    per_length = np.where(there, 1 / np.sqrt(np.maximum(squares, least)), 0.0)
+    u = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
+    return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
+
+
+def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_kept: int) -> FloatArray:
+    """Return the log Bayes factor of each block against the null, with amplitude and noise sd integrated out.
+
+    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
+    the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
+
+    Parameters
+    ----------
+    blocks
+        The templates.
+    residuals
+        Projected residuals, shape (n_rows, n_draws).
+    n_kept
+        Number of readings that are not lost.
+
+    Returns
+    -------
+    Log Bayes factors, shape (n_blocks, n_draws).
+    """
+    scores = (blocks.u.T @ residuals) ** 2
+    scores /= np.maximum(np.sum(residuals**2, axis=0), 1e-300)
+    out = np.empty((len(blocks.starts), residuals.shape[1]))
+    widths = np.diff(blocks.starts, append=len(scores))
+    for width in np.unique(widths):  # all blocks of one width at a time
+        members = np.flatnonzero(widths == width)
+        columns = blocks.starts[members, None] + np.arange(width)
+        out[members] = average_over_amplitude_scales(scores[columns], blocks.gain[columns], n_kept)
+    return out
+
+
+def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_kept: int) -> FloatArray:
+    """Average the Bayes factors of templates of one width over the `SCALES` at which each is detectable.
+
+    At smaller scales the projected template has an rms lambda below `LEAST_VISIBLE`: the Bayes factor is near one
+    whatever the readings, and would keep irrelevant effects.
+
+    Parameters
+    ----------
+    explained
+        Share of the residual's sum of squares along each axis, (n_templates, width, n_draws).
+    gain
+        Squared length of the projection along each axis, (n_templates, width).
+    n_kept
+        Number of readings that are not lost.
+
+    Returns
+    -------
+    Log Bayes factors, (n_templates, n_draws); about -48 for a template that is detectable at no scale.
+    """
+    terms = np.empty((len(SCALES), explained.shape[0], explained.shape[2]))
+    visible = SCALES[:, None] ** 2 * gain.sum(axis=1) >= LEAST_VISIBLE**2
+    for k, scale in enumerate(SCALES):
+        ratio = scale**2 * gain
+        of_all = np.einsum("bwd,bw->bd", explained, ratio / (1 + ratio))
+        np.log1p(-np.minimum(of_all, 1 - 1e-12), out=terms[k])
+        terms[k] *= -0.5 * n_kept
+        terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
+    terms[~visible] = _INVISIBLE
+    top = terms.max(axis=0)
+    n_visible = np.maximum(np.count_nonzero(visible, axis=0), 1)[:, None]
+    return np.asarray(top + np.log(np.exp(terms - top).sum(axis=0) / n_visible))
+
+
+_RESOLVED = 0.6  # posterior sd over the distance of nodes, from which their sum is the integral to a percent
+_SAME = 1e-9  # of the prior's unit cube: nodes as close are one
+_EDGE = 1e-6  # of it too
+_ROUNDS = 6
+_REACH = math.sqrt(3)  # of the nodes on both sides of a peak, in posterior sds
+_NODES = _REACH * np.array([0.0, -1.0, 1.0])
+_LOG_WEIGHTS = np.log([2 / 3, 1 / 6, 1 / 6]) + 0.5 * _NODES**2 + 0.5 * math.log(2 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class _CoarseParameters:
+    """Parameters of a noise model whose nodes lie further apart than a fit determines them.
+
+    `columns` numbers them among the settings of the nodes; `peak` are their values at the likeliest node, and
+    `spacing` the distances of nodes, in the unit cube of the prior, (n_coarse,) all. `gain`: nats by which the evidence
+    may rise between the nodes.
+    """
+
+    columns: IntArray
+    peak: FloatArray
+    spacing: FloatArray
+    gain: float
+
+    @classmethod
+    def of(cls, evidence: NoiseEvidence) -> _CoarseParameters:
+        weights, found = evidence.weights, []
+        for effect, part in effects_with_columns(evidence.noise.effects):
+            settings = evidence.nodes.settings[:, part]
+            if len(effect.nodes_per_parameter) != settings.shape[1] or np.all(settings == settings[0]):
+                continue  # without nodes of the prior, or known
+            unit = effect.prior.to_unit_cube(settings)
+            for k, n in enumerate(effect.nodes_per_parameter):
+                own, node_of = np.unique(np.round(unit[:, k] / _SAME), return_inverse=True)
+                marginal = np.bincount(node_of.ravel(), weights).astype(np.float64)
+                own = own * _SAME
+                spacing = float(np.diff(own).min(initial=math.inf)) if len(own) > 1 else 1 / n
+                mean = float(marginal @ own)
+                if math.sqrt(float(marginal @ (own - mean) ** 2)) < _RESOLVED * spacing:
+                    at = unit[int(np.argmax(weights)), k]
+                    found.append((part.start + k, float(at), spacing, _rise_between(marginal)))
+        columns, peak, spacings, gains = zip(*found, strict=True) if found else ((), (), (), ())
+        return cls(np.array(columns, dtype=np.int64), np.array(peak), np.array(spacings), float(sum(gains)))
+
+
+def _rise_between(marginal: FloatArray) -> float:
+    """Return the height, in nats, of the peak over the best node, from the nodes' probabilities in order, (n_nodes,).
+
+    It is that of a parabola through the best node and its neighbours. Infinity for a single node.
+    """
+    if len(marginal) < 2:
+        return math.inf
+    with np.errstate(divide="ignore"):
+        log_p = np.maximum(np.log(marginal), -700.0)
+    k = int(np.argmax(log_p))
+    before, after = log_p[max(k - 1, 0)], log_p[min(k + 1, len(log_p) - 1)]
+    bend = float(2 * log_p[k] - before - after)
+    return float(after - before) ** 2 / (8 * bend) if bend > 0 else 0.0
+
+
+def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) -> NoiseEvidence:
+    """Return the evidence of a fit with nodes about its peak, along each parameter whose nodes lie too far apart.
+
+    The other nodes of these parameters are dropped. The evidence is returned as it is if all nodes are close enough, if
+    refined nodes cannot raise it to `least` nats, or if no higher peak is found.
+    """
+    if not np.isfinite(evidence.log_z):
+        return evidence
+    coarse = _CoarseParameters.of(evidence)
+    if not coarse.columns.size or evidence.log_z + coarse.gain < least:
+        return evidence
+    model, best = evidence.noise, evidence.nodes.settings[int(np.argmax(evidence.log_z_nodes))]
+    parts = [(effect, part) for effect, part in effects_with_columns(model.effects) if effect.nodes_per_parameter]
+    columns, peak, spacing = coarse.columns, coarse.peak, coarse.spacing
+
+    def log_density(points: FloatArray) -> FloatArray:
+        settings = np.repeat(best[None, :], len(points), axis=0)
+        for effect, part in parts:
+            own = (columns >= part.start) & (columns < part.stop)
+            if own.any():
+                unit = effect.prior.to_unit_cube(settings[:, part])
+                unit[:, columns[own] - part.start] = points[:, own]
+                settings[:, part] = effect.prior.from_unit_cube(unit)
+        return log_evidence_under(found, model.laws_at(settings, found.predicted))
+
+    while columns.size:
+        peak, sd = _peak_and_sds(log_density, peak, spacing)
+        inside = (peak - _REACH * sd > 0) & (peak + _REACH * sd < 1)
+        if inside.all():
+            break
+        # At an end of its prior a parameter keeps the nodes that it has.
+        columns, peak, spacing = columns[inside], coarse.peak[np.isin(coarse.columns, columns[inside])], spacing[inside]
+    nodes = dict(model.likely)
+    for effect, part in parts:
+        about = {int(c) - part.start: (peak[k], sd[k]) for k, c in enumerate(columns) if part.start <= c < part.stop}
+        if about:
+            nodes[effect.name] = _nodes_about(effect, about)
+    out = laplace_evidence(found, replace(model, likely=nodes)) if columns.size else evidence
+    return out if _height(out) > _height(evidence) else evidence
+
+
+def _height(evidence: NoiseEvidence) -> float:
+    """Return the log evidence at the likeliest node, without the prior weights of nodes."""
+    return float((evidence.log_z_nodes - evidence.nodes.log_weights).max(initial=-math.inf))
+
+
+def _peak_and_sds(
+    log_density: Callable[[FloatArray], FloatArray], start: FloatArray, spacing: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the peak of a density over the unit cube and its sd along each axis, (n_axes,) both.
+
+    Parabolas through three points along each axis lead to it; the points draw together from `spacing` to the sd.
+    """
+    center, step = start, spacing
+    eye = np.eye(len(start))
+    for _ in range(_ROUNDS):
+        center = np.clip(center, step + _EDGE, 1 - step - _EDGE)
+        middle, *around = log_density(center + step * np.concatenate([0 * eye[:1], -eye, eye]))
+        below, above = np.split(np.array(around), 2)
+        if not np.isfinite([middle, *around]).all():
+            break
+        slope, bend = 0.5 * (above - below), 2 * middle - above - below
+        concave = bend > 1e-3
+        sd = step / np.sqrt(np.where(concave, bend, 1.0))
+        move = np.clip(np.where(concave, slope / np.where(concave, bend, 1.0), np.sign(slope)), -2.0, 2.0)
+        center = np.clip(center + move * step, _EDGE, 1 - _EDGE)
+        if np.all(np.abs(move) * step < 0.5 * sd) and np.all(step < 2 * sd):
+            break
+        step = np.where(concave, np.clip(sd, step / 8, step), step)
+    return center, sd
+
+
+def _nodes_about(effect: NoiseEffect, about: Mapping[int, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
+    """Return the nodes of one effect, (n_nodes, n_params), and log weights: about a peak, the prior's where not coarse.
+
+    `about` has the peak and the sd of coarse parameters, by their number, in the unit cube.
+    """
+    axes, log_weights = [], []
+    for k, n in enumerate(effect.nodes_per_parameter):
+        if k in about:
+            peak, sd = about[k]
+            axes.append(peak + sd * _NODES)
+            log_weights.append(_LOG_WEIGHTS + math.log(sd))
+        else:
+            axes.append((np.arange(n) + 0.5) / n)
+            log_weights.append(np.full(n, -math.log(n)))
+    unit = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
+    return effect.prior.from_unit_cube(unit), np.sum(np.meshgrid(*log_weights), axis=0).ravel()
+
+
+def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
+    """Return the log probability that every effect of a fit has a detectable size (lambda 4 or more).
+
+    The size is the norm, in noise sds, of the effect's change after a (linearised) refit of all other parameters; its
+    posterior is normal with unit sd. This probability, multiplied with the evidence, removes the part of a hypothesis
+    that readings cannot tell from the hypothesis without the effect.
+
+    Parameters
+    ----------
+    found
+        The fit.
+    law
+        Its noise model.
+    usable
+        Row numbers of the usable readings, (n_usable,).
+    """
+    sizes = linearised_sizes(found, law, usable, found.model.names)
+    return float(sum(log_ndtr(size - LEAST_VISIBLE) for size in sizes))
+
+
+def linearised_sizes(found: Fit, law: NoiseLaw, usable: IntArray, names: Sequence[str]) -> Iterator[float]:
+    """Iterate over the lambdas of some effects of a fit: norm, in noise sds, of the change after a linearised refit.
+
+    Arguments as of `log_probability_effects_detectable`; `names` are those of the effects.
+    """
+    sd = found.sd / np.sqrt(law.fisher_information)
+    slopes = law(found.slopes) / sd
+    for name in names:
+        rest = np.delete(slopes, found.model.coordinate_slice(name), axis=1)
+        change = law(found.change_by_effect(name, usable)[:, None])[:, 0] / sd
+        taken = np.linalg.solve(rest.T @ rest + np.eye(rest.shape[1]), rest.T @ change)
+        yield float(np.linalg.norm(np.append(change - rest @ taken, taken)))

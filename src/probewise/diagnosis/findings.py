@@ -1,0 +1,368 @@
+"""The findings on each effect, the noise, a misfit after the repair, and a formula for an unknown effect."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.best_repair import BestRepair
+from probewise.diagnosis.evidence import Linearised, linearised_sizes
+from probewise.diagnosis.fit import fit, fit_each_start
+from probewise.diagnosis.held_out import held_out_gain
+from probewise.diagnosis.locate import ALARM, significant_places
+from probewise.diagnosis.noise_law import n_rows_since_previous_usable, noise_statistics, previous_usable
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
+from probewise.diagnosis.search.constants import ALIASED_NATS
+from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
+from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.verdict import Hypothesis, Judged
+from probewise.diagnosis.words import p_in_words, substitute_reading_unit
+from probewise.effects import Dropouts, NamedEffect, NoiseEffect, is_out_of_vocabulary
+from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
+from probewise.recordings.plan import Plan
+
+_LEAST_PROBABILITY = 1e-3
+_IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
+_STANDS_BESIDE = 0.5  # conditional probability from which an effect counts as beside the unknown one
+_N_DRAWS = 999
+
+
+@dataclass(frozen=True)
+class ParameterFound:
+    """One parameter of an effect or of the noise: posterior mean, sd and central 95 % interval, in `unit`."""
+
+    name: str
+    unit: str
+    mean: float
+    sd: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EffectFound:
+    """One effect: probability in any hypothesis, size, sentence, parameters, and the scans to which it is bound.
+
+    `size_lambda` is the norm of the effect's change of the readings in noise sds, after a refit of all else. Of a noise
+    effect it is that of an effect on the mean with equal evidence; of rounding that is certain, that of the rounding
+    error, step / sqrt(12), over all readings.
+    """
+
+    name: str
+    probability: float
+    size_lambda: float
+    sentence: str
+    parameters: tuple[ParameterFound, ...]
+    scans: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class NoiseFound:
+    """The noise `model` ("white", or effects joined by "+"), the p-value of deviations from it, and its parameters.
+
+    `nuisances` are sentences on effects of the model that no combination and no repaired model holds.
+    """
+
+    model: str
+    p_value: float
+    parameters: tuple[ParameterFound, ...]
+    nuisances: tuple[str, ...] = ()
+
+
+def effects_found(
+    searched: Searched,
+    hypotheses: tuple[Hypothesis, ...],
+    best: BestRepair,
+    samples: ModelSamples,
+    *,
+    rng: np.random.Generator,
+) -> tuple[EffectFound, ...]:
+    """Return the findings on every effect with a name and a probability above 0.001, most probable first.
+
+    Parameters
+    ----------
+    searched
+        Result of the search.
+    hypotheses
+        All hypotheses with their probabilities.
+    best, samples
+        The repair and its posterior samples, which give size and parameters of its effects; those of other effects are
+        from the most probable fit that contains them or, if there is none, from the linearised null.
+    rng
+        Source of randomness.
+    """
+    prepared = searched.prepared
+    out, plan = [], prepared.everything.plan
+    unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
+    beside = {}
+    if unknown >= _IS_UNKNOWN:
+        beside = searched.effect_probabilities_given_unknown() | searched.noise_probabilities_given_unknown()
+    unit = plan.instrumentation.unit
+    drawn: dict[tuple[WeighedFit, Names], ModelSamples] = {}
+    for name, effect in prepared.effects.items():
+        p = sum(h.probability for h in hypotheses if name in h.effects)
+        if beside.get(name, 0.0) >= _STANDS_BESIDE and not is_out_of_vocabulary(name):
+            p += unknown * beside[name]
+        if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)):
+            continue
+        holder, noise = (best.fit, best.noise) if name in samples.effects else _likeliest_candidate_with(searched, name)
+        if holder is None:
+            effect, values, size = _samples_of_insignificant(searched, effect, rng=rng)
+        else:
+            effect = next((e for e in holder.found.model.effects if e.name == name), effect)
+            own = samples if name in samples.effects else drawn.get((holder, noise))
+            if own is None:
+                evidence, weights = holder.evidence[noise], holder.weights
+                own = sample_model(holder.found, evidence, prepared.recording, weights=weights, rng=rng, annealed=False)
+                drawn[holder, noise] = own
+            values, size = own.effect_samples(name), _lambda_of(searched, holder, name, noise)
+        out.append(
+            EffectFound(
+                name,
+                min(p, 1.0),
+                size,
+                sentence_from_samples(effect, values),
+                (*parameters_found(effect, values, unit), *_scan_numbers_found(effect, plan)),
+                effect.scans,
+            )
+        )
+    return tuple(sorted(out, key=lambda e: -e.probability))
+
+
+def _likeliest_candidate_with(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
+    """Return the most probable refit that contains an effect, and its noise effects; None, () if there is none."""
+    ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
+    for (mean, noise), p in ranked:
+        if p > 0 and name in (*mean, *noise):
+            candidate = searched.best_refit_of(mean, noise)
+            if candidate is not None:
+                return candidate, noise
+    return None, ()
+
+
+def _samples_of_insignificant(
+    searched: Searched, effect: NamedEffect[Any], *, rng: np.random.Generator
+) -> tuple[NamedEffect[Any], FloatArray, float]:
+    """Draw parameters of an effect that no refit contains: amplitudes by the linearised null, others from the prior.
+
+    Returns
+    -------
+    The middle one of its variants (discrete choices), the samples, (N_SAMPLES, n_params), and lambda at the best.
+    """
+    null, misfit_templates = searched.null, searched.misfit_templates
+    best = max(null.evidence.values(), key=lambda e: e.log_z)
+    problem = Linearised.of(null.found, best.likeliest_law)
+    templates = misfit_templates.templates.templates_of(misfit_templates.about, effect.with_fewer_variants())
+    middle = len(templates.columns) // 2
+    effect = templates.variant_of_entry(middle)
+    values = effect.prior.from_unit_cube(rng.random((N_SAMPLES, len(effect.prior.names))))
+    if not effect.amplitudes:
+        return effect, values, 0.0
+    projected = problem.project(templates.columns[middle])
+    # A ridge of one prior scale keeps undetectable amplitudes finite.
+    precision = projected.T @ projected + np.eye(projected.shape[1])
+    amount = np.linalg.solve(precision, projected.T @ problem.residual)
+    spread = np.linalg.cholesky(np.linalg.inv(precision))
+    draws = amount + rng.standard_normal((N_SAMPLES, len(amount))) @ spread.T
+    for k in effect.amplitudes:
+        values[:, k] = draws @ templates.settings[middle][:, k]
+    # Amplitudes of an excluded sign are reflected.
+    inside = np.isfinite(effect.prior.log_prob(values))
+    values[~inside] = np.abs(values[~inside])
+    return effect, values, float(np.linalg.norm(projected @ amount))
+
+
+def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
+    """Return an effect's lambda: the residual norm, in noise sds, of a refit without it to noise-free readings.
+
+    An effect on the noise has the lambda of an effect on the mean with equal evidence; rounding, and a noise effect
+    that also changes the mean, the norm of the change in noise sds.
+    """
+    law = holder.evidence[noise].likeliest_law
+    found, prepared = holder.found, searched.prepared
+    effect = prepared.effects[name]
+    if name in prepared.noise_effect_names and cast(NoiseEffect, effect).changes_the_mean:
+        everywhere = found.model.predict(found.z[None, :])[0]
+        return float(np.linalg.norm(cast(NoiseEffect, effect).change_of_readings(everywhere))) / found.sd
+    if isinstance(effect, Dropouts) and effect.lost:
+        return effect.distance
+    if name in searched.certain:
+        step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of_effect(name)]
+        return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(law.n_kept)
+    if name in prepared.noise_effect_names:
+        # For noise effects: the size of an effect on the mean with equal evidence.
+        without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]
+        gain = holder.evidence[noise].log_z - max(without)
+        return math.sqrt(2 * max(gain, 0.0))
+    model, stay = found.model.model_and_mask_without(name)
+    noise_free = prepared.recording.with_readings(
+        prepared.expand_usable_to_all_rows(found.predicted)
+    ).without_declared_range()
+    # With the noise sd as floor, the refit balances readings and priors as the real one did.
+    sigma = float(law.likeliest_sigma(law(found.residuals)[:, None])[0])
+    refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)
+    if not math.isfinite(refit.objective):
+        # Without the effect these parameters predict no readings to start from; those of the null do.
+        null = searched.evidences.fits[holder.n_gaussians, ()].found.z
+        others = found.z[stay][len(null) :]
+        starts = [np.concatenate([null, share * others]) for share in (1.0, 0.0)]
+        again = fit_each_start(model, noise_free, starts, law.with_least_sigma(sigma), tolerance=0.02)
+        refit = min(again, key=lambda one: one.objective)
+    if not math.isfinite(refit.objective):
+        return next(linearised_sizes(found, law, prepared.usable_rows, [name]))
+    return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.fisher_information)
+
+
+def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
+    """Describe the noise of the repaired model, and test its residuals for deviations from this noise.
+
+    Deviations are autocorrelation, heavy tails, or a spread that depends on the level.
+    """
+    prepared, after = searched.prepared, best.problem
+    steps, before = n_rows_since_previous_usable(prepared.recording), previous_usable(prepared.recording)
+    own = after.residual[: after.n_points, None]
+    null = after.draw_null_residuals(_N_DRAWS, rng=rng)[: after.n_points]
+    joined = noise_statistics(np.concatenate([own, null], axis=1), steps, best.fit.found.predicted, before=before)
+    center, spread = joined[:, 1:].mean(axis=1), joined[:, 1:].std(axis=1)
+    worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)
+    p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + _N_DRAWS)
+    unit = prepared.recording.plan.instrumentation.unit
+    parameters = [_parameter_found("sd", unit, samples.noise_sd)]
+    nuisances = []
+    for name in best.noise:
+        effect = cast(NoiseEffect, prepared.effects[name])
+        if name in samples.effects:
+            values = samples.effect_samples(name)
+        else:
+            values = noise_effect_samples(effect, best.fit.evidence[best.noise], rng=rng)
+            nuisances.append(sentence_from_samples(effect, values))
+        parameters += parameters_found(effect, values, unit)
+    return NoiseFound("+".join(best.noise) or "white", p_value, tuple(parameters), tuple(nuisances))
+
+
+def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
+    """Summarise an effect's parameter samples, (n_samples, n_params), without fixed ones; `unit` is a reading's."""
+    fixed = getattr(effect, "fixed", ())
+    return tuple(
+        _parameter_found(name, substitute_reading_unit(own, unit), values[:, k])
+        for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
+        if name not in fixed
+    )
+
+
+def _scan_numbers_found(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
+    """Return one parameter `scans`, of the numbers, from 0, of the scans to which an effect is bound, if any."""
+    numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
+    return (_parameter_found("scans", "scan", numbers),) if numbers.size else ()
+
+
+def _parameter_found(name: str, unit: str, values: FloatArray) -> ParameterFound:
+    low, high = np.quantile(values, [0.025, 0.975])
+    mean, sd = mean_and_sd_of_samples(values[:, None])
+    return ParameterFound(name, unit, float(mean[0]), float(sd[0]), (float(low), float(high)))
+
+
+_N_DRAWS_OF_REMAINDER = 199
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """A significant misfit that remains after all named effects.
+
+    `p_value`: of the global test of the repaired model; `share_of_gain`: the share of the total gain in log evidence
+    that an unknown effect or a formula would add; `where`: the covariate in which the misfit is most significant, or
+    None; `formula`: one that was found beside the named effects, or None.
+    """
+
+    p_value: float
+    share_of_gain: float
+    where: str | None
+    sentence: str
+    formula: Formula | None = None
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula proposed for an unknown effect, and its gain over the null, or over the effects that it stands beside.
+
+    The `expression` is added to the reading (`side` "reading") or to the rate of the state `target` ("rate").
+    `log_evidence` is the gain in nats, `heldout_log_density_per_reading` that in nats per held-out reading.
+    """
+
+    expression: str
+    side: str
+    target: str
+    parameters: tuple[ParameterFound, ...]
+    log_evidence: float
+    heldout_log_density_per_reading: float
+
+
+def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: np.random.Generator) -> Remainder | None:
+    """Return the misfit that remains, with p below .01, after a repair by effects; None if there is neither."""
+    p_value, names = best.improvement.p_value_after, best.fit.names
+    if judged.verdict not in ("named", "cannot_tell") or not names or p_value >= ALARM:
+        return None
+    own, log_z = best.fit.n_gaussians, best.fit.evidence[best.noise].log_z
+    value = searched.evidences.unknown.get((own, names, best.noise), log_z)
+    fit = searched.evidences.best_formula_beside(best.fit, best.noise)
+    with_formula = -math.inf if fit is None else fit.evidence[best.noise].log_z
+    more = max(value - log_z, with_formula - log_z, 0.0)
+    named = max(log_z - searched.evidences.fits[own, ()].evidence[best.noise].log_z, 0.0)
+    prepared, covariates = searched.prepared, searched.misfit_templates.covariates
+    draws = best.problem.draw_null_residuals(_N_DRAWS_OF_REMAINDER, rng=rng)
+    found = significant_places(
+        best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws
+    )
+    where = found[0].covariate if found else None
+    shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate_in_words(where)}"
+    share = more / (named + more) if named + more > 0 else 0.0
+    formula, said = None, ""
+    if fit is not None and with_formula > max(value, log_z + ALIASED_NATS):
+        formula, said = _formula_beside(searched, best, fit, rng=rng)
+    smaller = "A smaller misfit" if share < 0.5 else "A misfit"
+    gain = f"what has no name would add {share:.0%} of the whole gain in log evidence"
+    sentence = f"{smaller} remains ({p_in_words(p_value)}; {gain}){shows}{said}."
+    return Remainder(p_value, share, where, sentence, formula)
+
+
+def _formula_beside(
+    searched: Searched, best: BestRepair, fit: WeighedFit, *, rng: np.random.Generator
+) -> tuple[Formula, str]:
+    """Return the formula that a fit adds to the best repair, with its gain over that, and a clause that tells it."""
+    prepared, evidence = searched.prepared, fit.evidence[best.noise]
+    effect = next(e for e in fit.found.model.effects if e.name not in best.fit.names)
+    values = sample_model(
+        fit.found, evidence, prepared.recording, weights=fit.weights, rng=rng, annealed=False
+    ).effect_samples(effect.name)
+    parts = prepared.apparatus.held_out_parts(prepared.recording)
+    law, law_without = evidence.likeliest_law, best.fit.evidence[best.noise].likeliest_law
+    held = held_out_gain(best.fit.found, fit.found, prepared.recording, law, parts, law_of_null=law_without)
+    gained = evidence.log_z - best.fit.evidence[best.noise].log_z
+    unit = prepared.recording.plan.instrumentation.unit
+    formula = _formula_from_samples(effect, values, unit, gained, held.per_reading)
+    return formula, f"; a formula describes it: {sentence_from_samples(effect, values)}"
+
+
+def formula_of(searched: Searched, judged: Judged, best: BestRepair, samples: ModelSamples) -> Formula | None:
+    """Return the formula in the repair of an unknown effect; None if there is none."""
+    if judged.verdict != "unknown":
+        return None
+    unit, gain = searched.prepared.recording.plan.instrumentation.unit, best.improvement
+    for effect in best.fit.found.model.effects:
+        if getattr(effect, "expression", "") and is_out_of_vocabulary(effect.name):
+            values = samples.effect_samples(effect.name)
+            return _formula_from_samples(effect, values, unit, gain.log_evidence, gain.heldout_log_density_per_reading)
+    return None
+
+
+def _formula_from_samples(
+    effect: NamedEffect[Any], values: FloatArray, unit: str, log_evidence: float, per_reading: float
+) -> Formula:
+    """Describe an effect with an `expression` by samples of its parameters, (n_samples, n_params), and its gain."""
+    _, side, target, _ = effect.name.split(":", 3)
+    expression = str(getattr(effect, "expression", ""))
+    return Formula(expression, side, target, parameters_found(effect, values, unit), log_evidence, per_reading)

@@ -1,0 +1,237 @@
+"""Gain on held-out readings. Whole parts are held out, since rows chosen at random would leak information."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.fit import Fit, fit, residual_degrees_of_freedom
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_memory import innovations_given_rest
+from probewise.recordings.plan import Recording
+
+LEAST_ROWS = 8
+"""Least number of rows of a held-out part."""
+
+MOST_PARTS = 10
+"""Largest number of parts held out in turn."""
+
+Parts = tuple[IntArray, tuple[str, ...]]
+"""Part number of each usable reading, (n_usable,), and the names of the parts."""
+
+_BLOCKS = 5
+_NO_SLOPE = 1e-6  # of a parameter's slope on its own readings: so little on others is rounding of predictions
+_HARDLY_TOLD = 0.5  # variance of a coordinate given the other parts, of 1 before them
+
+
+@dataclass(frozen=True)
+class HeldOutGain:
+    """Gain of a model over the null on held-out readings: mean in nats per reading, and the sd of that mean.
+
+    `by_scan`: name and mean gain of each held-out part, such as a scan.
+    """
+
+    per_reading: float
+    sd: float
+    n_readings: int
+    by_scan: tuple[tuple[str, float], ...]
+
+
+def held_out_gain(
+    null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts, *, law_of_null: NoiseLaw
+) -> HeldOutGain:
+    """Refit both models without one part of the readings at a time, and compare their log densities of that part.
+
+    A held-out reading is predicted from the other parts alone. If the part has parameters of its own, which other parts
+    do not determine, or if the noise has memory, its readings are predicted sequentially, each given those before it:
+    together they have the joint density of the part given the rest. Parts of fewer than eight readings are not held
+    out, and of more than ten parts only ten.
+
+    Parameters
+    ----------
+    null, repaired
+        The two models, fitted to all readings.
+    recording
+        What was read.
+    law, law_of_null
+        Noise distribution of the repaired model, and of the null.
+    held_out
+        Number of the part of each usable reading, and names of the parts.
+    """
+    plan, usable = recording.plan, recording.usable
+    parts, names = held_out
+
+    def gain_per_reading(out: BoolArray) -> FloatArray:
+        rows = np.zeros(len(plan), dtype=np.bool_)
+        rows[np.flatnonzero(usable)[out]] = True
+        each = ((repaired, law), (null, law_of_null))
+        repaired_one, null_one = (_refit_log_densities(f, recording, rows, own, out) for f, own in each)
+        return repaired_one - null_one
+
+    return mean_gain_over_parts(parts, gain_per_reading, names)
+
+
+def partition_into_blocks(recording: Recording) -> Parts:
+    """Partition usable readings into five parts: every fifth block of eight successive readings.
+
+    Returns numbers (n_usable,) and names of the parts. An effect local in time cannot be predicted for another scan,
+    but it can between known readings; a block is long enough that its middle is not adjacent to known readings.
+    """
+    block = np.arange(int(recording.usable.sum())) // LEAST_ROWS
+    return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
+
+
+def mean_gain_over_parts(
+    scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()
+) -> HeldOutGain:
+    """Hold out one part at a time, at most ten, and average the gains of their readings.
+
+    Parameters
+    ----------
+    scan
+        Number of the part of each usable reading, such as its scan, (n_usable,).
+    gain
+        Function of a mask of held-out readings (n_usable,); returns the gain of each of them, in nats.
+    scan_names
+        Names of the parts; without, their numbers.
+
+    Returns
+    -------
+    The gain; no readings and gain 0 if fewer than two parts are long enough.
+    """
+    long_enough = [int(k) for k in np.unique(scan) if np.sum(scan == k) >= LEAST_ROWS]
+    if len(long_enough) < 2:
+        return HeldOutGain(0.0, 0.0, 0, ())
+    if len(long_enough) > MOST_PARTS:
+        long_enough = [long_enough[int(i)] for i in np.linspace(0, len(long_enough) - 1, MOST_PARTS).round()]
+    gains = [gain(np.asarray(scan == k)) for k in long_enough]
+    by_scan = tuple(
+        (scan_names[k] if scan_names else str(k), float(g.mean())) for k, g in zip(long_enough, gains, strict=True)
+    )
+    joined = np.concatenate(gains)
+    sd = float(joined.std(ddof=1)) / math.sqrt(len(joined))
+    return HeldOutGain(float(joined.mean()), sd, len(joined), by_scan)
+
+
+def _refit_log_densities(
+    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray
+) -> FloatArray:
+    """Return the log predictive density of each held-out reading, from a refit to the others; 0 for lost readings.
+
+    At an end of the range it is a log likelihood relative to its peak: 0 where the prediction is beyond the end.
+    `rows` (n_points,) and `out` (n_usable,) are masks of the held-out readings. Lost readings (dropouts at one value)
+    add the same to every model of the mean.
+    """
+    kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
+    rest = law.take_readings(~out)
+    if not rest.n_kept:  # without them the noise sd, and so the density, is unknown
+        return np.zeros(int(out.sum()))
+    without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
+    of_its_own = are_of_part_alone(found.slopes, out)
+    turned = np.where(of_its_own, 0.0, rest(without.slopes))
+    # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the other
+    # readings may bound them on one side only, as for a ceiling.
+    about = np.where(of_its_own, found.z, without.z)
+    predicted, slopes = (part[recording.usable] for part in found.model.predict_and_differentiate(about))
+    free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information), rest.n_kept)
+    sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
+    curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
+    miss = recording.readings[recording.usable] - predicted
+    covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
+    # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
+    hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
+    if (of_its_own | hardly_told).any() or law.has_memory:
+        return sequential_log_densities(law, out, miss, slopes, without.z - about, covariance, sigma_2)
+    miss, slopes, own = miss[out], slopes[out], law.take_readings(out)
+    spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
+
+    def log_density(miss: FloatArray) -> FloatArray:
+        narrow, wide = (
+            _log_normal_density(miss, sigma_2 * sd**2 + spread) + math.log(max(share, 1e-300))
+            for sd, share in ((own.sd_with_rounding, 1 - law.share), (law.times * own.sd, law.share))
+        )
+        return np.asarray(np.logaddexp(narrow, wide))
+
+    density = log_density(miss)
+    if own.is_censored.any():
+        density -= np.where(own.is_censored, log_density(np.zeros(len(miss))), 0.0)
+    return np.asarray(density * own.kept)
+
+
+def are_of_part_alone(slopes: FloatArray, part: BoolArray) -> BoolArray:
+    """Return which parameters change only the readings of a part, (n_params,), such as where its run starts.
+
+    `slopes` are those of all readings, (n_readings, n_params), `part` is the mask of its readings.
+    """
+    here, elsewhere = (np.linalg.norm(slopes[rows], axis=0) for rows in (part, ~part))
+    return np.asarray((here > 0.0) & (elsewhere <= _NO_SLOPE * here))
+
+
+def sequential_log_densities(
+    law: NoiseLaw,
+    out: BoolArray,
+    miss: FloatArray,
+    slopes: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    sigma_2: float,
+) -> FloatArray:
+    """Return the log density of each held-out reading given the others and those held out before it, 0 for lost ones.
+
+    Parameters
+    ----------
+    law
+        Noise distribution of all readings.
+    out
+        Mask of the held-out readings, (n_points,).
+    miss, slopes
+        Residuals of all readings, (n_points,), and slopes, (n_points, n_params), at one point.
+    mean, covariance
+        Of the coordinates about that point, from the readings that are not held out.
+    sigma_2
+        Variance of a whitened reading.
+
+    Returns
+    -------
+    Log densities, (n_out,), whose sum is the log of the joint density; of censored readings, relative to the peak.
+    """
+    whitened, sd = innovations_given_rest(law, np.concatenate([slopes, miss[:, None]], axis=1), out)
+    turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
+    mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
+    noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
+    shares, widths = np.array([1 - law.share, law.share]), _variances_of_narrow_and_wide(law, out, sd)
+    for k in np.flatnonzero(kept):
+        row = turned[k]
+        gain = covariance @ row
+        left, spread = innovations[k] - row @ mean, max(float(row @ gain), 0.0)
+        parts = noise_2[k] * widths[k] + spread
+        density = _log_normal_density(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
+        densities[k] = np.logaddexp(*density)
+        variance = float(np.exp(density - densities[k]) @ parts)  # the most probable noise variance of this reading
+        if censored[k]:
+            densities[k] -= np.logaddexp(
+                *(_log_normal_density(np.zeros(2), parts) + np.log(np.maximum(shares, 1e-300)))
+            )
+        mean += gain * left / variance
+        covariance -= np.outer(gain, gain) / variance
+    return np.asarray((densities - np.where(censored, 0.0, np.log(sd))) * kept)
+
+
+def _variances_of_narrow_and_wide(law: NoiseLaw, out: BoolArray, sd: FloatArray) -> FloatArray:
+    """Return the variances of each held-out reading if it is narrow and if it is wide, in units of sd^2, (n_out, 2).
+
+    `sd` is that of each reading, (n_out,), given the others. Whatever it reads, it may be either.
+    """
+    if not law.wide.size:
+        return np.tile([1.0, law.times**2], (len(sd), 1))
+    own = law.sd[out] ** 2
+    narrow = own * law.relative_precision[out]
+    return np.stack([sd**2 - own + narrow, sd**2 - own + narrow * law.times**2], axis=1) / sd[:, None] ** 2
+
+
+def _log_normal_density(miss: FloatArray, variance: FloatArray) -> FloatArray:
+    return np.asarray(-0.5 * np.log(2 * np.pi * variance) - 0.5 * miss**2 / variance)

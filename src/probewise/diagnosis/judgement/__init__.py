@@ -1,1 +1,0 @@
-"""The global test of the null, and the verdict."""

@@ -1,1 +1,0 @@
-"""A light sensor on an arm over printed patterns, as an `Apparatus`."""

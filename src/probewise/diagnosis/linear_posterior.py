@@ -1,0 +1,474 @@
+"""Posteriors in closed form of a fit whose model is partly linear: in amplitudes, and in what it simulates.
+
+Readings are linear in an amplitude, but the coordinate of an amplitude with a heavy-tailed prior is a steep function of
+its value about 0: a normal distribution of the coordinate there becomes one of values that is far too wide. Values with
+one scale in common lie on arcs in their coordinates. Both priors are mixtures of normal distributions. Given the
+components, the values are jointly normal; given the values, the components are independent. They are drawn in turn
+(Gibbs sampling, `LinearAmplitudes`).
+
+Fix one component of an amplitude and the value of another parameter of the effect, such as a time constant, and replace
+the simulation by its tangent (`LinearView`): all other parameters are then approximately jointly normal, and their
+evidence is in closed form (`ConditionallyLinearDensity`). A settling about as slow as what it is added to is an
+example: its amplitude and time constant lie on a hyperbola, whose two branches no single normal distribution fits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, Self
+
+import numpy as np
+from scipy.special import logsumexp, ndtr, ndtri
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.effects import HeavyTailedPrior, NamedEffect
+from probewise.effects.priors import SharedScalePrior
+from probewise.priors import Prior, Product
+from probewise.recordings.plan import Recording
+from probewise.sensor import Stage
+from probewise.sensor.stages import effects_with_columns
+
+_STRAIGHT = 0.2  # sd of a coordinate within which its value is as good as linear in it
+_SWEEPS = 10
+_STEP = 1e-6
+_ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly may fail to be positive
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudeGroup:
+    """Amplitudes with one component of the mixture in common: one alone, or values with one scale.
+
+    `at` (n,): numbers of their coordinates; `prior`: theirs; `typical`: the unit of their values here; `sds`
+    (n_components,): sds of the components, in typical sizes.
+    """
+
+    at: tuple[int, ...]
+    prior: Prior
+    typical: float
+    sds: FloatArray
+
+    def values(self, z: FloatArray) -> FloatArray:
+        """Return the values, in typical sizes, from coordinates, (n_samples, n) both."""
+        return self.prior.from_unit_cube(ndtr(z)) / self.typical
+
+    def coordinates(self, values: FloatArray) -> FloatArray:
+        """Return the coordinates of values in typical sizes, (n_samples, n) both."""
+        unit = self.prior.to_unit_cube(values * self.typical)
+        return np.asarray(np.clip(ndtri(unit), -FARTHEST, FARTHEST))
+
+    def log_prior_of_value(self, values: FloatArray) -> FloatArray:
+        """Return the log prior density of values of one amplitude, in typical sizes, (n_samples,), up to a constant."""
+        return np.asarray(self.prior.log_prob(values[:, None] * self.typical))
+
+    def values_by_coordinates(self, z: FloatArray) -> FloatArray:
+        """Return the derivatives of the values by the coordinates at z (n,), (n, n)."""
+        steps = _STEP * np.eye(len(z))
+        return np.asarray((self.values(z + steps) - self.values(z - steps)).T / (2 * _STEP))
+
+
+@dataclass(frozen=True, eq=False)
+class LinearAmplitudes:
+    """The linearised posterior of a fit of whose amplitudes some are wide in their coordinate.
+
+    The unknowns x (n_params,) are the values of these amplitudes, in typical sizes, and the coordinates of all else.
+    `x`: those of the fit; `curvature` (n_params, n_params) and `downhill` (n_params,) are those of minus the log
+    likelihood by x, the latter at x = 0.
+    """
+
+    groups: tuple[AmplitudeGroup, ...]
+    x: FloatArray
+    curvature: FloatArray
+    downhill: FloatArray
+
+    @classmethod
+    def of(cls, found: Fit, slopes: FloatArray, residual: FloatArray) -> Self | None:
+        """Find the amplitudes of a fit that are wide in their coordinate; None if there is none.
+
+        Parameters
+        ----------
+        found
+            The fit.
+        slopes, residual
+            Whitened slopes (n_points, n_params) and residuals (n_points,), in noise sds.
+        """
+        z_sd = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes + np.eye(len(found.z)))))
+        groups = tuple(group for group in two_sided_amplitude_groups(found) if np.any(z_sd[list(group.at)] > _STRAIGHT))
+        if not groups:
+            return None
+        x, by_x = found.z.copy(), slopes.copy()
+        for group in groups:
+            at = list(group.at)
+            x[at] = group.values(found.z[None, at])[0]
+            by_x[:, at] = np.linalg.solve(group.values_by_coordinates(found.z[at]).T, slopes[:, at].T).T
+        return cls(groups, x, by_x.T @ by_x, by_x.T @ (residual + by_x @ x))
+
+    def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw coordinates, (n_samples, n_params), each the end of a chain of its own."""
+        drawn, precision = np.tile(self.x, (n_samples, 1)), np.ones((n_samples, len(self.x)))
+        own = np.arange(len(self.x))
+        for _ in range(_SWEEPS):
+            for group in self.groups:
+                at, sds = list(group.at), group.sds
+                squares = np.sum(drawn[:, at] ** 2, axis=1)
+                log_weight = -0.5 * squares[:, None] / sds**2 - len(at) * np.log(sds)
+                component = np.argmax(log_weight + rng.gumbel(size=log_weight.shape), axis=1)
+                precision[:, at] = sds[component, None] ** -2
+            every = np.repeat(self.curvature[None], n_samples, axis=0)
+            every[:, own, own] += precision + _ROUNDING * np.diag(self.curvature)
+            # Of the mean plus a draw of covariance 1 / every: one solution with a right side of covariance `every`.
+            root = np.linalg.cholesky(every)
+            noise = np.einsum("nij,nj->ni", root, rng.standard_normal(drawn.shape))
+            drawn = np.linalg.solve(every, (self.downhill + noise)[:, :, None])[:, :, 0]
+        for group in self.groups:
+            drawn[:, list(group.at)] = group.coordinates(drawn[:, list(group.at)])
+        return drawn
+
+    def log_density(self, z: FloatArray) -> FloatArray:
+        """Return the log density of coordinates, unnormalised, (n_samples, n_params) -> (n_samples,)."""
+        x = z.copy()
+        for group in self.groups:
+            x[:, list(group.at)] = group.values(z[:, list(group.at)])
+        likelihood = x @ self.downhill - 0.5 * np.einsum("ni,ij,nj->n", x, self.curvature, x)
+        return np.asarray(likelihood - 0.5 * np.sum(z**2, axis=1))
+
+
+def two_sided_amplitude_groups(found: Fit) -> Iterator[AmplitudeGroup]:
+    """List the amplitudes of a fit's effects that may have either sign, values with one scale together."""
+    for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
+        own = effect.prior
+        if isinstance(own, SharedScalePrior):
+            every = tuple(range(columns.start, columns.stop))
+            yield AmplitudeGroup(every, own, own.typical, own.component_sds / own.typical)
+        for k, one in _two_sided_priors(effect).items():
+            alone = Product({own.names[k]: one})
+            yield AmplitudeGroup((columns.start + k,), alone, one.typical, one.component_sds / one.typical)
+
+
+def _two_sided_priors(effect: NamedEffect[Any]) -> dict[int, HeavyTailedPrior]:
+    """Return the heavy-tailed priors of the amplitudes that may have either sign, by the number of the parameter."""
+    marginals = list(getattr(effect.prior, "marginals", {}).values())
+    own = {k: marginals[k] for k in effect.amplitudes if k < len(marginals)}
+    return {k: prior for k, prior in own.items() if isinstance(prior, HeavyTailedPrior) and not prior.positive}
+
+
+@dataclass(frozen=True, eq=False)
+class LinearView:
+    """The tangent of what a model simulates before its effects on the readings.
+
+    It is linear in straight coordinates. For a parameter of the null (the model without effects) that is a linear
+    function of the parameter; for one of an effect it is its coordinate, whose prior is standard normal. Many
+    simulations are linear in a parameter, such as a starting level, but not in the coordinate of its uniform prior.
+
+    Parameters
+    ----------
+    model
+        The model.
+    z
+        Coordinates at which the tangent touches, (n_params,).
+    view
+        What is simulated there, (n_points,).
+    slopes
+        Its derivatives, (n_params, n_points); 0 for coordinates of effects on the readings.
+    """
+
+    model: Model
+    z: FloatArray
+    view: FloatArray
+    slopes: FloatArray
+
+    @classmethod
+    def of(cls, found: Fit) -> Self | None:
+        """Return the tangent at a fit; None if the model does not simulate readings, or not all of them are finite.
+
+        A light sensor simulates what each of its Gaussians sees. Also None where parameters have no coordinates of
+        their own (`Null.coordinates`).
+        """
+        model, is_upstream = found.model, np.ones(found.model.n_params, dtype=np.bool_)
+        for effect in filter(acts_on_readings, model.effects):
+            is_upstream[model.coordinate_slice(effect.name)] = False
+        upstream = np.flatnonzero(is_upstream)
+        points, steps = difference_points_and_steps(found.z)
+        theta = model.sensor.theta(found.z[None, : model.sensor.n_params])
+        if model.sensor.coordinates(theta) is None:
+            return None
+        views = model.chain.simulated_view(model.theta(points[[0, *(1 + upstream)]]), model.plan)
+        if not isinstance(views, np.ndarray) or not np.isfinite(views).all():
+            return None
+        slopes = np.zeros((model.n_params, views.shape[1]))
+        slopes[upstream] = (views[1:] - views[0]) / steps[upstream, None]
+        return cls(model, found.z, views[0], slopes)
+
+    @cached_property
+    def _n_own(self) -> int:
+        return self.model.sensor.n_params
+
+    def _theta_by_coordinates(self, z: FloatArray) -> FloatArray:
+        """Return the derivative of each of the null's parameters by its coordinate, (n_samples, n_own)."""
+        theta = self.model.sensor.theta
+        return np.asarray((theta(z[:, : self._n_own] + _STEP) - theta(z[:, : self._n_own] - _STEP)) / (2 * _STEP))
+
+    @cached_property
+    def _theta_and_derivatives(self) -> tuple[FloatArray, FloatArray]:
+        z = self.z[None]
+        return self.model.sensor.theta(z[:, : self._n_own]), self._theta_by_coordinates(z)
+
+    def straightened(self, z: FloatArray) -> FloatArray:
+        """Return the straight coordinates of coordinates, (n_samples, n_params) both."""
+        theta, derivatives = self._theta_and_derivatives
+        own = self.z[: self._n_own] + (self.model.sensor.theta(z[:, : self._n_own]) - theta) / derivatives
+        return np.concatenate([own, z[:, self._n_own :]], axis=1)
+
+    def coordinates(self, straight: FloatArray) -> FloatArray:
+        """Return the coordinates of straight ones, (n_samples, n_params) both; infinite outside the prior's support."""
+        theta, derivatives = self._theta_and_derivatives
+        own = self.model.sensor.coordinates(theta + (straight[:, : self._n_own] - self.z[: self._n_own]) * derivatives)
+        assert own is not None
+        return np.concatenate([own, straight[:, self._n_own :]], axis=1)
+
+    def log_volume(self, z: FloatArray) -> FloatArray:
+        """Return the log of the volume of straight coordinates per volume of coordinates, (n_samples,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stretched = np.log(np.abs(self._theta_by_coordinates(z) / self._theta_and_derivatives[1]))
+        return np.asarray(stretched.sum(axis=1))
+
+    def predict(self, z: FloatArray) -> FloatArray:
+        """Return approximate readings of each row, (n_samples, n_params) -> (n_samples, n_points)."""
+        view = self.view + (self.straightened(z) - self.z) @ self.slopes
+        return self.model.chain.readings_from_simulated_view(view, self.model.theta(z), self.model.plan)
+
+
+def acts_on_readings(effect: NamedEffect[Any]) -> bool:
+    """Return whether an effect changes readings that are simulated already."""
+    return effect.stage >= Stage.SEEN
+
+
+_REACH = 10.0  # of the grid to either side of the fit, in sds of Laplace's approximation
+_WIDER = 3.0  # factor on the reach until both ends of the grid are improbable
+_IMPROBABLE = 10.0  # nats below the best node
+_N_NODES = 161
+_GRID_STEP = 1e-5  # for differences
+_BLOCK = 2_000_000  # numbers in memory for one block of nodes
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionallyLinearDensity:
+    """A density of a fit's coordinates: a grid in one of them, and at each node a mixture of normals in the others.
+
+    Those are the value of the effect's amplitude, in units of its typical size, and the straight coordinates (see
+    `LinearView`) of every other parameter.
+
+    Parameters
+    ----------
+    view
+        The tangent of the simulation.
+    at
+        Index of the coordinate of the grid.
+    amplitude
+        The amplitude.
+    nodes
+        The grid, equally spaced, (n_nodes,).
+    log_shares
+        Log probability of each node and component, (n_nodes, n_components).
+    means
+        Means of the others, (n_nodes, n_components, n_params - 1).
+    roots
+        Lower Cholesky factors of their precisions, (n_nodes, n_components, n_params - 1, n_params - 1).
+    """
+
+    view: LinearView
+    at: int
+    amplitude: AmplitudeGroup
+    nodes: FloatArray
+    log_shares: FloatArray
+    means: FloatArray
+    roots: FloatArray
+
+    @classmethod
+    def of(cls, found: Fit, law: NoiseLaw, recording: Recording, covariance: FloatArray, sd: float) -> Self | None:
+        """Return the density over the least known of the coordinates that can be gridded; None if there is none.
+
+        It can be that of an effect on the readings, without change points, with one amplitude of either sign.
+
+        Parameters
+        ----------
+        found, law, recording
+            The fit, the law of its noise, and what was fitted.
+        covariance
+            Of the coordinates, by Laplace's approximation, (n_params, n_params).
+        sd
+            Of a whitened reading.
+        """
+        able = list(_grid_coordinates_with_amplitudes(found))
+        if not able:
+            return None
+        view = LinearView.of(found)
+        if view is None:
+            return None
+        at, amplitude = max(able, key=lambda each: covariance[each[0], each[0]])
+        on_grid = partial(cls._on_grid, view, found, law, recording, sd, at, amplitude)
+        reach = _REACH * math.sqrt(covariance[at, at])
+        low, high = found.z[at] - reach, found.z[at] + reach
+        while (out := on_grid(low, high)) is not None and not out._ends_are_improbable and high - low < 2 * FARTHEST:
+            reach *= _WIDER
+            low, high = max(found.z[at] - reach, -FARTHEST), min(found.z[at] + reach, FARTHEST)
+        return None if out is None else on_grid(*out._probable_range)
+
+    @classmethod
+    def _on_grid(
+        cls,
+        view: LinearView,
+        found: Fit,
+        law: NoiseLaw,
+        recording: Recording,
+        sd: float,
+        at: int,
+        amplitude: AmplitudeGroup,
+        low: float,
+        high: float,
+    ) -> Self | None:
+        nodes = np.asarray(np.linspace(low, high, _N_NODES), dtype=np.float64)
+        rest = np.delete(np.arange(len(found.z)), at)
+        own = _number_without(at, amplitude.at[0])
+        x = found.z[rest]
+        x[own] = amplitude.values(found.z[None, list(amplitude.at)])[0, 0]
+        moved = x + np.concatenate([np.zeros((1, len(x))), _GRID_STEP * np.eye(len(x))])
+        points = np.tile(_inserted(moved, at, amplitude), (len(nodes), 1, 1))
+        points[:, :, at] = nodes[:, None]
+        sigma = law.likeliest_sigma(law(found.residuals)[:, None])
+        n_at_once = max(1, _BLOCK // (len(moved) * len(found.residuals)))
+        parts = [
+            _quadratic_log_likelihood(view, law, recording, points[first : first + n_at_once], x, sigma, sd)
+            for first in range(0, len(nodes), n_at_once)
+        ]
+        height, downhill, curvature = (np.concatenate(part) for part in zip(*parts, strict=True))
+        if not (np.isfinite(height).all() and np.isfinite(curvature).all()):
+            return None
+        precision = np.ones((len(amplitude.sds), len(x)))
+        precision[:, own] = amplitude.sds**-2.0
+        every = curvature[:, None] + precision[:, :, None] * np.eye(len(x))
+        roots = np.asarray(np.linalg.cholesky(every), dtype=np.float64)
+        means = np.linalg.solve(every, downhill[:, None, :, None])[..., 0]
+        volume = np.log(np.diagonal(roots, axis1=2, axis2=3)).sum(axis=2) - 0.5 * np.log(precision).sum(axis=1)
+        log_prior = -0.5 * nodes**2
+        log_shares = (height + log_prior)[:, None] + 0.5 * np.einsum("ncj,nj->nc", means, downhill) - volume
+        return cls(view, at, amplitude, nodes, log_shares - logsumexp(log_shares), means, roots)
+
+    @cached_property
+    def _own(self) -> int:
+        """Number of the amplitude among the coordinates without that of the grid."""
+        return _number_without(self.at, self.amplitude.at[0])
+
+    @cached_property
+    def _probable_mask(self) -> BoolArray:
+        """Mask of the nodes that are not improbable, (n_nodes,)."""
+        of_nodes = logsumexp(self.log_shares, axis=1)
+        return np.asarray(of_nodes > of_nodes.max() - _IMPROBABLE)
+
+    @property
+    def _ends_are_improbable(self) -> bool:
+        # Not the outermost nodes alone: between two branches of a hyperbola is a narrow gap.
+        n = len(self.nodes) // 8
+        return not (self._probable_mask[:n].any() or self._probable_mask[-n:].any())
+
+    @property
+    def _probable_range(self) -> tuple[float, float]:
+        """The range of the nodes that are not improbable, with one more on either side."""
+        first, last = np.flatnonzero(self._probable_mask)[[0, -1]]
+        return float(self.nodes[max(first - 1, 0)]), float(self.nodes[min(last + 1, len(self.nodes) - 1)])
+
+    def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw coordinates, (n_samples, n_params)."""
+        shares = np.exp(self.log_shares).ravel()
+        node, component = np.divmod(
+            rng.choice(len(shares), n_samples, p=shares / shares.sum()), self.log_shares.shape[1]
+        )
+        eps = rng.standard_normal((n_samples, self.means.shape[2], 1))
+        apart = np.linalg.solve(self.roots[node, component].transpose(0, 2, 1), eps)[..., 0]
+        value = self.nodes[node] + (rng.random(n_samples) - 0.5) * (self.nodes[1] - self.nodes[0])
+        middle = self._interpolated_means(value)[np.arange(n_samples), component]
+        out = _inserted(middle + apart, self.at, self.amplitude)
+        out[:, self.at] = value
+        return self.view.coordinates(out)
+
+    def log_density(self, z: FloatArray) -> FloatArray:
+        """Return the log density of coordinates, up to a constant, (n_samples, n_params) -> (n_samples,)."""
+        x, at = np.delete(self.view.straightened(z), self.at, axis=1), list(self.amplitude.at)
+        x[:, self._own] = self.amplitude.values(z[:, at])[:, 0]
+        node = self._nearest_nodes(z[:, self.at])
+        apart = x[:, None] - self._interpolated_means(z[:, self.at])
+        eps = np.einsum("ncji,ncj->nci", self.roots[node], apart)
+        volume = np.log(np.diagonal(self.roots[node], axis1=2, axis2=3)).sum(axis=2)
+        in_values = logsumexp(self.log_shares[node] + volume - 0.5 * np.sum(eps**2, axis=2), axis=1)
+        # From a density of the amplitude's value to that of its coordinate.
+        log_prior = self.amplitude.log_prior_of_value(x[:, self._own])
+        with np.errstate(invalid="ignore"):
+            out = in_values - 0.5 * z[:, at[0]] ** 2 - log_prior + self.view.log_volume(z)
+        # Outside the support of the null's prior: there the posterior is 0, whatever this density.
+        return np.where(np.isfinite(out), out, 0.0)
+
+    def _interpolated_means(self, value: FloatArray) -> FloatArray:
+        """Return the means of all components at values of the grid's coordinate, (n, n_components, n_params - 1)."""
+        position = (value - self.nodes[0]) / (self.nodes[1] - self.nodes[0])
+        below = np.clip(np.floor(position), 0, len(self.nodes) - 2).astype(np.int64)
+        share = (position - below)[:, None, None]
+        return np.asarray((1 - share) * self.means[below] + share * self.means[below + 1])
+
+    def _nearest_nodes(self, value: FloatArray) -> IntArray:
+        spacing = self.nodes[1] - self.nodes[0]
+        nearest = np.clip(np.rint((value - self.nodes[0]) / spacing), 0, len(self.nodes) - 1)
+        return np.asarray(nearest, dtype=np.int64)
+
+
+def _quadratic_log_likelihood(
+    view: LinearView,
+    law: NoiseLaw,
+    recording: Recording,
+    points: FloatArray,
+    x: FloatArray,
+    sigma: FloatArray,
+    sd: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the log likelihood at x = 0, its gradient there and minus its second derivatives, at each node.
+
+    `points` (n_nodes, n_rest + 1, n_params) are the coordinates of x, and of x moved along each of its n_rest axes;
+    the result has shapes (n_nodes,), (n_nodes, n_rest), (n_nodes, n_rest, n_rest).
+    """
+    n, n_moved, n_params = points.shape
+    predicted = view.predict(points.reshape(-1, n_params))[:, recording.usable]
+    with np.errstate(all="ignore"):  # of predictions that ran away: not finite in the result
+        whitened = law((recording.readings[recording.usable] - predicted).T).T.reshape(n, n_moved, -1)
+        at_x, sigmas = whitened[:, 0].T, np.broadcast_to(sigma, n)
+        height = -law.minus_log_likelihood(at_x, sigmas)
+        normal = law.normal_pseudo_residuals(at_x, sigmas).T
+        slopes = (whitened[:, :1] - whitened[:, 1:]) / (_GRID_STEP * sd)
+        curvature, gradient = slopes @ slopes.transpose(0, 2, 1), np.einsum("nij,nj->ni", slopes, normal) / sd
+    height = height - gradient @ x - 0.5 * np.einsum("i,nij,j->n", x, curvature, x)
+    return height, gradient + curvature @ x, curvature
+
+
+def _number_without(at: int, other: int) -> int:
+    """Return the number of a coordinate among those without the one at `at`."""
+    return other - (other > at)
+
+
+def _inserted(x: FloatArray, at: int, amplitude: AmplitudeGroup) -> FloatArray:
+    """Return coordinates, (n, n_params), of all but one in which an amplitude is a value, (n, n_params - 1)."""
+    out, own = x.copy(), _number_without(at, amplitude.at[0])
+    out[:, [own]] = amplitude.coordinates(x[:, [own]])
+    return np.insert(out, at, 0.0, axis=1)
+
+
+def _grid_coordinates_with_amplitudes(found: Fit) -> Iterator[tuple[int, AmplitudeGroup]]:
+    """List the nonlinear coordinates of the effects on the readings that have one amplitude, which has either sign."""
+    groups = {group.at: group for group in two_sided_amplitude_groups(found) if len(group.at) == 1}
+    for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
+        amplitudes = tuple(columns.start + k for k in effect.amplitudes)
+        if acts_on_readings(effect) and not effect.has_change_point and amplitudes in groups:
+            for at in range(columns.start, columns.stop):
+                if at not in amplitudes:
+                    yield at, groups[amplitudes]

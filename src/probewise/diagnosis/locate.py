@@ -1,0 +1,328 @@
+"""The p-value of a fit, and the windows of each covariate in which its residuals are significant.
+
+The null distribution of every statistic comes from one pivotal bootstrap, r* = P eps: residuals of a linearised fit to
+pure noise (P projects onto what the fit leaves), without refits. It accounts for multiple comparisons, because each
+draw is compared in the same ways.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.templates import TemplateBank
+from probewise.effects import NamedEffect
+from probewise.recordings.plan import Plan
+from probewise.systems.table import published_covariate
+
+
+@dataclass(frozen=True, eq=False)
+class Covariate:
+    """One covariate (time, place, level, ...) of the usable readings.
+
+    `rows` (n_rows,): indices of the usable readings for which it is defined; `values` (n_rows,): its values there, in
+    its unit; `groups`: whether it is categorical (an orientation, a scan); `scan`: name of the scan to which it is
+    restricted, or None.
+    """
+
+    name: str
+    values: FloatArray
+    rows: IntArray
+    groups: bool = False
+    scan: str | None = None
+
+    @property
+    def published_name(self) -> str:
+        """Its name in results: without the prefix "column:" where no covariate of a table has that name."""
+        return published_covariate(self.name)
+
+
+ALARM = 0.01
+"""p-value of the global test, at or below which the model counts as incomplete."""
+
+_LARGEST_P = 0.05
+_LEAST_ROWS = 3
+_RUNS = ("scan", "run")  # covariates that number parts of the recording
+_ABSORBED = 1e-8  # of a window's length: below it, what the fit leaves is rounding
+_SIGNIFICANT = 0.05  # of the maximum of an effect: below it, it is negligible
+_PLAIN = 0.25  # p-value of the first draws above which more draws are not needed
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A window of a covariate in which residuals, or an effect, are significant, with the curve of mean residuals.
+
+    `start`, `end` in the covariate's unit; None for a whole `scan`. `z`: the statistic of the window in noise sds; for
+    an effect, its lambda. The curve is the mean residual in bins of the covariate, with the noise sd of that mean.
+    `values` (n_usable,): the covariate at each usable reading, NaN if undefined. `without_effect`: whether the values
+    are readings predicted without the effect.
+    """
+
+    covariate: str
+    scan: str | None
+    start: float | None
+    end: float | None
+    p_value: float
+    z: float
+    curve_at: FloatArray
+    curve_mean: FloatArray
+    curve_sd: FloatArray
+    values: FloatArray | None = None
+    without_effect: bool = False
+
+    def __post_init__(self) -> None:
+        if self.values is not None:
+            object.__setattr__(self, "values", read_only_floats(self.values))
+        for name in ("curve_at", "curve_mean", "curve_sd"):
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
+
+    @property
+    def figure_name(self) -> str:
+        """Name of the place's figure file: "witness_COVARIATE.svg" or "witness_COVARIATE_SCAN.svg"."""
+        where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
+        return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
+
+    def rows_among(self, plan: Plan, usable: IntArray) -> BoolArray:
+        """Return the mask of the usable readings, of a plan's rows `usable` (n_usable,), that lie in it."""
+        out = np.ones(len(usable), dtype=np.bool_)
+        if self.scan is not None:
+            out &= np.array(plan.scan_names)[plan.scan[usable]] == self.scan
+        return out & self._within
+
+    @property
+    def _within(self) -> BoolArray:
+        """Mask of the usable readings whose covariate lies in the window."""
+        values = np.zeros(0) if self.values is None else self.values
+        if self.start is None or self.end is None:
+            return np.isfinite(values)
+        return np.asarray((values >= self.start) & (values <= self.end))
+
+    def overlap(self, other: Place) -> float:
+        """Return the readings in both windows, as a share of those in either."""
+        either = int(np.sum(self._within | other._within))
+        return float(np.sum(self._within & other._within)) / either if either else 0.0
+
+
+def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], draws: FloatArray) -> float:
+    """Test for a missing effect on the mean, by the weighted mean of the Bayes factors of all templates.
+
+    Parameters
+    ----------
+    problem
+        The fit under the noise model found.
+    banks
+        All templates compared, with labels; each label has equal weight, divided among its templates.
+    draws
+        Residuals under the null, (n_rows, n_draws). Only the first fifth is used if that gives a p-value above 0.25.
+
+    Returns
+    -------
+    The p-value: the share of draws with as large a mean; for a mean b beyond their resolution, the bound 1/b.
+    """
+    families = [(number, label) for number, bank in enumerate(banks) for label in bank.labels]
+    names = list(dict.fromkeys(families))
+    codes = np.array([names.index(family) for family in families])
+    log_weight = -np.log(np.bincount(codes)[codes]) - math.log(len(names))
+
+    def log_mean_bayes_factor(residuals: FloatArray) -> FloatArray:
+        scores = np.concatenate([bank.log_bayes_factors(problem, residuals) for bank in banks])
+        return np.asarray(logsumexp(scores + log_weight[:, None], axis=0))
+
+    seen = float(log_mean_bayes_factor(problem.residual[:, None])[0])
+    n_draws = draws.shape[1]
+    if seen > math.log(10 * n_draws):
+        return math.exp(-seen)
+    above = np.zeros(0)
+    for first, last in ((0, n_draws // 5), (n_draws // 5, n_draws)):
+        above = np.append(above, log_mean_bayes_factor(draws[:, first:last]) >= seen)
+        if above.mean() > _PLAIN:
+            break
+    return float((1 + above.sum()) / (1 + len(above)))
+
+
+def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
+    """Build windows over the sorted values of a covariate: of half the readings, a quarter and so on, half overlapping.
+
+    Equal values stay together. Of a categorical covariate, one window per value.
+
+    Returns
+    -------
+    Indicator columns, (n_points, n_windows), and the covariate's least and largest value in each window.
+    """
+    values, rows = covariate.values, covariate.rows
+    columns: list[FloatArray] = []
+    ends: list[tuple[float, float]] = []
+
+    def add_window(members: FloatArray, low: float, high: float) -> None:
+        column = np.zeros(n_points)
+        column[rows[members.astype(np.int64)]] = 1.0
+        columns.append(column)
+        ends.append((low, high))
+
+    if covariate.groups:
+        for value in np.unique(values):
+            add_window(np.flatnonzero(values == value).astype(np.float64), float(value), float(value))
+        return np.stack(columns, axis=1), ends
+    order = np.argsort(values, kind="stable")
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]])
+    n = len(values)
+    width = n // 2
+    looked: set[tuple[int, int]] = set()
+    while width >= _LEAST_ROWS and len(columns) <= 160:
+        for first in sorted({*range(0, n - width + 1, max(width // 2, 1)), n - width}):
+            # Equal values stay together: a window that split them would select by something else.
+            low = int(edges[np.searchsorted(edges, first)])
+            high = int(edges[np.searchsorted(edges, first + width)])
+            if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
+                looked.add((low, high))
+                members = order[low:high]
+                add_window(members.astype(np.float64), float(values[members[0]]), float(values[members[-1]]))
+        width //= 2
+    if not columns:
+        return np.zeros((n_points, 0)), []
+    return np.stack(columns, axis=1), ends
+
+
+def significant_places(
+    problem: Linearised,
+    covariates: Sequence[Covariate],
+    scan_names: Sequence[str],
+    residuals: FloatArray,
+    draws: FloatArray,
+) -> list[Place]:
+    """Return, for each covariate, its most significant window if that has p up to 0.05; most significant first.
+
+    Parameters
+    ----------
+    problem
+        The fit under the noise model found.
+    covariates
+        Covariates to search.
+    scan_names
+        Names of the scans or runs, for the covariates `scan` and `run`.
+    residuals
+        Reading minus prediction, (n_points,), for the mean curves.
+    draws
+        Residuals under the null, (n_rows, n_draws).
+    """
+    out: list[Place] = []
+    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_kept)
+    own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_kept) or 1.0
+    for covariate in covariates:
+        columns, ends = window_columns_and_bounds(covariate, problem.n_points)
+        if not ends:
+            continue
+        whitened = problem.whiten(columns)
+        projected = problem.project_whitened(whitened)
+        lengths = np.linalg.norm(projected, axis=0)
+        there = lengths > _ABSORBED * np.linalg.norm(whitened, axis=0)
+        if not there.any():
+            continue
+        units = projected[:, there] / lengths[there]
+        kept = [ends[k] for k in np.flatnonzero(there)]
+        scores = np.abs(units.T @ problem.residual) / own_norm
+        null = np.max(np.abs(units.T @ draws) / norms, axis=0)
+        best = int(np.argmax(scores))
+        p_value = (1 + int(np.sum(null >= scores[best]))) / (1 + draws.shape[1])
+        if p_value > _LARGEST_P:
+            continue
+        start: float | None
+        end: float | None
+        start, end = kept[best]
+        scan = covariate.scan
+        if covariate.name in _RUNS:
+            scan, start, end = scan_names[int(kept[best][0])], None, None
+        curve = _mean_curve_fields(covariate, residuals, problem.sd)
+        out.append(Place(covariate.published_name, scan, start, end, p_value, float(scores[best]), **curve))
+    return sorted(out, key=lambda place: (place.p_value, -place.z))
+
+
+def places_of_effect(
+    effect: NamedEffect[Any],
+    change: FloatArray,
+    covariate: Covariate,
+    scans: Covariate | None,
+    plan: Plan,
+    residuals: FloatArray,
+    *,
+    p_value: float,
+    size: float,
+    sd: float,
+) -> list[Place]:
+    """Locate a named effect: the interval of a covariate in which it is at least half its maximum.
+
+    In `level` a twentieth suffices; in `direction` its deviation from its mean counts; in `run`, it is the run of
+    the largest change. The list holds one place, or, for an effect bound to scans, one per scan in which it is a
+    twentieth of its maximum or more.
+
+    Parameters
+    ----------
+    effect
+        The effect.
+    change
+        Its change of the readings, (n_points,).
+    covariate
+        Covariate in which to locate it.
+    scans
+        The covariate `scan`, if there are several.
+    plan
+        Plan of the usable readings.
+    residuals
+        Residuals of the null, (n_points,), for the mean curve.
+    p_value, size
+        p-value of the global test, and the effect's lambda.
+    sd
+        Noise sd of a reading.
+    """
+    name = covariate.name
+    if name == "run":
+        strongest = plan.scan_names[int(plan.scan[np.argmax(np.abs(change))])]
+        return [Place(name, strongest, None, None, p_value, size, **_mean_curve_fields(covariate, residuals, sd))]
+    if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
+        curve = _mean_curve_fields(scans, residuals, sd)
+        return [
+            Place("scan", scan, None, None, p_value, size, **curve)
+            for scan in _scans_with_effect(effect.scans, change, plan)
+        ]
+    there = change[covariate.rows]
+    # The levels absorb what all readings share: where nearly all move one way, those at rest stand out.
+    strength = np.abs(there - there.mean() if name == "direction" else there)
+    # An effect with a threshold in level begins where it is first significant.
+    significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
+    values = covariate.values[significant]
+    curve = _mean_curve_fields(covariate, residuals, sd)
+    start, end = float(values.min()), float(values.max())
+    return [Place(covariate.published_name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
+
+
+def _scans_with_effect(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
+    """List the scans in which an effect's change is a twentieth of its largest or more, strongest first."""
+    # A scan without usable readings is not in the plan, and a name may return.
+    rows = {scan: np.array([name == scan for name in plan.scan_names])[plan.scan] for scan in scans}
+    strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
+    significant = [scan for scan in scans if strength[scan] >= _SIGNIFICANT * max(strength.values())]
+    return sorted(significant, key=lambda scan: -strength[scan])
+
+
+def _mean_curve_fields(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
+    """Return fields of a `Place`: the covariate at each reading, and the curve of mean residuals in bins of it."""
+    values, mine = covariate.values, residuals[covariate.rows]
+    if covariate.groups:
+        parts = [np.flatnonzero(values == value) for value in np.unique(values)]
+    else:
+        parts = np.array_split(np.argsort(values, kind="stable"), min(30, max(len(values) // 4, 1)))
+    by_row = np.full(len(residuals), np.nan)
+    by_row[covariate.rows] = values
+    return {
+        "values": by_row,
+        "curve_at": np.array([values[p].mean() for p in parts]),
+        "curve_mean": np.array([mine[p].mean() for p in parts]),
+        "curve_sd": np.array([sd / math.sqrt(len(p)) for p in parts]),
+    }

@@ -1,1 +1,0 @@
-"""Distributions of the noise (normal, heavy-tailed, correlated, rounded), and noise models built from effects."""

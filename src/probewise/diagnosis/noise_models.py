@@ -1,0 +1,319 @@
+"""Noise models: effects on the noise, discretised to nodes under which the evidence of a fit is computed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.noise_law import (
+    NoiseLaw,
+    RoundedNormal,
+    n_rows_since_previous_usable,
+    order_by_scan,
+    previous_usable,
+)
+from probewise.diagnosis.noise_memory import with_known_wide_readings
+from probewise.effects import FittedReadings, NoiseEffect, lattice_step
+from probewise.inference import sd_floor
+from probewise.recordings.plan import Recording
+from probewise.sensor.stages import NoiseParameters, effects_with_columns
+
+_FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
+_MANY = 12  # nodes of one effect above which they are thinned before combination with another's
+_APART = 0.3  # initial spacing of nodes in the log of half a step over the noise sd
+_WIDEST, _NARROWEST = -6, 9  # range of nodes: noise sds from 3 steps, or the residual rms, to a thirtieth of a step
+_UNLIKELY = 15.0  # nats behind the best from which nodes of noise with rounding are dropped
+_HIDDEN = 0.6  # sd over step from which rounding is negligible (lattice sum 1 + 2 exp(-2 pi^2 0.36) = 1.0016)
+
+_FINE = 0.01  # noise sds: tolerance of a lost reading's value without rounding
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseNodes:
+    """The nodes of a noise model about a fit: parameters (n_nodes, n_params), distributions and log prior weights."""
+
+    settings: FloatArray
+    laws: tuple[NoiseLaw, ...]
+    log_weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """A set of effects on the noise.
+
+    Parameters
+    ----------
+    effects
+        The effects; empty for white noise.
+    recording
+        What was read.
+    likely
+        For some effects by name, the nodes to use, (n_nodes, n_params), and their log prior weights.
+    rounding
+        Rounding step of all readings, if there is no other noise effect, or 0.
+    least_sd
+        Least plausible sd of a reading, given those before it.
+    """
+
+    effects: tuple[NoiseEffect, ...]
+    recording: Recording
+    likely: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    rounding: float = 0.0
+    least_sd: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its effects; () for white noise."""
+        return tuple(effect.name for effect in self.effects)
+
+    def columns_of_effect(self, name: str) -> slice:
+        """Return the slice of one effect's parameters in the settings of nodes."""
+        return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
+
+    def coarse_nodes_by_effect(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return, for each effect with one parameter and over twelve nodes, every third node and its log weight."""
+        out = {}
+        for effect in self.effects:
+            nodes = effect.bank()[:, 0, :]
+            if len(nodes) > _MANY and nodes.shape[1] == 1:
+                out[effect.name] = nodes[1::3], np.full(len(nodes[1::3]), -math.log(len(nodes[1::3])))
+        return out
+
+    def nodes_for_predictions(self, predicted: FloatArray) -> NoiseNodes:
+        """Return the product grid of the effects' nodes, with the noise law and log weight at each.
+
+        `predicted` are predictions of the usable rows, (n_usable,). With `rounding`, each node is a noise sd.
+        """
+        residuals, sd = self._residuals_and_rough_sd(predicted)
+        rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._usable_readings)
+        banks = [self._weighted_nodes(effect, residuals / sd, rows) for effect in self.effects]
+        settings, log_weights = np.zeros((1, 0)), np.zeros(1)
+        for bank, log_each in banks:
+            settings = np.concatenate(
+                [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
+            )
+            log_weights = (log_weights[:, None] + log_each).ravel()
+        laws = self.laws_at(settings, predicted)
+        if self.rounding:
+            # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
+            (law,) = laws
+            halves, beside = _sd_nodes_with_rounding(
+                law(self._usable_readings - predicted), 0.5 * self.rounding, law.n_kept, law.sd_beside_rounding
+            )
+            laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
+            return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
+        return NoiseNodes(settings, laws, log_weights)
+
+    def laws_at(self, settings: FloatArray, predicted: FloatArray) -> tuple[NoiseLaw, ...]:
+        """Return the noise distributions at settings of the parameters, (n_nodes, n_params), without rounding.
+
+        `predicted` are predictions of the usable rows, (n_usable,).
+        """
+        residuals, sd = self._residuals_and_rough_sd(predicted)
+        span = float(np.ptp(predicted)) or 1.0
+        noise = self._noise_parameters_at_nodes(settings, np.clip((predicted - predicted.min()) / span, 0.0, 1.0))
+        far = np.abs(residuals) > _FAR * sd
+        laws = (self._law_at_node(noise, k, far) for k in range(len(settings)))
+        left = self._usable_readings - predicted
+        return tuple(with_known_wide_readings(law, left) if law.walk.size and law.share else law for law in laws)
+
+    def _residuals_and_rough_sd(self, predicted: FloatArray) -> tuple[FloatArray, float]:
+        """Return the residuals over their declared relative sds, (n_usable,), and a robust estimate of their sd."""
+        residuals = (self._usable_readings - predicted) / self._relative_sd
+        # Rounded readings can all be as predicted; rounding errors alone are not outliers.
+        free = residuals[~self._censored] if self._censored.any() else residuals
+        sd = max(float(np.median(np.abs(free))) / 0.6745, self._rounding_step / math.sqrt(12))
+        return residuals, sd or 1.0
+
+    def _weighted_nodes(
+        self, effect: NoiseEffect, residuals: FloatArray, rows: FittedReadings
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the nodes of one effect, (n_nodes, n_params), and their log weights, (n_nodes,)."""
+        if effect.name in self.likely:
+            return self.likely[effect.name]
+        return effect.weighed_nodes(residuals, rows)
+
+    def _noise_parameters_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
+        """Return the relative sds, correlations, ... of the noise at all nodes, with every noise effect applied.
+
+        `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) predictions from 0 to 1.
+        """
+        plan, usable = self.recording.plan, self.recording.usable
+        everywhere = np.zeros((1, len(plan)))
+        everywhere[0, usable] = seen
+        noise = NoiseParameters(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
+        for effect, own in effects_with_columns(self.effects):
+            noise = effect.apply(noise, settings[:, own], plan)
+        return noise
+
+    def _law_at_node(self, noise: NoiseParameters, node: int, far: BoolArray) -> NoiseLaw:
+        def value_at_node(values: FloatArray) -> float:
+            return float(values[min(node, len(values) - 1), 0])
+
+        sd = noise.sd[min(node, len(noise.sd) - 1)]
+        sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
+        lost_share = value_at_node(noise.lost_share)
+        value = value_at_node(noise.lost_value)
+        lost = np.zeros_like(far)
+        if lost_share > 0:
+            lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * self._span + 1e-14 * abs(value))
+        carry = np.where(
+            self._n_rows_since_previous_in_scan > 0,
+            value_at_node(noise.rho) ** np.maximum(self._n_rows_since_previous_in_scan, 1),
+            0.0,
+        )
+        # The noise of a censored reading is not known: none is correlated with it.
+        unknown = lost | self._censored
+        carry[unknown] = 0.0
+        above = self._previous_in_scan
+        carry[(above >= 0) & unknown[above]] = 0.0
+        walk = (
+            value_at_node(noise.walk) ** 2 * self._n_rows_since_previous_in_table if np.any(noise.walk) else np.zeros(0)
+        )
+        log_extra = 0.0
+        if lost_share > 0:
+            n_lost, cells = (
+                int(lost.sum()),
+                max(self._span / self._lost_value_resolution, 1.0),
+            )
+            # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
+            log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
+            log_extra += int((lost & self._censored).sum()) * math.log(self._lost_value_resolution)
+            log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
+            log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
+        return NoiseLaw(
+            sd,
+            carry,
+            lost,
+            value_at_node(noise.wide_share),
+            value_at_node(noise.wide_times),
+            log_extra,
+            least=self.least_sd,
+            walk=walk,
+            before=np.maximum(above, 0)
+            if self._has_interleaved_scans and np.any(carry)
+            else np.zeros(0, dtype=np.int64),
+            censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),
+        )
+
+    @cached_property
+    def _censored(self) -> BoolArray:
+        """Mask of the usable readings at an end of the instrument's range, (n_usable,)."""
+        return self.recording.censored[self.recording.usable]
+
+    @cached_property
+    def _previous_in_scan(self) -> IntArray:
+        return previous_usable(self.recording)
+
+    @cached_property
+    def _has_interleaved_scans(self) -> bool:
+        above = self._previous_in_scan
+        return bool(np.any((above >= 0) & (above != np.arange(len(above)) - 1)))
+
+    @cached_property
+    def _usable_readings(self) -> FloatArray:
+        return self.recording.readings[self.recording.usable]
+
+    @cached_property
+    def _span(self) -> float:
+        """Range of the usable readings."""
+        return float(np.ptp(self._usable_readings))
+
+    @cached_property
+    def _n_rows_since_previous_in_scan(self) -> IntArray:
+        return n_rows_since_previous_usable(self.recording)
+
+    @cached_property
+    def _n_rows_since_previous_in_table(self) -> FloatArray:
+        """Number of rows back to the previous usable reading, even of another run; at first, to before the table."""
+        return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
+
+    @cached_property
+    def _relative_sd(self) -> FloatArray:
+        return self.recording.relative_sd[self.recording.usable]
+
+    @cached_property
+    def _lost_value_resolution(self) -> float:
+        """Width of a cell, in reading units: lost readings have one value to within it."""
+        return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
+
+    @cached_property
+    def _rounding_step(self) -> float:
+        """Rounding step of all readings, 0 if there is none."""
+        return lattice_step(self._usable_readings)
+
+
+def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
+    """Return the log prior probability of the one value that lost readings have.
+
+    Half is for the ends of the declared range, and half for any of `cells` possible values; without ends, all of it.
+    """
+    if not ends:
+        return -math.log(cells)
+    at_end = any(abs(value - end) <= 1e-9 * (max(ends) - min(ends) + abs(end)) for end in ends)
+    return math.log(0.5 * at_end / len(ends) + 0.5 / cells)
+
+
+def _sd_nodes_with_rounding(
+    residuals: FloatArray, half_step: float, n_points: int, sd: float | FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return nodes for the noise sd of rounded readings, as half steps per sd, and log weights, (n,) both.
+
+    `residuals` are over the relative sds, (n_readings,), and `sd` those sds as `RoundedNormal` takes them.
+    Nodes are coarse, and refined about the best to the accuracy of log sigma without rounding. They extend to the
+    residual rms, in case the mean is incomplete.
+    """
+
+    def log_likelihood(halves: FloatArray) -> FloatArray:
+        sigma = half_step / halves
+        density = RoundedNormal(halves, sigma, sd)
+        return -density.minus_log_likelihood(residuals[:, None] * density.normal_sd, sigma, n_points)
+
+    rms = math.sqrt(float(residuals @ residuals) / n_points)
+    widest = math.floor(math.log(half_step / (2 * rms)) / _APART) if rms > 0 else _NARROWEST
+    x = _APART * np.arange(min(widest, _WIDEST), _NARROWEST + 1)
+    height, apart = log_likelihood(np.exp(x)), _APART
+    while apart > 1 / math.sqrt(2 * n_points):
+        apart /= 4
+        between = x[np.argmax(height)] + apart * np.array([-5, -3, -2, -1, 1, 2, 3, 5])
+        order = np.argsort(np.append(x, between))
+        x = np.append(x, between)[order]
+        height = np.append(height, log_likelihood(np.exp(between)))[order]
+    log_weights = np.log(np.gradient(x))
+    likely = height > height.max() - _UNLIKELY
+    return np.exp(x[likely]), log_weights[likely]
+
+
+def rounding_hides_noise(step: float, sd: float) -> bool:
+    """Return whether a noise sd is below 0.6 rounding steps: too coarse for a normal density of the readings."""
+    return sd < _HIDDEN * step
+
+
+def least_sd_given_rounding(recording: Recording) -> float:
+    """Return the least sd of a normal density of the readings: the usual floor, and at least 0.6 of a rounding step."""
+    # On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice.
+    return max(sd_floor(recording), _HIDDEN * lattice_step(recording.readings[recording.usable]))
+
+
+def rough_sd(recording: Recording) -> float:
+    """Estimate the noise sd without a model, from second differences within scans, few of which are at an edge.
+
+    The estimate includes rounding; equal readings are spread over a step, so that the median is not one of few values.
+    It is 0 if no three usable readings are successive.
+    """
+    order = order_by_scan(recording)
+    readings, steps = recording.readings[recording.usable][order], n_rows_since_previous_usable(recording)[order]
+    free = ~recording.censored[recording.usable][order]  # a meter that stands at its end does not scatter
+    inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1) & free[:-2] & free[1:-1] & free[2:]) + 1
+    bends = np.sort(readings[inner - 1] - 2 * readings[inner] + readings[inner + 1])
+    step = lattice_step(readings)
+    if step:
+        bends = np.round(bends / step) * step
+        first, last = np.searchsorted(bends, bends, "left"), np.searchsorted(bends, bends, "right")
+        bends = bends + step * ((np.arange(len(bends)) - first + 0.5) / (last - first) - 0.5)
+    return float(np.median(np.abs(bends))) / (0.6745 * math.sqrt(6)) if inner.size else 0.0

@@ -1,0 +1,430 @@
+"""Draws of a fit's coordinates from its posterior.
+
+Importance resampling from the closest proposal at hand, or annealing where no proposal is close enough: the densities
+between are q^(1 - beta) p^beta (Neal 2001). After each step of beta the samples are resampled by their weights and
+moved: each half by differences of the other half (ter Braak 2006), which leaves the density invariant.
+
+A quadratic surrogate of the model's predictions is cheap enough to move thousands of samples. It is fitted at steps of
+the size of the approximate posterior, so that it interpolates over the relevant region instead of extrapolating from a
+point. Negligible changes of the readings are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self, TypeAlias
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence import NoiseEvidence
+from probewise.diagnosis.fit import FARTHEST, Fit
+from probewise.diagnosis.hypothesis_problem import HypothesisProblem, log_likelihood_marginal_over_sigma
+from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.profiled import ProfiledDensity
+from probewise.errors import NotConvergedError
+from probewise.nested.weights import n_effective, power_bracket, resampled_rows
+from probewise.progress import Progress, silent
+from probewise.recordings.plan import Recording
+
+_ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
+_LEAST_OF_IT = 0.5  # least acceptable share of the target
+_EFFECTIVE = 0.5  # least effective share of the samples after a step of beta
+_AT_LAST = 3  # factor on the number of moves at beta = 1
+_LEAST_STEP = 1e-3
+
+Density: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Log densities of samples, unnormalised, (n, n_params) -> (n,)."""
+
+
+def importance_resample(
+    first: FloatArray,
+    log_q: Density,
+    log_p: Density,
+    *,
+    n_wanted: int,
+    rng: np.random.Generator,
+    least: float = _LEAST_OF_IT * _ENOUGH,
+) -> FloatArray | None:
+    """Draw from a density by importance resampling, if the effective sample size suffices.
+
+    Parameters
+    ----------
+    first
+        Samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated.
+    log_q, log_p
+        Unnormalised log densities of the proposal and the target, (n, n_params) -> (n,); `log_p` is minus infinity
+        outside its support.
+    n_wanted
+        Number of samples to draw; the effective sample size should be half of it.
+    rng
+        Source of randomness.
+    least
+        Least acceptable effective sample size, as a share of `n_wanted`.
+
+    Returns
+    -------
+    Samples in random order, (n_wanted, n_params); None if the effective sample size is too small.
+    """
+    gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
+    share = _n_distinct_effective(gain, first[:n_wanted]) / len(gain)
+    if share * len(first) < least * n_wanted:
+        return None
+    enough = min(math.ceil(_ENOUGH * n_wanted / share), len(first))
+    if enough > n_wanted:
+        more = first[n_wanted:enough]
+        gain = np.append(gain, log_p(more) - log_q(more))
+    if _n_distinct_effective(gain, first[: len(gain)]) < least * n_wanted:
+        return None
+    rows = resampled_rows(np.exp(gain - gain.max()), n_wanted, rng)
+    return np.asarray(first[rng.permutation(rows)])
+
+
+def _n_distinct_effective(log_weight: FloatArray, samples: FloatArray) -> float:
+    """Return Kish's effective sample size; samples with an equal first coordinate count as one."""
+    _, which = np.unique(samples[:, 0], return_inverse=True)
+    if not np.isfinite(log_weight).any():
+        return 0.0
+    with np.errstate(divide="ignore"):
+        return n_effective(np.log(np.bincount(which, np.exp(log_weight - log_weight.max()))))
+
+
+def draw_by_annealing(
+    first: FloatArray,
+    log_q: Density,
+    log_p: Density,
+    *,
+    n_moves: int,
+    n_wanted: int,
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> FloatArray:
+    """Draw from a density by sequential Monte Carlo, starting from samples of another one.
+
+    Parameters
+    ----------
+    first
+        Samples of the other density, (n_walkers, n_params), an even number.
+    log_q, log_p, n_wanted, rng
+        As in `importance_resample`.
+    n_moves
+        Moves of each sample after a step of beta, and between collections of samples.
+    progress
+        Called at each step of beta, and then with the number of collected samples.
+
+    Returns
+    -------
+    Samples in random order, (n_wanted, n_params), collected from the walkers every `n_moves` moves.
+
+    Raises
+    ------
+    NotConvergedError
+        If no initial sample is in the support of the target.
+    """
+    n_walkers = len(first)
+    z, heights = first, (log_q(first), log_p(first))
+    if not np.isfinite(heights[1]).any():
+        raise NotConvergedError("no sample of the approximate posterior is within the bounds of the prior")
+    beta, scale = 0.0, 1.0
+    while beta < 1.0:
+        gain = heights[1] - heights[0]
+        after = _next_beta(gain, beta)
+        kept = resampled_rows(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
+        beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
+        progress("annealing samples to the posterior", note=f"beta {beta:.2f} of 1")
+        for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):
+            z, heights, scale = _ensemble_step(z, heights, beta, scale, log_q, log_p, rng=rng)
+    harvest = [z]
+    while len(harvest) * n_walkers < n_wanted:
+        progress("sampling the posterior", len(harvest) * n_walkers, n_wanted)
+        for _ in range(n_moves):
+            z, heights, scale = _ensemble_step(z, heights, beta, scale, log_q, log_p, rng=rng)
+        harvest.append(z)
+    return np.asarray(rng.permutation(np.concatenate(harvest))[:n_wanted])
+
+
+def _next_beta(gain: FloatArray, beta: float) -> float:
+    """Find the largest beta, by bisection, at which half of the finite weights are effective samples."""
+    enough = _EFFECTIVE * np.count_nonzero(np.isfinite(gain))
+    if n_effective((1.0 - beta) * gain) >= enough:
+        return 1.0
+    low, _ = power_bracket(lambda power: (power - beta) * gain, beta, 1.0, wanted=enough, n_steps=30)
+    return min(max(low, beta + _LEAST_STEP), 1.0)
+
+
+def _ensemble_step(
+    z: FloatArray,
+    heights: tuple[FloatArray, FloatArray],
+    beta: float,
+    scale: float,
+    log_q: Density,
+    log_p: Density,
+    *,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray], float]:
+    """Move one half of the walkers by differences of the other half, then vice versa; adapt the step size."""
+    z, q, p = z.copy(), heights[0].copy(), heights[1].copy()
+    order, n = rng.permutation(len(z)), len(z) // 2
+    accepted = 0
+    for own, other in ((order[:n], order[n:]), (order[n:], order[:n])):
+        first, second = (z[rng.choice(other, len(own))] for _ in range(2))
+        length = scale * 2.38 / math.sqrt(2 * z.shape[1]) * rng.choice([1.0, 0.3], (len(own), 1))
+        to = z[own] + length * (first - second)
+        to_q, to_p = log_q(to), log_p(to)
+        inside = np.isfinite(to_q) & np.isfinite(to_p)
+        rise = (1 - beta) * (to_q[inside] - q[own][inside]) + beta * (to_p[inside] - p[own][inside])
+        taken = inside.copy()
+        taken[inside] = np.log(rng.random(len(own)))[inside] < rise
+        z[own[taken]], q[own[taken]], p[own[taken]] = to[taken], to_q[taken], to_p[taken]
+        accepted += int(taken.sum())
+    rate = accepted / len(z)
+    return z, (q, p), min(max(scale * (1.3 if rate > 0.35 else 0.75 if rate < 0.15 else 1.0), 0.05), 2.0)
+
+
+_NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected
+_RUNS_AWAY = 1e100  # of a prediction, whose square overflows: it counts as impossible
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticPredictions:
+    """Quadratic predictions at steps `e` from a point: `center` + `change_coefficients(e)` @ `changes`.
+
+    `center` (n_points,) are the predictions at the point; `changes` (n_changes, n_points) are orthonormal. Their
+    coefficients are linear in n_terms terms, the steps and products of `pairs` of steps, by `shares` (n_terms,
+    n_changes).
+    """
+
+    center: FloatArray
+    pairs: tuple[IntArray, IntArray]
+    shares: FloatArray
+    changes: FloatArray
+
+    @classmethod
+    def of(cls, predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float) -> QuadraticPredictions:
+        """Build the surrogate; it is exact, but for negligible changes, at every step, its reverse, and sums of two.
+
+        Parameters
+        ----------
+        predict
+            The model as a function of steps, (n_samples, n_params) -> (n_samples, n_points); finite at step 0.
+        n_params
+            Number of parameters, one step each.
+        sd
+            Noise sd of a reading: changes by less than 0.02 sd over all readings together are neglected.
+        """
+        first, second = np.triu_indices(n_params)
+        apart = first != second
+        one = np.eye(n_params)
+        y = predict(np.concatenate([np.zeros((1, n_params)), one, -one, one[first[apart]] + one[second[apart]]]))
+        y = np.where(np.abs(y) < _RUNS_AWAY, y, np.nan)
+        up, down, both = y[1 : n_params + 1] - y[0], y[n_params + 1 : 2 * n_params + 1] - y[0], y[2 * n_params + 1 :]
+        # Readings impossible on one side are as on the other; on both, they say nothing.
+        up, down = (np.nan_to_num(np.where(np.isnan(a), -b, a)) for a, b in ((up, down), (down, up)))
+        squares = np.empty((len(first), y.shape[1]))
+        squares[~apart] = 0.5 * (up + down)
+        squares[apart] = np.nan_to_num(both - y[0] - up[first[apart]] - up[second[apart]])
+        terms = np.concatenate([0.5 * (up - down), squares])
+        lengths, axes = np.linalg.eigh(terms @ terms.T)
+        kept = lengths > (_NEGLIGIBLE * sd) ** 2
+        root = np.sqrt(lengths[kept])
+        return cls(y[0], (first, second), axes[:, kept] * root, (axes[:, kept] / root).T @ terms)
+
+    def change_coefficients(self, e: FloatArray) -> FloatArray:
+        """Return the coefficient of each change at steps `e`, (n_samples, n_params) -> (n_samples, n_changes)."""
+        first, second = self.pairs
+        return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)
+
+
+@dataclass(frozen=True, eq=False)
+class SurrogatePosterior:
+    """An approximate posterior of coordinates z = center + e @ steps, as a function of e, (n_samples, n_params).
+
+    The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-residuals. `residual` (n_axes,), at
+    the center, and `changes` (n_axes, n_changes) are whitened, in orthonormal axes of the space that they span: n_axes
+    is n_changes + 1, or n_usable if that is less.
+    """
+
+    quadratic: QuadraticPredictions
+    center: FloatArray
+    steps: FloatArray
+    law: NoiseLaw
+    residual: FloatArray
+    changes: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        quadratic: QuadraticPredictions,
+        center: FloatArray,
+        steps: FloatArray,
+        readings: FloatArray,
+        law: NoiseLaw,
+    ) -> Self:
+        """Build from quadratic predictions at steps from `center`, the readings (n_usable,), and their noise."""
+        residual = law(readings - quadratic.center)[:, None]
+        residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
+        _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
+        normal = law.without_tail_or_rounding()
+        return cls(quadratic, center, steps, normal, turned[:, -1], turned[:, :-1])
+
+    def log_density(self, e: FloatArray) -> FloatArray:
+        """Return the unnormalised log posterior at steps e, (n_samples,); minus infinity beyond six prior sds."""
+        z = self.center + e @ self.steps
+        whitened = self.residual[:, None] - self.changes @ self.quadratic.change_coefficients(e).T
+        height = log_likelihood_marginal_over_sigma(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
+        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
+
+
+_N_WALKERS = 250
+_MOVES = 6  # of each walker after a step of beta
+_N_FIRST = 1000  # draws of a proposal
+_LEAST = 0.25  # least effective share of draws by a linear view of the simulation,
+_NEARLY_ALL = 0.8  # and where slices of the simulation itself cost little
+# The surrogate costs next to nothing.
+_N_NEAR = 2000
+_MOVES_NEAR = 20
+
+
+def posterior_draws(
+    found: Fit,
+    noise: NoiseEvidence,
+    recording: Recording,
+    n_samples: int,
+    *,
+    annealed: bool = True,
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> FloatArray:
+    """Draw coordinates, (n_samples, n_params), from the posterior about a fit, under one noise model.
+
+    Unless `annealed`, they are draws of Laplace's approximation, or of `LinearAmplitudes` where it applies. Otherwise:
+    If an effect on the readings has a nonlinear coordinate, they are resampled from a `ConditionallyLinearDensity`;
+    where many samples cost little more than one, from a `ProfiledDensity` if an effect has a nonlinear coordinate, or
+    else from `LinearAmplitudes`. Without any of these, samples of Laplace's approximation are moved to the posterior in
+    two stages, the first through a quadratic surrogate: with several Gaussians the posterior is curved, and Laplace's
+    samples predict new angles far worse.
+
+    `n_samples` is their number; the other parameters are those of `sample_model`.
+    """
+    laplace = _Laplace.of(found, noise, recording)
+    if not annealed:
+        linear = laplace.linear_amplitudes
+        return laplace.draw(n_samples, rng=rng) if linear is None else linear.draw(n_samples, rng=rng)
+    steps = rng.standard_normal((_N_NEAR, len(found.z)))
+    problem = HypothesisProblem(found.model, recording, noise.with_likeliest_node_alone)
+
+    def log_posterior(z: FloatArray) -> FloatArray:
+        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
+        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
+
+    for weighed in _resampled_from_proposals(laplace, log_posterior, n_samples, rng=rng):
+        if weighed is not None:
+            return weighed
+    return _annealed(laplace, steps, log_posterior, n_samples, rng=rng, progress=progress)
+
+
+@dataclass(frozen=True, eq=False)
+class _Laplace:
+    """Laplace's approximation to the posterior about a fit: normal about `center`, covariance `steps.T @ steps`.
+
+    `sd` is that of a whitened reading; `slopes` (n_points, n_params) and `residual` (n_points,) are whitened, in sds.
+    """
+
+    found: Fit
+    recording: Recording
+    law: NoiseLaw
+    sd: float
+    slopes: FloatArray
+    residual: FloatArray
+    steps: FloatArray
+
+    @classmethod
+    def of(cls, found: Fit, noise: NoiseEvidence, recording: Recording) -> Self:
+        law = noise.likeliest_law
+        whitened, turned = law(found.residuals)[:, None], law(found.slopes)
+        sigma = law.likeliest_sigma(whitened)
+        sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), 1e-150)
+        curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
+        # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps
+        # leave the SSF's geometry unchanged, which speeds up vectorised predictions.
+        order = np.roll(np.arange(len(found.z)), -found.model.sensor.n_params)
+        at, steps = np.ix_(order, order), np.empty_like(curvature)
+        steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
+        normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, 1e-150))[:, 0]
+        return cls(found, recording, law, sd, turned / sd, normal / sd, steps)
+
+    @cached_property
+    def center(self) -> FloatArray:
+        """The mode, one Newton step from the fit, (n_params,)."""
+        found, curvature = self.found, self.slopes.T @ self.slopes + np.eye(len(self.found.z))
+        center = found.z + np.linalg.solve(curvature, self.slopes.T @ self.residual - found.z)
+        center = np.asarray(np.clip(center, -FARTHEST, FARTHEST))
+        if np.isfinite(found.model.predict(center[None, :])[0, self.recording.usable]).all():
+            return center
+        return found.z  # the step left the domain of the formula
+
+    @cached_property
+    def linear_amplitudes(self) -> LinearAmplitudes | None:
+        """The same with amplitudes that are linear in their value; None if all are as good as linear already."""
+        return LinearAmplitudes.of(self.found, self.slopes, self.residual)
+
+    def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw coordinates, (n_samples, n_params)."""
+        return np.asarray(self.center + rng.standard_normal((n_samples, len(self.center))) @ self.steps)
+
+
+def _resampled_from_proposals(
+    laplace: _Laplace, log_posterior: Density, n_samples: int, *, rng: np.random.Generator
+) -> Iterator[FloatArray | None]:
+    """Yield samples by importance from one proposal after another, None for one that is too far from the posterior."""
+    found, law, recording = laplace.found, laplace.law, laplace.recording
+    in_bulk = found.model.sensor.predicts_in_bulk
+    grid = ConditionallyLinearDensity.of(found, law, recording, laplace.steps.T @ laplace.steps, laplace.sd)
+    if grid is not None:
+        first, least = grid.draw(n_samples if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
+        yield importance_resample(first, grid.log_density, log_posterior, n_wanted=n_samples, rng=rng, least=least)
+    if not in_bulk:
+        return
+    profiled = ProfiledDensity.of(found, law, recording)
+    if profiled is not None:
+        yield profiled.importance_resample(log_posterior, n_first=_N_FIRST, n_wanted=n_samples, rng=rng)
+    linear = laplace.linear_amplitudes
+    if linear is not None:
+        first = linear.draw(_N_FIRST, rng=rng)
+        yield importance_resample(first, linear.log_density, log_posterior, n_wanted=n_samples, rng=rng)
+
+
+def _annealed(
+    laplace: _Laplace,
+    draws: FloatArray,
+    log_posterior: Density,
+    n_samples: int,
+    *,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> FloatArray:
+    """Move standard normal draws, (n, n_params), to the surrogate of the posterior, then to the posterior itself."""
+    model, usable, center, steps = laplace.found.model, laplace.recording.usable, laplace.center, laplace.steps
+    quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), laplace.sd)
+    near = SurrogatePosterior.of(quadratic, center, steps, laplace.recording.readings[usable], laplace.law)
+
+    def log_laplace(e: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * np.sum(e**2, axis=1))
+
+    def log_posterior_of_steps(e: FloatArray) -> FloatArray:
+        return log_posterior(center + e @ steps)
+
+    def resampled_or_annealed(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
+        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng)
+        if weighed is not None:
+            return weighed
+        return draw_by_annealing(
+            first[:_N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress
+        )
+
+    e = resampled_or_annealed(draws, log_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
+    return center + resampled_or_annealed(e, near.log_density, log_posterior_of_steps, _MOVES, n_samples) @ steps

@@ -1,1 +1,0 @@
-"""The repaired model: posterior samples of one hypothesis, or averaged over hypotheses."""

@@ -1,0 +1,469 @@
+"""Sensors calibrated over known patterns as nulls: mixtures of Gaussians and a free form of the SSF, and their priors.
+
+The sensor's natural coordinates are the logits of the Gaussians' shares, their means, the logs of their widths, the
+inverse hyperbolic tangents of their correlations, and the two levels: all unbounded, with a normal prior. (They are not
+the natural parameters of an exponential family.) In coordinates z every prior is a standard normal, so that fits and
+evidences need no special case.
+
+The misfit of a few Gaussians to a real SSF looks like physics, and the evidence favours another Gaussian only if it
+gains ten nats or more. A free form (`probewise.sensor.free_form`) absorbs this misfit: small weights at many places,
+each with a normal prior, so that the evidence penalises only those used.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from probewise._arrays import FloatArray, read_only_floats
+from probewise._kinds import require_like
+from probewise.calibration import FittedSensor
+from probewise.diagnosis.fit import FARTHEST, Fit, Null
+from probewise.effects import Extent, NamedEffect
+from probewise.errors import ParameterError, ShapeError
+from probewise.recordings.plan import Plan
+from probewise.scene import KnownScene, Scene
+from probewise.sensor import (
+    N_BENDS,
+    N_FREE_FORM,
+    Chain,
+    FreeLevels,
+    FreeMixture,
+    bend_coefficients,
+    footprint_of,
+    free_form_theta,
+    is_free_form,
+)
+
+LEAST_READINGS = 24
+"""Fewest usable readings for a verdict on a sensor."""
+
+
+class CalibratedSensor(ABC):
+    """A sensor over known patterns as a `Null`, with a normal prior of the natural coordinates of SSF and levels.
+
+    `center` (n_params,) is the prior's mean, `factor` a square root of its covariance. `calibrated_height_mm` is the
+    height of an earlier calibration; None: the height that a plan declares.
+    """
+
+    n_gaussians: int
+    center: FloatArray
+    factor: FloatArray
+    calibrated_height_mm: float | None
+
+    def __post_init__(self) -> None:
+        n = self.n_params
+        object.__setattr__(self, "center", read_only_floats(self.center))
+        object.__setattr__(self, "factor", read_only_floats(self.factor))
+        if self.center.shape != (n,) or self.factor.shape != (n, n):
+            raise ShapeError(
+                f"center {self.center.shape} and factor {self.factor.shape} do not fit; allowed: ({n},) and "
+                f"({n}, {n}) for {self.n_gaussians} Gaussians"
+            )
+
+    @property
+    @abstractmethod
+    def n_params(self) -> int:
+        """Number of coordinates."""
+
+    @property
+    @abstractmethod
+    def effective_n_gaussians(self) -> int:
+        """Number of Gaussians that its SSF counts as, the measure of its complexity."""
+
+    @property
+    @abstractmethod
+    def ssf_in_words(self) -> str:
+        """Description of its SSF, in words."""
+
+    @property
+    def predicts_in_bulk(self) -> bool:
+        """False: every sample costs as much as the first."""
+        return False
+
+    def coordinates(self, theta: FloatArray) -> FloatArray | None:
+        """Return None: what it simulates is no array of readings."""
+        return None
+
+    @property
+    def predicts_cheaply_nearby(self) -> bool:
+        """False: a prediction costs as much near another one as elsewhere."""
+        return False
+
+    @property
+    def may_be_far_off(self) -> bool:
+        """False: a fit of a sensor without a missing effect is near enough to screen the effects about it."""
+        return False
+
+    @property
+    def has_exchangeable_gaussians(self) -> bool:
+        """Whether its Gaussians are exchangeable."""
+        return False
+
+    @abstractmethod
+    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
+
+    @abstractmethod
+    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
+        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
+
+    @property
+    def starts(self) -> FloatArray:
+        """One starting point: 0 in the coordinates z, the centre of the prior, (1, n_params)."""
+        return np.zeros((1, self.n_params))
+
+    @property
+    def nuisance_names(self) -> tuple[str, ...]:
+        """Empty: all its parameters belong to the sensor."""
+        return ()
+
+    @property
+    def least_readings(self) -> int:
+        """Fewest usable readings for a verdict."""
+        return LEAST_READINGS
+
+    def admits(self, effect: NamedEffect[Any]) -> bool:
+        """Return True: every effect can act on a sensor."""
+        return True
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map coordinates z, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
+        return self.theta_from_natural(self._natural_from_z(z))
+
+    def z(self, theta: FloatArray) -> FloatArray:
+        """Map a_1 .. C_N, I_min, I_max to coordinates z: the inverse of `theta`."""
+        return self._z_from_natural(self.natural_from_theta(theta))
+
+    def _natural_from_z(self, z: FloatArray) -> FloatArray:
+        return self.center + z @ self.factor.T
+
+    def _z_from_natural(self, natural: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
+
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+        """Build the chain (sensor, effects, scene) over the plan's patterns; `n_nodes` for curved edges."""
+        return self.chain_over(cached_known_scene(plan), effects, n_nodes=n_nodes)
+
+    def chain_over(self, scene: Scene, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+        """Build the chain (sensor, effects, scene) over any scene; `n_nodes` for curved edges."""
+        return Chain(
+            FreeMixture(self.n_gaussians),
+            FreeLevels(),
+            scene,
+            tuple(effects),
+            n_nodes=n_nodes,
+            calibrated_height_mm=self.calibrated_height_mm,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixtureSensor(CalibratedSensor):
+    """A sensor whose SSF is a mixture: 6 n_gaussians + 1 coordinates, one less than the paper's parameters.
+
+    Only ratios of amplitudes matter. The evidence counts the permutations of exchangeable Gaussians.
+    """
+
+    n_gaussians: int
+    center: FloatArray
+    factor: FloatArray
+    has_exchangeable_gaussians: bool = True
+    calibrated_height_mm: float | None = field(default=None, kw_only=True)
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return 6 * self.n_gaussians + 1
+
+    @property
+    def effective_n_gaussians(self) -> int:
+        """Number of Gaussians."""
+        return self.n_gaussians
+
+    @property
+    def ssf_in_words(self) -> str:
+        """Number of Gaussians of the SSF, in words."""
+        return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
+
+    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, n_params + 1)."""
+        return natural_to_theta(natural, self.n_gaussians)
+
+    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
+        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
+        return theta_to_natural(theta, self.n_gaussians)
+
+    def permuted(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
+        """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians in another order."""
+        n, natural = self.n_gaussians, self._natural_from_z(z)
+        logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
+        blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
+        parts = [logits[:, 1:] - logits[:, :1], blocks.reshape(len(z), 5 * n), natural[:, -2:]]
+        return self._z_from_natural(np.concatenate(parts, axis=1))
+
+
+@lru_cache(maxsize=32)
+def cached_known_scene(plan: Plan) -> KnownScene:
+    """Build the scene of a plan's patterns, cached for all models."""
+    return KnownScene(plan.patterns)
+
+
+def natural_to_theta(natural: FloatArray, n_gaussians: int) -> FloatArray:
+    """Map natural coordinates (n_samples, 6 N + 1) to the paper's parameters (n_samples, 6 N + 2)."""
+    n_logits = n_gaussians - 1
+    logits = np.concatenate([np.zeros((len(natural), 1)), natural[:, :n_logits]], axis=1)
+    shares = np.exp(logits - logits.max(axis=1, keepdims=True))
+    shares /= shares.sum(axis=1, keepdims=True)
+    blocks = natural[:, n_logits:-2].reshape(len(natural), n_gaussians, 5)
+    u, v, log_sd_u, log_sd_v, turn = (blocks[..., k] for k in range(5))
+    rho = np.tanh(turn)
+    rest = 2 * (1 - rho**2)
+    a_uu = np.exp(-2 * log_sd_u) / rest  # [[A, C], [C, B]] is half the inverse of the covariance
+    b_vv = np.exp(-2 * log_sd_v) / rest
+    c_uv = -rho * np.exp(-log_sd_u - log_sd_v) / rest
+    amplitude = shares * np.sqrt(a_uu * b_vv - c_uv**2) / math.pi  # mass_n = a_n pi / sqrt(AB - C^2) = share
+    columns = np.stack([amplitude, u, v, a_uu, b_vv, c_uv], axis=-1).reshape(len(natural), 6 * n_gaussians)
+    return np.concatenate([columns, natural[:, -2:]], axis=1)
+
+
+def theta_to_natural(theta: FloatArray, n_gaussians: int) -> FloatArray:
+    """Invert `natural_to_theta`; the amplitudes may carry any common factor."""
+    blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
+    amplitude, u, v, a_uu, b_vv, c_uv = (blocks[..., k] for k in range(6))
+    det = a_uu * b_vv - c_uv**2
+    log_mass = np.log(amplitude) - 0.5 * np.log(det)
+    rho = -c_uv / np.sqrt(a_uu * b_vv)
+    rest = 2 * (1 - rho**2)
+    parts = np.stack([u, v, -0.5 * np.log(a_uu * rest), -0.5 * np.log(b_vv * rest), np.arctanh(rho)], axis=-1)
+    logits = log_mass[:, 1:] - log_mass[:, :1]
+    return np.concatenate([logits, parts.reshape(len(theta), 5 * n_gaussians), theta[:, -2:]], axis=1)
+
+
+def default_sensor(extent: Extent, n_gaussians: int) -> GaussianMixtureSensor:
+    """Return `n_gaussians` with the default prior: sds a fourteenth of the longest scan, to a factor of two."""
+    length = extent.length_mm
+    one_center = [0.0, 0.0, math.log(length / 14), math.log(length / 14), 0.0]
+    one_sd = [length / 10, length / 10, 0.8, 0.8, 0.7]
+    center = np.array([0.0] * (n_gaussians - 1) + one_center * n_gaussians + [extent.low, extent.high])
+    sd = np.array([1.5] * (n_gaussians - 1) + one_sd * n_gaussians + [extent.span / 2] * 2)
+    return GaussianMixtureSensor(n_gaussians, center, np.diag(sd))
+
+
+_SHARE = 0.1  # prior sd of each weight, as a share of the mass
+
+
+@dataclass(frozen=True, eq=False)
+class FreeFormSensor(CalibratedSensor):
+    """A sensor with a free-form SSF.
+
+    Its natural coordinates are those of one Gaussian and the two levels, then N_BENDS weights of the free form.
+    """
+
+    center: FloatArray
+    factor: FloatArray
+    n_gaussians: int = field(default=N_FREE_FORM, init=False)
+    calibrated_height_mm: float | None = field(default=None, kw_only=True)
+
+    @classmethod
+    def from_one_gaussian(cls, one: GaussianMixtureSensor) -> Self:
+        """Build the prior from that of one Gaussian's place and size, with weights of sd 0.1 of the mass about 0."""
+        factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
+        factor[: one.n_params, : one.n_params] = one.factor
+        return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
+
+    def start_from_one_gaussian(self, one: FloatArray) -> FloatArray:
+        """Return one start of a fit, (1, n_params): coordinates of one Gaussian, (7,), with weights of 0."""
+        return np.pad(one, (0, N_BENDS))[None, :]
+
+    @property
+    def n_params(self) -> int:
+        """Number of coordinates."""
+        return 7 + N_BENDS
+
+    @property
+    def effective_n_gaussians(self) -> int:
+        """2: the free form counts as one Gaussian more than one."""
+        return 2
+
+    @property
+    def ssf_in_words(self) -> str:
+        """Description of its SSF: "an SSF of free form"."""
+        return "an SSF of free form"
+
+    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
+        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
+        one = natural_to_theta(natural[:, :-N_BENDS], 1)
+        return np.concatenate([free_form_theta(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
+
+    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
+        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
+        return theta_to_free_form_natural(theta)
+
+
+def theta_to_free_form_natural(theta: FloatArray) -> FloatArray:
+    """Map theta, (n_samples, 6 N + 2), to a free form's natural coordinates, (n_samples, 7 + N_BENDS)."""
+    # The amplitude of the first does not enter its natural coordinates.
+    one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)
+    return np.concatenate([theta_to_natural(one, 1), bend_coefficients(theta[:, :-2])], axis=1)
+
+
+_RIDGE = 1e-8  # of each variance, by which a covariance of samples is sure to be positive
+_LEAST_VARIANCE = 1e-16  # of a coordinate, relative to its size
+
+
+def sensor_from_posterior(
+    names: Sequence[str], mean: FloatArray, cov: FloatArray, *, height_mm: float | None = None
+) -> CalibratedSensor:
+    """Build a prior from an earlier sensor's posterior mean and covariance, calibrated at `height_mm`.
+
+    Only the SSF's and the levels' columns are used; effects of the earlier model are dropped.
+
+    Raises
+    ------
+    ParameterError
+        If the names are not those of a mixture of Gaussians with two free levels.
+    """
+    names = list(names)
+    n_gaussians = sum(name.startswith("a_") for name in names)
+    wanted = [f"{p}_{n}" for n in range(1, n_gaussians + 1) for p in ("a", "u", "v", "A", "B", "C")]
+    wanted += ["I_min", "I_max"]
+    if n_gaussians == 0 or any(name not in names for name in wanted):
+        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
+    at = [names.index(name) for name in wanted]
+    mean = np.asarray(mean, dtype=np.float64)[at]
+    cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
+    free = is_free_form(mean[None, :-2])
+    natural_from_theta = theta_to_free_form_natural if free else partial(theta_to_natural, n_gaussians=n_gaussians)
+    center = natural_from_theta(mean[None, :])[0]
+    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
+    up = natural_from_theta(mean + np.diag(steps))
+    down = natural_from_theta(mean - np.diag(steps))
+    slope = ((up - down) / (2 * steps[:, None])).T
+    natural_cov = slope @ cov @ slope.T
+    # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
+    size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
+    size[levels] = np.abs(center[levels]).max() or 1.0
+    floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
+    factor = np.linalg.cholesky(natural_cov + np.diag(floor))
+    return (
+        FreeFormSensor(center, factor, calibrated_height_mm=height_mm)
+        if free
+        else GaussianMixtureSensor(
+            n_gaussians, center, factor, has_exchangeable_gaussians=False, calibrated_height_mm=height_mm
+        )
+    )
+
+
+class SensorPrior(Protocol):
+    """An earlier posterior of the sensor: a FittedSensor, or anything with its names and samples."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names, one per column."""
+        ...
+
+    @property
+    def samples(self) -> FloatArray:
+        """Posterior samples, (n_samples, n_params)."""
+        ...
+
+
+def require_sensor_prior(sensor: object) -> None:
+    """Raise ParameterError unless `sensor` has names and samples."""
+    allowed = "a FittedSensor: read_sensor('sensor.json') of probewise.calibration, or the .sensor of a Calibration"
+    if hasattr(getattr(sensor, "sensor", None), "samples"):
+        allowed = f"a FittedSensor: take its .sensor, this is the {type(sensor).__name__}"
+    require_like("sensor", sensor, ("names", "samples"), allowed)
+
+
+def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
+    """Raise ParameterError if the readings' unit differs from that of the calibration; "" is an unknown unit."""
+    unit, own = plan.instrumentation.unit, ""
+    if isinstance(sensor, FittedSensor):
+        own = sensor.instrumentation.unit
+    if own and unit and own != unit:
+        raise ParameterError("sensor", f"one that reads in {own!r}", f"one in {unit!r}, as the recording")
+
+
+def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
+    """Build a prior from an earlier sensor's posterior samples; see `sensor_from_posterior`.
+
+    If the samples average several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
+    """
+    height_mm = None
+    if isinstance(sensor, FittedSensor):
+        sensor, height_mm = sensor.with_leading_effects(), sensor.instrumentation.height_mm
+    samples = np.asarray(sensor.samples, dtype=np.float64)
+    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T), height_mm=height_mm)
+
+
+Start = tuple[Null, FloatArray]
+"""A null and coordinates to fit it from, (n_starts, n_params)."""
+
+
+@dataclass(frozen=True, eq=False)
+class SsfForms:
+    """Forms of a sensor's SSF with priors scaled to a recording, each as a null with coordinates to fit it from."""
+
+    extent: Extent
+
+    def one_gaussian_and_starts(self) -> Start:
+        """Return a sensor of one Gaussian, and three starts: typical, narrow and wide."""
+        one = default_sensor(self.extent, 1)
+        return one, starts_of_one_gaussian(one)
+
+    def free_form_and_starts(self, found: Fit) -> Start:
+        """Return a sensor of free form, and one start: the fit of one Gaussian."""
+        one = found.model.sensor
+        assert isinstance(one, GaussianMixtureSensor)
+        free = FreeFormSensor.from_one_gaussian(one)
+        return free, free.start_from_one_gaussian(found.z)
+
+    def more_gaussians_and_starts(self, found: Fit, order: int) -> Start:
+        """Return a sensor of `order` Gaussians, one more than the fit has, and starts: splits of the fit's heaviest."""
+        wanted = default_sensor(self.extent, order)
+        return wanted, starts_with_more_gaussians(found.model.sensor, found.z, wanted)
+
+
+def starts_of_one_gaussian(sensor: GaussianMixtureSensor) -> FloatArray:
+    """Return coordinates to start from for one Gaussian: typical, narrow and wide, (3, n_params)."""
+    return np.stack([_with_widths(np.zeros(sensor.n_params), step) for step in (0.0, -1.5, 1.5)])
+
+
+def _with_widths(z: FloatArray, step: float) -> FloatArray:
+    z = z.copy()
+    z[2:4] = step
+    return z
+
+
+def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: GaussianMixtureSensor) -> FloatArray:
+    """Split the heaviest Gaussian of a fit in three ways, as starts: coordinates of `wanted`, (3, wanted.n_params)."""
+    theta = found.theta(z[None, : found.n_params])[0]
+    n = found.n_gaussians
+    blocks = theta[: 6 * n].reshape(n, 6)
+    at = int(np.argmax(footprint_of(theta[None, : 6 * n], n).weight))
+    sd_u, sd_v = 1 / np.sqrt(2 * blocks[at, 3:5])
+    splits: Sequence[tuple[float, float, float, float]] = (
+        (0.0, 0.0, 0.65, 1.6),  # a core and a halo
+        (0.8, 0.0, 0.9, 0.9),  # side by side along x'
+        (0.0, 0.8, 0.9, 0.9),
+    )
+    out = []
+    for du, dv, first, second in splits:
+        pair = []
+        for sign, widen in ((1.0, first), (-1.0, second)):
+            part = blocks[at].copy()
+            part[1] += sign * du * sd_u
+            part[2] += sign * dv * sd_v
+            part[3:6] /= widen**2
+            part[0] /= 2 * widen**2  # halves the mass
+            pair.append(part)
+        rest = np.delete(blocks, at, axis=0)
+        out.append(np.concatenate([np.concatenate([rest, np.stack(pair)]).ravel(), theta[-2:]]))
+    return np.clip(wanted.z(np.stack(out)), -FARTHEST + 0.5, FARTHEST - 0.5)

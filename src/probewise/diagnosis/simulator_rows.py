@@ -1,0 +1,528 @@
+"""A user's simulator over a table as an `Apparatus`: effects, covariates, held-out and next runs, words."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.apparatus import MOST_READINGS, Words
+from probewise.diagnosis.fit import Fit, Model, Null
+from probewise.diagnosis.held_out import LEAST_ROWS, Parts
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.effects import (
+    CorrelatedNoise,
+    DriftingNoise,
+    Dropouts,
+    Extent,
+    NamedEffect,
+    NoisePerRun,
+    Outliers,
+    Quantisation,
+    RandomWalk,
+    SignalDependentNoise,
+)
+from probewise.recordings.plan import Plan, Recording
+from probewise.systems import RunTable, System
+from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.binding import has_value_per_run, names_of_jumps_in_sorted_rows
+from probewise.systems.forms.formulas import formula_forms
+from probewise.systems.forms.rates import names_in_definitions
+from probewise.systems.forms.readings import time_since_start_of_run
+from probewise.systems.forms.stop import MeterStop
+from probewise.systems.table import append_tables, covariate_of_column, unused_name
+
+_LEAST_ROWS = 4
+_MOST_RUNS = 4  # recorded runs to start from
+_SPELT = {
+    1 / 60_000: "ms millisecond milliseconds",
+    1 / 60: "s sec second seconds",
+    1.0: "min minute minutes",
+    60.0: "h hr hour hours",
+    1440.0: "d day days",
+    10_080.0: "week weeks",
+    43_830.0: "month months",
+    525_960.0: "a yr year years",
+}
+_MINUTES = {unit: minutes for minutes, units in _SPELT.items() for unit in units.split()}
+_A_READING = 1 / 60  # minutes, where no time tells how long one takes
+_BREAK = 0.5  # minutes, before a run
+_RUN = "run"
+
+
+@dataclass(frozen=True, eq=False)
+class RunCommand:
+    """One run that could be recorded: kind, description, rows without readings (`table`), and duration in minutes."""
+
+    kind: str
+    description: str
+    table: RunTable
+    minutes: float
+
+    @property
+    def plan(self) -> Plan:
+        """The rows, as a plan."""
+        return cast(Plan, self.table)
+
+
+def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[RunCommand]:
+    """List the runs that could be recorded: recorded runs again, reversed, slower, or with a control moved otherwise.
+
+    At most four recorded runs are taken, those that differ in their controls.
+
+    Parameters
+    ----------
+    table
+        The recorded rows.
+    reading
+        The predicted column, which is empty in rows yet to be taken.
+    controls
+        Columns that can be set; without any, runs can only be repeated.
+    time_unit
+        Unit of the table's time.
+    """
+    out: list[RunCommand] = []
+    settable = [name for name in controls if name in table.covariates]
+    ends = {name: _least_and_greatest(table.covariates[name]) for name in settable}
+    for rows in _rows_of_distinct_runs(table, settable):
+        name = table.scan_names[int(table.scan[rows[0]])]
+        kept = rows[:: -(-len(rows) // MOST_READINGS)]
+        of = f"run {name}" if table.run is not None else "the rows"
+        for kind, words, columns, slower in _variations_of_run(table, kept, ends, of):
+            called = unused_name(f"{name} {kind}", table.scan_names)
+            made = _planned_run(table, kept, columns=columns, reading=reading, name=called, like=name, slower=slower)
+            out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
+    return out
+
+
+Change = tuple[str, str, Mapping[str, FloatArray], float]
+"""Kind, words, the columns that are set, and how many times as long the run takes."""
+
+
+def _variations_of_run(
+    table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], of: str
+) -> Iterator[Change]:
+    own = {name: table.covariates[name][rows] for name in ends}
+    yield "again", f"take {of} again", {}, 1.0
+    if not ends:
+        return
+    if any(np.ptp(values) > 0 for values in own.values()):
+        yield (
+            "reversed",
+            f"take {of} with {_list_in_words(ends)} in reverse order",
+            {k: v[::-1] for k, v in own.items()},
+            1.0,
+        )
+    if table.has_varying_time:
+        yield "slow", f"take {of} again, twice as slowly", {}, 2.0
+    n = len(rows)
+    share = np.linspace(0.0, 1.0, n)
+    shapes: dict[str, tuple[str, Callable[[float, float], FloatArray]]] = {
+        "up": ("swept from {low} to {high}", lambda low, high: low + (high - low) * share),
+        "down": ("swept from {high} to {low}", lambda low, high: high + (low - high) * share),
+        "up and down": (
+            "swept from {low} to {high} and back", lambda low, high: low + (high - low) * (1 - np.abs(2 * share - 1)),
+        ),
+        "steps": ("switched between {low} and {high}, twice", lambda low, high: np.where(4 * share % 2 < 1, low, high)),
+        "low": ("held at {low}", lambda low, high: np.full(n, low)),
+        "middle": ("held at {middle}", lambda low, high: np.full(n, 0.5 * (low + high))),
+        "high": ("held at {high}", lambda low, high: np.full(n, high)),
+    }  # fmt: skip
+    for name, (low, high) in ends.items():
+        for kind, (said, shape) in shapes.items():
+            text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{0.5 * (low + high):.4g}")
+            yield (
+                f"{name} {kind}",
+                f"take {of} with {name} {text}",
+                {name: _rounded_to_range(shape(low, high), low, high)},
+                1.0,
+            )
+
+
+def _rounded_to_range(values: FloatArray, low: float, high: float) -> FloatArray:
+    """Round values to a thousandth of a range or finer, so that they can be set; those at its ends stay."""
+    if not low < high:
+        return values
+    decimals = int(np.ceil(3 - np.log10(high - low)))
+    return np.where((values == low) | (values == high), values, np.round(values, decimals))
+
+
+def _planned_run(
+    table: RunTable,
+    rows: IntArray,
+    columns: Mapping[str, FloatArray],
+    reading: str,
+    name: str,
+    like: str,
+    slower: float,
+) -> RunTable:
+    """Return rows of a table as a new run after it, called `name`: without readings, with `columns` set.
+
+    The run takes `slower` times as long as the rows did; parameters per run are taken as in the run `like`.
+    """
+    taken = table.take(rows)
+    changed: dict[str, Any] = {**columns}
+    if reading in table.columns:
+        changed[reading] = np.full(len(rows), np.nan)
+    if table.time is not None:
+        time = table.time_s[rows]
+        begin = time[0] if table.time_begins_anew else _next_start_time(table)
+        changed[table.time] = begin + slower * (time - time[0])
+    run = table.run or unused_name(_RUN, table.columns)
+    changed[run] = np.full(len(rows), name)
+    return replace(
+        taken,
+        columns={**taken.columns, **changed},
+        run=run,
+        like={name: table.like.get(like, like)},
+        first_row=len(table),
+    )
+
+
+def _next_start_time(table: RunTable) -> float:
+    """Return the time at which a run after a table starts: the median pause between runs later, or ten rows."""
+    by_run = [table.time_s[rows] for rows in table.rows_by_scan()]
+    between = [later[0] - earlier[-1] for earlier, later in itertools.pairwise(by_run)]
+    gaps = np.concatenate([np.diff(time) for time in by_run])
+    gap = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+    apart = [pause for pause in between if pause > 0]
+    return float(table.time_s.max()) + (float(np.median(apart)) if apart else 10 * gap)
+
+
+def plan_of_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
+    """Concatenate alternative runs, each timed as if it came next, to predict all of them at once."""
+    first, *more = (command.table for command in commands)
+    return cast(Plan, append_tables(first, more))
+
+
+def plan_of_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
+    """Concatenate runs to be recorded in sequence: each begins after the one before, unless time restarts with each."""
+    recorded = cast(RunTable, after)
+    out: list[RunTable] = []
+    for command in commands:
+        table = command.table
+        if table.time is not None and not recorded.time_begins_anew and out:
+            later = float(out[-1].time_s[-1]) + _next_start_time(recorded) - float(recorded.time_s.max())
+            table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
+        out.append(table)
+    return cast(Plan, append_tables(out[0], out[1:]))
+
+
+def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
+    """Return the row numbers of the first four runs, of four rows or more, that differ in their controls."""
+    seen: dict[tuple[object, ...], IntArray] = {}
+    size = {name: float(np.nanmax(np.abs(table.covariates[name]))) or 1.0 for name in controls}
+    for rows in table.rows_by_scan():
+        if len(rows) >= _LEAST_ROWS:
+            own = tuple(np.round(table.covariates[name][rows] / size[name], 9).tobytes() for name in controls)
+            seen.setdefault(own or (int(table.scan[rows[0]]),), rows)
+    return list(seen.values())[:_MOST_RUNS]
+
+
+def _least_and_greatest(values: FloatArray) -> tuple[float, float]:
+    return float(np.nanmin(values)), float(np.nanmax(values))
+
+
+def is_known_duration(table: RunTable, time_unit: str) -> bool:
+    """Return whether a table tells how long its rows take: it has a time, in a unit that is known."""
+    return _minutes_of_time_unit(table, time_unit) is not None
+
+
+def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
+    minutes = _minutes_of_time_unit(table, time_unit)
+    if minutes is None:
+        return _BREAK + len(table) * _A_READING
+    return _BREAK + float(np.ptp(table.time_s)) * minutes
+
+
+def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
+    """Return how many minutes a unit of a table's time has; None without a time, or in an unknown unit."""
+    return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
+
+
+def _list_in_words(names: Mapping[str, object]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
+    SignalDependentNoise,
+    CorrelatedNoise,
+    RandomWalk,
+    NoisePerRun,
+    Outliers,
+    Dropouts,
+    Quantisation,
+    DriftingNoise,
+)
+_ALONG_ROWS = (CorrelatedNoise, RandomWalk, DriftingNoise)
+CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some 20,000 in a diagnosis
+# Of a law's rates, 15 to 20 microseconds each, of however many samples: about the same number of predictions of a long
+# table as of a short one.
+_EVALUATIONS_PER_ROW = 6_000
+_LEAST_EVALUATIONS = 1_500_000
+_N_BLOCKS = 5
+_MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
+
+# Prior odds of one, two, three effects on the mean, and of white noise beside them. A second effect is as likely as a
+# fault of the noise, of which a walk takes up much of what a second effect does. Both are so rare that one effect holds
+# the credible set alone where the readings are clear; what is there and visible has far more evidence than that costs.
+_BY_SIZE = (0.329, 0.01, 0.001)
+_WHITE = 0.97
+# Probability that the noise is not white where the law is complete: one departure of a recording, of its law or of its
+# noise, is more likely than one of each.
+_NOT_WHITE_ALONE = 0.2
+_TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
+# Of a term in a rate that is another state by definition, such as that of a position, and of a jump at a row of a table
+# that an input sorts. A slip may look like the one, a ramp may be recorded in order: so both stay possible, and their
+# handicap is below the three nats that tell aliases apart.
+_UNLIKELY = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatorApparatus:
+    """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects.
+
+    Parameters
+    ----------
+    about
+        The system, its table, the first fit, and the sd of a reading.
+    stop
+        The level at which the meter stops without having declared it, if the readings show one.
+    finer
+        The system with a finer integration step, if the leading hypotheses were refitted with one. Effects keep the
+        scales and origins of `about`.
+    lost
+        The effect that lost readings which were left out, if any.
+    """
+
+    about: ReferenceFit
+    stop: MeterStop | None = None
+    finer: System | None = None
+    lost: Dropouts | None = None
+
+    @property
+    def system(self) -> System:
+        """The simulator over the runs of the table."""
+        return self.finer or self.about.system
+
+    @property
+    def rows_are_in_order(self) -> bool:
+        """Whether the order of the table's rows may be that of recording."""
+        return self.about.rows_are_in_order
+
+    @property
+    def words(self) -> Words:
+        """Words for sentences about the simulator."""
+        own = self.system.simulator
+        return Words(
+            null="the simulator",
+            find_signal="record where the reading changes",
+            settles_nothing="no rows like those of this table tell them apart",
+            run="run",
+            next_plan="next.csv",
+            model="repaired.json",
+            no_cure="more rows, or columns and runs that vary differently",
+            covariates={
+                "time": own.time or "time",
+                "row": "row number (from 0)",
+                "level": f"predicted {own.reading}",
+                "previous": f"change of predicted {own.reading} between rows",
+            },
+            own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
+        )
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """The columns that the simulator's file declares as controls."""
+        return self.system.simulator.controls
+
+    @property
+    def tells_duration(self) -> bool:
+        """Whether the table says how long a measurement takes: it has a time, in a known unit."""
+        return is_known_duration(self.about.table, self.system.simulator.time_unit)
+
+    def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
+        """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""
+        extent = Extent.of(recording)
+        kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
+        if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
+            kinds.remove(RandomWalk)
+        on_noise = [effect for kind in kinds if (effect := kind.for_extent(extent)) is not None]
+        forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
+        known = {effect.name: effect for effect in (self.stop, self.lost) if effect is not None}
+        return forms | {effect.name: effect for effect in on_noise} | known
+
+    def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
+        """Return formulas for effects out of vocabulary, by name: short expressions of columns and states."""
+        return cast(dict[str, NamedEffect[Any]], {form.name: form for form in formula_forms(self.about)})
+
+    def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+        """Return the names of the effects that the user's simulator file adds."""
+        return frozenset(effects.keys() & self.system.simulator.extra.keys())
+
+    @property
+    def evaluations_of_a_search(self) -> int:
+        """Limit on the evaluations of a law's rates, of all samples and runs at once, in a search."""
+        return max(_EVALUATIONS_PER_ROW * len(self.about.table), _LEAST_EVALUATIONS)
+
+    def refit_budget_share_spent(self) -> float:
+        """Return the spent share of the budget of calls or evaluations of a law; 0 if `simulate` takes arrays."""
+        caller = self.system.caller
+        if caller is None:
+            return self.system.tally.n_evaluations / self.evaluations_of_a_search
+        # A simulate that knows no runs is called for one recording after the other.
+        n_each = len(self.system.runs) if self.system.simulator.run is None else 1
+        return 0.0 if caller.broadcasts else caller.n_calls / (n_each * CALLS_OF_A_SEARCH)
+
+    def is_refit_budget_spent(self, share: float = 1.0) -> bool:
+        """Return whether at least this share of the budget is spent; if so, record that the search was cut short."""
+        over = self.refit_budget_share_spent() >= share
+        tally = self.system.caller or self.system.tally
+        tally.cut_short |= over
+        return over
+
+    def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
+        """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
+        usual = PriorOdds.for_effects(effects)
+        return replace(
+            usual,
+            by_size=_BY_SIZE,
+            white=_WHITE,
+            noise_by_size=tuple((1 - _WHITE) / (1 - usual.white) * share for share in usual.noise_by_size),
+            not_white_alone=_NOT_WHITE_ALONE,
+            twice=_TWICE,
+            unknown_explains_most=True,
+            named_needs_half=True,
+            shared_is_named=True,
+            unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects),
+            unlikely_weight=_UNLIKELY,
+        )
+
+    def null_forms(self, recording: Recording) -> Any:
+        """Raise NotImplementedError: the only null is the simulator."""
+        raise NotImplementedError("a simulator is its own null")
+
+    def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
+        """Return the covariates that vary, and the predicted change since the previous row, (n_usable,).
+
+        Covariates are time or row, predicted level, its change since the row before, columns, states, and the run.
+        """
+        table = cast(RunTable, recording.plan)
+        usable = np.flatnonzero(recording.usable)
+        by_row = self.covariate_values_by_name(found.model.predict(found.z[None, :])[0])
+        pooled = {name: values[usable] for name, values in by_row.items() if name != "run"}
+        if not self.rows_are_in_order:
+            pooled["previous"] = np.zeros(len(usable))
+            pooled.pop("row", None)
+        out = []
+        for name, values in pooled.items():
+            there = np.flatnonzero(np.isfinite(values))
+            if there.size and _varies(values[there]):
+                out.append(Covariate(name, values[there], there))
+        if len(table.scan_names) > 1:
+            out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))
+        return out, pooled["previous"]
+
+    def multiplied_covariates(self, covariates: Sequence[Covariate]) -> list[Covariate]:
+        """Return time and the table's columns: of more than ten, those with the most distinct values.
+
+        Columns with few values are settings or numbers of groups, whose product with another is the rarer mistake.
+        """
+        columns = {covariate_of_column(name) for name in self.about.table.covariates}
+        varied = [c for c in covariates if c.name == "time" or c.name in columns]
+        chosen = sorted(varied, key=lambda c: -len(np.unique(c.values)))[:_MOST_MULTIPLIED]
+        return [c for c in varied if c in chosen]
+
+    def covariate_values_by_name(self, predicted: FloatArray) -> dict[str, FloatArray]:
+        """Return every covariate by name at each row, (n_points,), for predictions (n_points,); the run is last."""
+        table, own = self.about.table, self.system.simulator
+        along = {"time": table.time_s} if table.has_varying_time else {"row": table.row_number}
+        out = {**along, "level": predicted}
+        columns = {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
+        out |= {covariate_of_column(name): v for name, v in columns.items()}
+        out |= {f"state:{name}": v for name, v in self.about.states.items()}
+        out["previous"] = _differences_within_runs(predicted, table)
+        out["run"] = table.scan.astype(np.float64)
+        return out
+
+    def covariate_of_effect(
+        self,
+        effect: NamedEffect[Any],
+        change: FloatArray,
+        without: FloatArray,
+        plan: Plan,
+        known: Sequence[Covariate],
+    ) -> Covariate | None:
+        """Return the first of an effect's covariates that is `known`; None if none is, or `change` is 0 at every row.
+
+        The values of `level` are those predicted `without` the effect.
+        """
+        pooled = {c.name: c for c in known}
+        name = next((name for name in effect.covariates if name in pooled), None)
+        if name is None or not np.any(change):
+            return None
+        return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
+
+    def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
+        """Return no columns, (n_usable, 0): a simulator has no fine structure."""
+        return np.zeros((len(usable), 0))
+
+    def held_out_parts(self, recording: Recording) -> Parts:
+        """Return the part of each usable reading, (n_usable,), and names: runs or, of one run, five blocks."""
+        table, usable = cast(RunTable, recording.plan), recording.usable
+        run = table.scan[usable]
+        if np.sum(np.bincount(run) >= LEAST_ROWS) > 1:
+            return run, table.scan_names
+        n = int(usable.sum())
+        part = np.minimum(np.arange(n) * _N_BLOCKS // max(n, 1), _N_BLOCKS - 1)
+        return part, tuple(f"part {k + 1} of {_N_BLOCKS}" for k in range(_N_BLOCKS))
+
+    def coordinates_of_new_run(self, model: Model) -> IntArray:
+        """Return the indices of the parameters per run, and of the effects' values per run, (n_coordinates,)."""
+        names, of_run = list(self.system.marginals), {*self.system.nuisance_names}
+        parameters = [k for k, name in enumerate(names) if name in of_run]
+        values = [np.arange(model.n_params)[model.coordinate_slice(n)] for n in model.names if has_value_per_run(n)]
+        return np.concatenate([np.array(parameters, dtype=np.int64), *values])
+
+    @property
+    def takes_one_measurement_at_a_time(self) -> bool:
+        """Whether FILE.py names no column of runs.
+
+        It reads every table as one run: a second run in next.csv would begin where the first ended, not from `states`
+        as it is planned, and a lag or a backlash would reach from one into the other.
+        """
+        return self.system.simulator.run is None
+
+    def settings_of(self, plan: Plan) -> FloatArray:
+        """Return the columns besides the reading, and the time since the start of the run, (n_points, n_settings)."""
+        table, own = cast(RunTable, plan), self.system.simulator
+        columns = [v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)]
+        return np.nan_to_num(np.stack([*columns, time_since_start_of_run(table)], axis=1))
+
+    def candidate_measurements(
+        self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
+    ) -> list[RunCommand]:
+        """List the runs that could be recorded after the table `plan`; the other arguments are not used."""
+        own = self.system.simulator
+        return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
+
+    plan_of_alternatives = staticmethod(plan_of_alternatives)
+    plan_of_sequence = staticmethod(plan_of_sequence)
+
+
+def _differences_within_runs(values: FloatArray, table: RunTable) -> FloatArray:
+    """Return the change since the previous row of the run, 0 at its first row, (n_points,) -> (n_points,)."""
+    out = np.zeros(len(table))
+    for rows in table.rows_by_scan():
+        out[rows[1:]] = np.diff(values[rows])
+    return out
+
+
+def _varies(values: FloatArray) -> bool:
+    return values.size > 1 and float(np.ptp(values)) > 1e-12 * max(1e-300, float(np.abs(values).max()))

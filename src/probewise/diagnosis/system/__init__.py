@@ -1,1 +1,0 @@
-"""Fit, diagnosis and audit of a user's simulator over a table of rows."""

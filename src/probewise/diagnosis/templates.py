@@ -1,0 +1,366 @@
+"""Templates of the effects that could be added to a fit, and banks of them with Bayes factors about any fit.
+
+A template is a set of columns (n_usable, k), changes of the readings at given settings of an effect, which span its
+change to first order; its nonlinear parameters are fixed. A fit absorbs a part of each template; the products needed
+for this are computed once for each noise model.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence import (
+    Linearised,
+    OrthonormalBlocks,
+    average_over_amplitude_scales,
+    block_log_bayes_factors,
+    scale_and_project,
+)
+from probewise.diagnosis.fit import Fit, effect_values
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.prior_odds import Names
+from probewise.effects import NamedEffect, scan_indicator
+from probewise.sensor import Stage
+
+_ABSENT = 1e-9  # share of a template's sum of squares below which its projection is rounding error
+_REMEMBERED = 5  # most recent noise models in the cache, up to `_MOST_BYTES`
+_MOST_BYTES = 2**28
+
+
+@dataclass(eq=False)
+class TemplateBank:
+    """Labelled templates, concatenated by columns, with their Bayes factors about any fit.
+
+    Parameters
+    ----------
+    columns
+        Columns of all templates, (n_points, n_columns).
+    widths
+        Number of columns of each template, (n_templates,).
+    labels
+        Label of each template; several may have the same, such as the name of their effect.
+    """
+
+    columns: FloatArray
+    widths: IntArray
+    labels: tuple[str, ...]
+    _whitened: dict[tuple[bytes, ...], _WhitenedTemplatesAndGrams] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> TemplateBank:
+        """Concatenate templates, each (n_points, k), with one label each."""
+        widths = np.array([t.shape[1] for t in templates], dtype=np.int64)
+        return cls(np.concatenate([np.zeros((n_points, 0)), *templates], axis=1), widths, tuple(labels))
+
+    def __getitem__(self, at: int) -> FloatArray:
+        """Return template number `at`, (n_points, k)."""
+        first = int(self._first_columns[at])
+        return self.columns[:, first : first + int(self.widths[at])]
+
+    @cached_property
+    def _first_columns(self) -> IntArray:
+        return np.cumsum(self.widths) - self.widths
+
+    @cached_property
+    def indices_by_label(self) -> dict[str, IntArray]:
+        """Indices of the templates of each label."""
+        labels = np.array(self.labels)
+        return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
+
+    def take_templates(self, members: IntArray) -> TemplateBank:
+        """Return a bank of the templates with these indices, in this order."""
+        at = [self._first_columns[k] + np.arange(self.widths[k]) for k in members]
+        columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
+        return TemplateBank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
+
+    def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
+        """Return the log Bayes factor of adding each template to a fit, as `block_log_bayes_factors` does.
+
+        Parameters
+        ----------
+        problem
+            The fit, linearised.
+        residuals
+            Projected residuals, (n_rows, n_draws); the fit's own by default.
+
+        Returns
+        -------
+        Log Bayes factors, (n_templates, n_draws).
+        """
+        own = problem.residual[:, None] if residuals is None else residuals
+        n, n_kept = problem.n_points, problem.n_kept
+        whitened = self._whitened_under(problem.law)
+        taken = problem.basis[:n].T @ whitened.templates  # the part that the fit absorbs, (n_params, n_columns)
+        along = whitened.templates.T @ own[:n]
+        total = np.maximum(np.sum(own**2, axis=0), 1e-300)
+        out = np.empty((len(self.widths), own.shape[1]))
+        for width, products in whitened.products.items():  # all templates of one width at a time
+            members, at = self._template_and_column_indices(width)
+            absorbed = taken[:, at].transpose(1, 0, 2)
+            left = products - absorbed.transpose(0, 2, 1) @ absorbed
+            gain, axes = _gram_eigensystems(left)
+            gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
+            turned = axes.transpose(0, 2, 1) @ along[at]
+            explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
+            out[members] = average_over_amplitude_scales(explained, gain, n_kept)
+        return out
+
+    def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
+        """Return the share of each template's norm that a fit does not absorb, (n_templates,)."""
+        templates = self._whitened_under(problem.law).templates
+        taken = problem.basis[: problem.n_points].T @ templates
+        whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._first_columns) for a in (templates, taken))
+        return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
+
+    def _template_and_column_indices(self, width: int) -> tuple[IntArray, IntArray]:
+        """Return the indices of the templates of one width, (n,), and of their columns, (n, width)."""
+        members = np.flatnonzero(self.widths == width)
+        return members, self._first_columns[members, None] + np.arange(width)
+
+    def _whitened_under(self, law: NoiseLaw) -> _WhitenedTemplatesAndGrams:
+        """Whiten all templates, scaled to unit rms each, with Gram matrices; cached for the last few noise models."""
+        key = law.whitening_key
+        if key in self._whitened:
+            self._whitened[key] = self._whitened.pop(key)
+        else:
+            room = min(max(_MOST_BYTES // max(self.columns.nbytes, 1), 1), _REMEMBERED)
+            while len(self._whitened) >= room:
+                self._whitened.pop(next(iter(self._whitened)))
+            whitened = law(self.columns)
+            norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+            per_column = np.repeat(self.widths, self.widths)
+            whitened *= np.sqrt(law.n_kept / per_column) / np.where(norms > 0, norms, 1.0)
+            products = {}
+            for width in map(int, np.unique(self.widths)):
+                blocks = whitened[:, self._template_and_column_indices(width)[1]].transpose(1, 0, 2)
+                products[width] = blocks.transpose(0, 2, 1) @ blocks
+            self._whitened[key] = _WhitenedTemplatesAndGrams(whitened, products)
+        return self._whitened[key]
+
+
+def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return eigenvalues (n, width) and eigenvectors (n, width, width) of Gram matrices (n, width, width)."""
+    width = squares.shape[-1]
+    if width == 1:
+        return squares[:, 0], np.ones_like(squares)
+    if width > 2:
+        values, axes = np.linalg.eigh(squares)
+        return values, axes
+    # Two columns, or one as above, are the rule and have a closed form (Jacobi's rotation).
+    first, second, both = squares[:, 0, 0], squares[:, 1, 1], squares[:, 0, 1]
+    angle = 0.5 * np.arctan2(2 * both, first - second)
+    c, s = np.cos(angle), np.sin(angle)
+    values = np.stack(
+        [first * c * c + second * s * s + 2 * both * c * s, first * s * s + second * c * c - 2 * both * c * s]
+    )
+    return values.T, np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class _WhitenedTemplatesAndGrams:
+    """All templates, whitened, (n_points, n_columns), and by width their Gram matrices, (n, width, width)."""
+
+    templates: FloatArray
+    products: dict[int, FloatArray]
+
+
+_RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
+_ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none if it is insignificant,
+_LAST_DIGITS = 1e-12  # or, whatever the noise, no larger than rounding of predictions that are smooth to this share
+_INSIGNIFICANT = 0.01  # noise sds; readings by the epoch vary by less than `_ROUNDING`
+_AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class EffectTemplates:
+    """An effect's template bank about a fit: columns, setting and variant of each entry.
+
+    Variants are the discrete choices of an effect, such as which scans it acts on; `choice` numbers them by entry.
+    """
+
+    columns: tuple[FloatArray, ...]  # each (n_usable, n_columns)
+    settings: tuple[FloatArray, ...]  # each (n_columns, n_params)
+    variants: tuple[NamedEffect[Any], ...]
+    choice: IntArray  # number of each entry's variant, (n_entries,)
+
+    def variant_of_entry(self, at: int) -> NamedEffect[Any]:
+        """Return the variant (discrete choice, such as of scans) of entry number `at`."""
+        variant: NamedEffect[Any] = self.variants[self.choice[at]]
+        return variant
+
+    @cached_property
+    def variant_odds(self) -> FloatArray:
+        """Prior odds of each variant against the first, (n_variants,)."""
+        return np.array([variant.relative_odds for variant in self.variants])
+
+    def variant_probabilities(self, scores: FloatArray) -> FloatArray:
+        """Return the posterior probability of each variant, (n_variants,), from log Bayes factors (n_entries,)."""
+        shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants)) * self.variant_odds
+        return np.asarray(shares / shares.sum())
+
+
+@dataclass(eq=False)
+class TemplateCache:
+    """Cache of the templates of effects about fits, on the rows `usable`."""
+
+    usable: IntArray
+    known: dict[tuple[Fit, NamedEffect[Any]], EffectTemplates] = field(default_factory=dict)
+    banks: dict[tuple[Fit, tuple[str, ...]], TemplateBank] = field(default_factory=dict)
+
+    def coarse_bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> TemplateBank:
+        """Return one bank of the templates of several effects about a fit, of fewer variants, labelled by name."""
+        key = found, tuple(effect.name for effect in effects)
+        if key not in self.banks:
+            own = [
+                (effect.name, t)
+                for effect in effects
+                for t in self.templates_of(found, effect.with_fewer_variants()).columns
+            ]
+            self.banks[key] = TemplateBank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
+        return self.banks[key]
+
+    def templates_of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
+        """Return the templates of one effect about one fit."""
+        key = found, effect
+        if key not in self.known:
+            self.known[key] = templates_of_effect(found, effect, self.usable)
+        return self.known[key]
+
+
+def templates_of_effect(
+    found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
+) -> EffectTemplates:
+    """Predict the change of the readings by each bank entry of all variants of an effect, about a fit.
+
+    Variants are its discrete choices, such as of scans. With `most`, so many entries are predicted, evenly spread.
+    """
+    variants = effect.variants()
+    banks = [variant.bank() for variant in variants]
+    choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
+    entries = np.concatenate(banks)
+    if most is not None and most < len(entries):
+        kept = np.linspace(0, len(entries) - 1, most).round().astype(np.int64)
+        choice, entries = choice[kept], entries[kept]
+    gates = effect.variant_masks(found.model.plan)
+    if gates is not None:
+        (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
+        columns = [everywhere * gates.opened[k][usable, None] for k in choice]
+    else:
+        # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
+        columns = []
+        for _, group in itertools.groupby(
+            range(len(choice)), key=lambda at: _scans_and_patterns_of(variants[choice[at]])
+        ):
+            at = list(group)
+            columns += _predicted_changes(found, variants[choice[at[0]]], entries[at], usable)
+    return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
+
+
+def _scans_and_patterns_of(variant: NamedEffect[Any]) -> tuple[object, object]:
+    return variant.scans, variant.patterns
+
+
+def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
+    """Return the change of the readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans.
+
+    A column is 0 too if the model with the effect diverges, or the change is no more than rounding.
+    """
+    plain, plan = found.model, found.model.plan
+    model = plain.with_effect(effect)
+    n_rows = bank.shape[0] * bank.shape[1]
+    own = {e.name: effect_values(e, found.z[None, plain.coordinate_slice(e.name)]) for e in plain.effects}
+    sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
+    inside = np.flatnonzero(scan_indicator(plan, effect.scans)) if effect.scans else np.arange(len(plan))
+    there = plan.take(inside) if effect.scans else plan
+    kept = np.isin(usable, inside, assume_unique=True)
+    at = np.searchsorted(inside, usable[kept])
+    # Effects after the light integral reuse it.
+    seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
+    change = np.zeros((n_rows, len(usable)))  # of all rows of a long plan it may be gigabytes
+    step = max(_AT_ONCE // len(there), 1)
+    for first in range(0, n_rows, step):
+        rows = slice(first, min(first + step, n_rows))
+        n = rows.stop - first
+        each = {name: np.repeat(values, n, axis=0) for name, values in own.items()}
+        each[effect.name] = bank.reshape(n_rows, -1)[rows]
+        theta = model.joined_theta(np.repeat(sensor, n, axis=0), each)
+        read = (
+            model.chain.predict(theta, there)
+            if seen is None
+            else model.chain.readings_from_simulated_view(seen, theta, there)
+        )
+        change[rows, kept] = read[:, at] - found.predicted[kept]
+    columns = change.T
+    largest = np.abs(found.predicted).max(initial=0.0)
+    columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + largest))] = 0.0  # NaN too
+    none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
+    columns[:, np.abs(columns).max(axis=0) < none] = 0.0
+    return np.split(columns, len(bank), axis=1)
+
+
+def combinations_up_to(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
+    """List every combination of up to `most` names, each sorted, the empty one first."""
+    for size in range(most + 1):
+        yield from itertools.combinations(sorted(names), size)
+
+
+_BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
+
+
+def log_mean_exp(scores: FloatArray) -> float:
+    """Return the log of the mean of Bayes factors that are given as logs."""
+    top = float(scores.max())  # thousands of short lists: scipy's general function is ten times slower
+    return top + math.log(float(np.exp(scores - top).mean())) if math.isfinite(top) else top
+
+
+def log_bayes_factors_by_label(problem: Linearised, bank: TemplateBank) -> dict[str, FloatArray]:
+    """Return, by label of a bank (an effect's name), the log Bayes factors of its templates, (n_entries,)."""
+    scores = bank.log_bayes_factors(problem)[:, 0]
+    return {name: scores[members] for name, members in bank.indices_by_label.items()}
+
+
+def log_bayes_factors_of_pairs(
+    problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
+) -> dict[Names, float]:
+    """Return the log Bayes factor of each pair of effects, by their sorted names.
+
+    It is the sum of both effects' own (`singles`), corrected by the joint score of the best two entries of each bank.
+    """
+    best = {name: np.argsort(-scores)[:_BEST_ENTRIES] for name, scores in singles.items()}
+    entries = [(name, int(i)) for name in templates for i in best[name]]
+    pairs = list(combinations(sorted(templates), 2))
+    if not pairs:
+        return {}
+    columns = [templates[name].columns[i] for name, i in entries]
+    widths = [c.shape[1] for c in columns]
+    # In a basis of their joint span, with one more axis for the rest of the residual.
+    axes, turned = np.linalg.qr(scale_and_project(problem, columns))
+    along = axes.T @ problem.residual
+    rest = math.sqrt(max(float(problem.residual @ problem.residual - along @ along), 0.0))
+    turned = np.concatenate([turned, np.zeros((1, turned.shape[1]))])
+    own = dict(zip(entries, np.split(turned, np.cumsum(widths)[:-1], axis=1), strict=True))
+    asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
+    both = [_joined_templates(own[first], own[second]) for first, second in asked]
+    blocks = OrthonormalBlocks.of_projected_templates(np.concatenate(both, axis=1), [c.shape[1] for c in both])
+    together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_kept)[:, 0]
+    apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
+    starts = np.concatenate([[0], np.cumsum([len(best[a]) * len(best[b]) for a, b in pairs])[:-1]])
+    gained = np.logaddexp.reduceat(together, starts) - np.logaddexp.reduceat(apart, starts)
+    alone = {name: log_mean_exp(scores) for name, scores in singles.items()}
+    return {(a, b): alone[a] + alone[b] + float(own) for (a, b), own in zip(pairs, gained, strict=True)}
+
+
+def _joined_templates(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Join two templates of unit rms into one of unit rms."""
+    widths = first.shape[1], second.shape[1]
+    scaled = [t * math.sqrt(w / sum(widths)) for t, w in zip((first, second), widths, strict=True)]
+    return np.concatenate(scaled, axis=1)

@@ -1,0 +1,302 @@
+"""Basis functions over every covariate, for unknown effects: changes of the readings that no named effect describes.
+
+A mismatch that depends smoothly on a covariate adds to the readings, multiplies the signal, or displaces the sensor. So
+there are smooth functions of covariates: alone, times the signal, and times the slope of the readings along the
+motion; over time and place all three, over another covariate those that make sense. Other bases are steps (change
+points) over time and place, windows, one value per scan or angle, memories of earlier readings, and transients at the
+ends of scans. Where columns are logged beside the readings, products of two are bases too: a function of one column
+cannot imitate a product of two that vary independently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.templates import TemplateBank
+
+PRODUCTS = "products of two columns"
+"""The family of products of covariates."""
+
+MEMORY = "what was seen before"
+"""The family of what a reading keeps of earlier ones."""
+
+SCAN_ENDS = "ends of scans"
+"""The family of transients at the ends of scans or runs."""
+
+_LIKE = 0.9  # cosine from which a basis duplicates a named effect
+_MOST_GROUPS = 24
+_N_STEPS = 15  # change points of a covariate
+_FEW_SCANS = 6
+_MEMORIES = (3.0, 10.0, 30.0)  # readings
+
+
+@dataclass(frozen=True, eq=False)
+class _BasisMultipliers:
+    """Factors by which a function of a covariate is multiplied to give a basis, (n_points,) each; number of scans.
+
+    `adds`: 1, an added error; `gain`: the signal; `shift`: the slope along the axis of motion, a displacement;
+    `turned`: the sign of the motion, an error that reverses with it.
+    """
+
+    adds: FloatArray
+    gain: FloatArray
+    shift: FloatArray
+    turned: FloatArray
+    n_scans: int
+
+
+def bank_of_unknown_effects(
+    covariates: Sequence[Covariate],
+    signal: FloatArray,
+    slope: FloatArray,
+    scan: IntArray | None,
+    *,
+    multiplied: Sequence[Covariate] = (),
+) -> TemplateBank:
+    """Build the template bank of unknown effects: basis functions over every covariate.
+
+    Parameters
+    ----------
+    covariates
+        Covariates of the usable readings.
+    signal, slope
+        Predicted reading above its minimum, and its slope along the motion, (n_usable,) each.
+    scan
+        Number of each usable row's scan, (n_usable,); rows of scans may be mixed. None: rows are in no order, and
+        nothing depends on the rows before.
+    multiplied
+        Covariates of which the product of every two is a basis; all products are one family.
+
+    Returns
+    -------
+    Bank of bases, (n_usable, n_columns) each, labelled by family; families have equal prior weight.
+    """
+    numbers = np.zeros(len(signal), dtype=np.int64) if scan is None else scan
+    order = np.argsort(numbers, kind="stable")  # those of each scan together
+    starts, back = np.flatnonzero(np.diff(numbers[order], prepend=-1)), np.argsort(order)
+    sign = np.zeros(len(signal))
+    for covariate in covariates:
+        if covariate.name == "direction":
+            sign[covariate.rows] = covariate.values
+    along_axis = slope * np.where(sign == 0, 1.0, sign)
+    ways = _BasisMultipliers(np.ones(len(signal)), signal, along_axis, sign, len(starts))
+    found = [
+        (_basis_family_name(covariate, template), template)
+        for covariate in covariates
+        for template in _bases_of_covariate(covariate, ways)
+    ]
+    found += [(PRODUCTS, template) for template in _product_bases(multiplied, len(signal))]
+    if scan is not None:
+        found += [(MEMORY, template[back]) for template in _memory_bases(signal[order], starts)]
+        found += [(SCAN_ENDS, template[back]) for template in _scan_end_bases(len(signal), starts)]
+    kept = [(name, template) for name, template in found if np.any(template)]
+    return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
+
+
+def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linearised) -> TemplateBank:
+    """Return the bases without those that a template of a named effect holds, the fit's parameters projected out.
+
+    A basis of one column that is in or near a template's span, with a cosine of 0.9 or more, is left out: a window that
+    extends to the end of the recording, for instance, is the effect of a light switched on. A basis of several columns
+    that has a template's span, such as an offset for each run, becomes zero: as an unknown effect it explains nothing,
+    and its share of the prior is not given to the others.
+    """
+    if bases.widths.size == 0 or named.widths.size == 0:
+        return bases
+    blocks, own = _orthonormal_blocks(named, problem), _orthonormal_blocks(bases, problem)
+    single = np.flatnonzero(bases.widths == 1)
+    kept = np.setdiff1d(np.arange(len(bases.widths)), single[_are_held(own.u[:, own.starts[single]], blocks)])
+    twins = np.repeat(_have_span_of_some(own, blocks), bases.widths)
+    return replace(bases, columns=np.where(twins, 0.0, bases.columns)).take_templates(kept)
+
+
+def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: Linearised) -> TemplateBank:
+    """Return the bases without the products that a template of a formula holds, the fit's parameters projected out."""
+    products = bases.indices_by_label.get(PRODUCTS, np.zeros(0, dtype=np.int64))
+    if products.size == 0 or formulas.widths.size == 0:
+        return bases
+    held = _are_held(
+        _orthonormal_blocks(bases.take_templates(products), problem).u, _orthonormal_blocks(formulas, problem)
+    )
+    return bases.take_templates(np.setdiff1d(np.arange(len(bases.widths)), products[held]))
+
+
+def _orthonormal_blocks(bank: TemplateBank, problem: Linearised) -> OrthonormalBlocks:
+    return OrthonormalBlocks.of(problem, [bank[k] for k in range(len(bank.widths))])
+
+
+def _are_held(columns: FloatArray, blocks: OrthonormalBlocks) -> BoolArray:
+    """Return which orthonormal columns, (n_rows, n_columns), have a cosine of 0.9 or more with the span of a block."""
+    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ columns) ** 2, blocks.starts, axis=0))
+    return np.asarray(cosines.max(axis=0) >= _LIKE)
+
+
+def _have_span_of_some(blocks: OrthonormalBlocks, others: OrthonormalBlocks) -> BoolArray:
+    """Return which blocks of two or more directions have nearly the span of one of the others, (n_blocks,).
+
+    Spans have as many directions, and the largest angle between them has a cosine of 0.9 or more.
+    """
+    spans, other_spans = (
+        [u[:, np.any(u, axis=0)] for u in np.split(each.u, each.starts[1:], axis=1)] for each in (blocks, others)
+    )
+    by_rank: dict[int, list[FloatArray]] = {}
+    for span in other_spans:
+        by_rank.setdefault(span.shape[1], []).append(span)
+    return np.array(
+        [
+            span.shape[1] > 1
+            and any(
+                np.linalg.svd(other.T @ span, compute_uv=False)[-1] >= _LIKE for other in by_rank.get(span.shape[1], [])
+            )
+            for span in spans
+        ]
+    )
+
+
+def _basis_family_name(covariate: Covariate, template: FloatArray) -> str:
+    """Name a template's family, such as "time" or, for windows and steps, "time, locally"."""
+    name = covariate.published_name
+    where = name if covariate.scan is None else f"{name} within scans"
+    return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
+
+
+def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:
+    if covariate.groups:
+        yield from _group_bases(covariate, ways)
+    elif covariate.scan is not None:
+        yield _cosine_bases(covariate, ways.adds, 6)
+        yield _cosine_bases(covariate, ways.shift, 3)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16) if ways.n_scans <= _FEW_SCANS else (8,))
+    elif covariate.name == "place":
+        for terms in (3, 8, 20):
+            yield _cosine_bases(covariate, ways.adds, terms)
+            yield _cosine_bases(covariate, ways.shift, terms)
+        yield _cosine_bases(covariate, ways.gain, 3)
+        yield _cosine_bases(covariate, ways.gain, 8)
+        yield _cosine_bases(covariate, ways.turned, 3)
+        yield _cosine_bases(covariate, ways.turned * ways.shift, 3)
+        yield from _step_bases(covariate, ways.shift)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
+    elif covariate.name == "time":
+        for terms in (3, 8, 24, 64):
+            yield _cosine_bases(covariate, ways.adds, terms)
+        for way in (ways.gain, ways.shift):
+            yield _cosine_bases(covariate, way, 3)
+            yield _cosine_bases(covariate, way, 8)
+            yield from _step_bases(covariate, way)
+        yield from _step_bases(covariate, ways.adds)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
+    elif covariate.name in ("level", "edge_distance"):
+        for terms in (3, 8, 20):
+            yield _cosine_bases(covariate, ways.adds, terms)
+        side = np.where(ways.gain > 0.5 * ways.gain.max(), 1.0, -1.0)
+        yield _cosine_bases(covariate, side * ways.adds, 8)
+        yield _cosine_bases(covariate, ways.turned, 3)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
+    elif covariate.name == "slope":
+        yield _cosine_bases(covariate, ways.adds, 3)
+        yield _on_all_rows(covariate.values[:, None], covariate, len(ways.adds))
+        yield _on_all_rows(np.abs(covariate.values)[:, None], covariate, len(ways.adds))
+    else:  # a logged column of the recording
+        for way in (ways.adds, ways.gain):
+            yield _cosine_bases(covariate, way, 3)
+            yield _cosine_bases(covariate, way, 8)
+
+
+def _group_bases(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:
+    codes = np.unique(covariate.values, return_inverse=True)[1]
+    if codes.max() >= _MOST_GROUPS:
+        return
+    member = _on_all_rows((codes[:, None] == np.arange(codes.max() + 1)).astype(np.float64), covariate, len(ways.adds))
+    for way in (ways.adds, ways.gain, ways.shift):
+        yield member * way[:, None]
+    for way in (ways.adds, ways.shift):
+        yield from (column[:, None] * way[:, None] for column in member.T)
+
+
+def _product_bases(covariates: Sequence[Covariate], n_points: int) -> Iterator[FloatArray]:
+    """Yield the product of each two covariates, both centred and scaled: 0 where either is missing."""
+    scaled = [
+        _on_all_rows(((c.values - c.values.mean()) / (c.values.std() or 1.0))[:, None], c, n_points) for c in covariates
+    ]
+    yield from (first * second for first, second in combinations(scaled, 2))
+
+
+def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
+    """Yield exponential averages (of 3, 10, 30 readings) and maximum of the signal within scans; the maximum alone."""
+    held = np.empty((len(signal), len(_MEMORIES) + 1))
+    keep = np.exp(-1 / np.array(_MEMORIES))
+    first = np.zeros(len(signal), dtype=np.bool_)
+    first[starts] = True
+    state, most = np.zeros(len(_MEMORIES)), 0.0
+    for k, value in enumerate(signal):
+        if first[k]:
+            state[:], most = value, value
+        state = keep * state + (1 - keep) * value
+        most = max(most, value)
+        held[k, :-1], held[k, -1] = state, most
+    yield held
+    yield held[:, -1:]
+
+
+def _scan_end_bases(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
+    """Yield pairs of columns: decay from a scan's start, growth towards its end, over 2 and over 8 readings.
+
+    A pair is the same in all scans; with up to 24 scans, there are also bases of one pair per scan.
+    """
+    first = np.repeat(starts, np.diff(starts, append=n_points))
+    last = np.repeat(np.append(starts[1:], n_points) - 1, np.diff(starts, append=n_points))
+    rows = np.arange(n_points)
+    each = (first[:, None] == starts).astype(np.float64)
+    for length in (2.0, 8.0):
+        begin, end = np.exp(-(rows - first) / length), np.exp(-(last - rows) / length)
+        yield np.stack([begin, end], axis=1)
+        if len(starts) <= _MOST_GROUPS:
+            yield np.concatenate([each * begin[:, None], each * end[:, None]], axis=1)
+
+
+def _cosine_bases(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
+    """Return cosines along the covariate times `way`, (n_points, n_columns), finer where `way` squared is larger."""
+    values, weight = covariate.values, way[covariate.rows] ** 2
+    distinct, codes = np.unique(values, return_inverse=True)
+    share = np.cumsum(np.bincount(codes, weight + 1e-3 * weight.mean()))
+    if share[-1] == 0:
+        return np.zeros((len(way), n_terms))
+    along = (share / share[-1] - 0.5 * np.diff(share, prepend=0.0) / share[-1])[codes]
+    if covariate.name == "level":  # most readings are at its ends, but curvature shows in between
+        along = 0.5 * along + 0.5 * (values - distinct[0]) / np.ptp(distinct)
+    waves = np.cos(np.pi * along[:, None] * np.arange(0 if np.ptp(way) else 1, n_terms + 1))
+    return _on_all_rows(waves * way[covariate.rows, None], covariate, len(way))
+
+
+def _step_bases(covariate: Covariate, way: FloatArray) -> Iterator[FloatArray]:
+    """Yield 15 bases: `way` after a change point, 0 before; between points, the sums of `way` squared are equal."""
+    values, weight = covariate.values, way[covariate.rows] ** 2
+    order = np.argsort(values, kind="stable")
+    share = np.cumsum(weight[order])
+    for k in range(1, _N_STEPS + 1):
+        at = values[order][min(int(np.searchsorted(share, share[-1] * k / (_N_STEPS + 1))), len(values) - 1)]
+        yield _on_all_rows(((values > at) * way[covariate.rows])[:, None], covariate, len(way))
+
+
+def _window_bases(covariate: Covariate, way: FloatArray, parts: Sequence[int]) -> Iterator[FloatArray]:
+    order, n = np.argsort(covariate.values, kind="stable"), len(covariate.values)
+    for n_parts in parts:
+        width = max(n // n_parts, 2)
+        for first in range(0, n - width + 1, max(width // 2, 1)):
+            window = np.zeros(n)
+            window[order[first : first + width]] = 1.0
+            yield _on_all_rows((window * way[covariate.rows])[:, None], covariate, len(way))
+
+
+def _on_all_rows(columns: FloatArray, covariate: Covariate, n_points: int) -> FloatArray:
+    out = np.zeros((n_points, columns.shape[1]))
+    out[covariate.rows] = columns
+    return out

@@ -1,0 +1,486 @@
+"""The verdict, from probabilities, a global test of the null's mean, and aliases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.diagnosis.aliases import Alias, aliases_with_separating_plans
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.search.refits import (
+    WeighedFit,
+    effects_out_of_vocabulary,
+    noise_effects_in_vocabulary,
+    require_converged_fit,
+)
+from probewise.diagnosis.search.searched import Searched
+from probewise.effects import PROPOSAL, name_without_copy_suffix
+
+N_DRAWS = 999
+"""Number of residual draws under the null."""
+
+_NO_ALARM = 0.05  # p-value above which no alarm is possible, so that other forms of the SSF need no test
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalTest:
+    """Result of the global test of the null: p-value, and the most probable noise, names of its effects.
+
+    `problem` is the fit linearised under that noise; `draws` (n_rows, 999) are projected residuals under the null.
+    """
+
+    null: WeighedFit
+    noise: Names
+    problem: Linearised
+    draws: FloatArray
+    p_value: float
+
+
+def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTest:
+    """Test whether effects are missing in the mean of the null; the p-value is 1 where all readings are equal.
+
+    Raises
+    ------
+    NotConvergedError
+        If the fit of the null did not converge, with enough readings to tell.
+    """
+    prepared, null, noise = searched.prepared, searched.null, searched.posterior.likeliest_noise()
+    problem = Linearised.of(null.found, null.evidence[null.possible_noise(noise)].likeliest_law)
+    if not prepared.has_too_little_data:
+        require_converged_fit(null.found, Linearised.of(null.found, null.law))
+    draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
+    p_value = bayes_factor_p_value(problem, searched.template_banks_for_global_test(null.found), draws)
+    p_value = _max_p_value_over_orders(searched, null, noise, p_value, rng=rng)
+    # Constant readings have no noise to compare a residual with.
+    return GlobalTest(null, noise, problem, draws, 1.0 if prepared.has_only_equal_readings else p_value)
+
+
+def _max_p_value_over_orders(
+    searched: Searched, null: WeighedFit, noise: Names, p_value: float, *, rng: np.random.Generator
+) -> float:
+    """Return the largest p-value over the SSF's order (number of Gaussians) and higher ones, and with fine structure.
+
+    The evidence accepts another Gaussian only if it gains ten nats or more; a smaller misfit of an SSF that is no
+    mixture is not physics. So an alarm must hold at every order, and with fine structure about the freest form. Once a
+    p-value exceeds .05, the rest is not tested.
+    """
+    prepared, fits = searched.prepared, searched.evidences.fits
+    rivals = [fits[n, ()] for n in sorted(n for n, names in fits if not names and n > null.n_gaussians)]
+    asked = [(rival, False) for rival in rivals]
+    if prepared.null is None:  # a known prior is kept at every order: an orientation error shows only relative to it
+        asked.append(((rivals or [null])[-1], True))
+    for rival, fine in asked:
+        if p_value > _NO_ALARM:
+            break
+        found = rival.found
+        beside = prepared.apparatus.fine_structure_slopes(found, prepared.usable_rows) if fine else None
+        problem = Linearised.of(found, rival.evidence[rival.possible_noise(noise)].likeliest_law, beside)
+        draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
+        p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_global_test(found), draws))
+    return p_value
+
+
+OUT_OF_THE_QUESTION = 0.2
+"""Share of a leader's probability up to which its rivals are not credible; priors differ by less."""
+
+_NO_NAMES = ("unknown",)
+
+
+def shared_effects(probabilities: Mapping[Names, float]) -> Names:
+    """Return the effects that are in nearly all hypotheses at once, sorted; () if there are none.
+
+    The hypotheses without one of them have together at most a fifth of the probability of those with all of them, so
+    that no alias of one is credible. `probabilities` are by the effects of each hypothesis.
+    """
+    total, shared = sum(probabilities.values()), frozenset[str]()
+    for name in _most_probable_first(probabilities):
+        with_all = sum(p for names, p in probabilities.items() if shared | {name} <= {*names})
+        if total - with_all <= OUT_OF_THE_QUESTION * with_all:
+            shared |= {name}
+    return tuple(sorted(shared))
+
+
+def probabilities_beside(shared: Names, probabilities: Mapping[Names, float]) -> dict[Names, float]:
+    """Return, most probable first, what acts beside shared effects: () for nothing more, and its probability.
+
+    Hypotheses that lack one of the shared effects are left out.
+    """
+    beside = {
+        tuple(name for name in names if name not in shared): p
+        for names, p in probabilities.items()
+        if {*shared} <= {*names}
+    }
+    return dict(sorted(beside.items(), key=lambda item: -item[1]))
+
+
+def _most_probable_first(probabilities: Mapping[Names, float]) -> Iterator[str]:
+    """Iterate over all effects, those first that are in hypotheses of the largest probability."""
+    of_effect: dict[str, float] = {}
+    for names, p in probabilities.items():
+        for name in names if names != _NO_NAMES else ():
+            of_effect[name] = of_effect.get(name, 0.0) + p
+    yield from sorted(of_effect, key=lambda name: (-of_effect[name], name))
+
+
+Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
+
+_CREDIBLE = 0.95
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of effects and its probability; () is clean, ("unknown",) what is out of vocabulary and not named."""
+
+    effects: Names
+    probability: float
+
+    @property
+    def label(self) -> str:
+        """Name in a credible set: effects joined by "+", or "clean"."""
+        return "+".join(sorted(map(name_without_copy_suffix, self.effects))) or "clean"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The verdict on a recording, with probabilities.
+
+    Parameters
+    ----------
+    verdict
+        "clean", "named", "noise" (named, but all effects are on the noise), "unknown" or "cannot_tell".
+    combination
+        Most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown. Of a simulator,
+        if only the `shared` effects can be named, these and others of the `leader` with more than half the probability.
+    p_value
+        p-value of the global test of the mean, under the noise model found.
+    hypotheses
+        All hypotheses, most probable first; probabilities sum to one.
+    aliases
+        Pairs of aliased effects.
+    order_probabilities
+        Probability of each number of Gaussians of the SSF.
+    unknown_shares
+        Probability of each form, such as "place", that an unknown effect could have, given that there is one.
+    too_little
+        Whether there are too few readings for a verdict, or all are equal.
+    withdrawn
+        Whether the leading hypothesis is not stated because it predicts held-out readings far worse than the null.
+    shared
+        Effects that nearly all hypotheses have, whatever else acts; always () for a light sensor.
+    leader
+        Most probable set of effects that holds the `combination`, by which the model is repaired, if that is another.
+    """
+
+    verdict: Verdict
+    combination: Names
+    p_value: float
+    hypotheses: tuple[Hypothesis, ...]
+    aliases: tuple[Alias, ...] = ()
+    order_probabilities: Mapping[int, float] = field(default_factory=dict)
+    unknown_shares: Mapping[str, float] = field(default_factory=dict)
+    too_little: bool = False
+    withdrawn: bool = False
+    shared: Names = ()
+    leader: Names = ()
+
+    def with_verdict_withdrawn(self) -> Judged:
+        """Return a copy whose verdict is `cannot_tell`, names no effect and is marked as `withdrawn`."""
+        return replace(self, verdict="cannot_tell", combination=(), withdrawn=True, shared=(), leader=())
+
+    @property
+    def repaired_by(self) -> Names:
+        """The set of effects by which the model is repaired: the `combination`, or the larger set that leads."""
+        return self.leader or self.combination
+
+    @property
+    def stated(self) -> Names:
+        """The effects that the verdict states without reserve: the `combination`, or of that the `shared` effects."""
+        return self.shared if self.leader else self.combination
+
+    @property
+    def beside_shared(self) -> tuple[Hypothesis, ...]:
+        """What may act beside the `shared` effects, most probable first; () is nothing more."""
+        found = probabilities_beside(self.shared, {h.effects: h.probability for h in self.hypotheses})
+        return tuple(Hypothesis(names, p) for names, p in found.items())
+
+    @property
+    def unknown_probability(self) -> float:
+        """Probability of an effect on the mean that is out of vocabulary and not named."""
+        return next((h.probability for h in self.hypotheses if h.effects == ("unknown",)), 0.0)
+
+    @property
+    def clean_probability(self) -> float:
+        """Probability that no effect is missing, neither on the mean nor on the noise."""
+        return next((h.probability for h in self.hypotheses if not h.effects), 0.0)
+
+    @property
+    def credible(self) -> tuple[str, ...]:
+        """Labels of the hypotheses in the 95 % credible set, most probable first."""
+        return credible_labels(self.hypotheses)
+
+    @property
+    def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
+        """Forms that an unknown effect could have, with probabilities, largest first; empty if there hardly is one."""
+        if self.unknown_probability < 1e-3:
+            return ()
+        shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
+        return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
+
+
+def judge(searched: Searched, test: GlobalTest) -> Judged:
+    """Return the verdict, with probabilities and aliases, from a search and the global test."""
+    prepared, posterior = searched.prepared, searched.posterior
+    pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
+
+    def aliased_combinations(combination: Names) -> frozenset[Names]:
+        """Return the combinations with the same noise effects, and effects on the mean aliased with these."""
+        noise = prepared.noise_effect_names & {*combination}
+        others = searched.combinations_aliased_with(tuple(name for name in combination if name not in noise))
+        return frozenset(tuple(sorted({*names, *noise})) for names in others)
+
+    def verdict_on(hypotheses: tuple[Hypothesis, ...]) -> tuple[Verdict, Names]:
+        if prepared.has_too_little_data:
+            return "cannot_tell", ()
+        return verdict_and_combination(
+            hypotheses,
+            test.p_value,
+            noise_names=prepared.pure_noise_effect_names,
+            aliases=pairs,
+            aliased_with=aliased_combinations,
+            certain=frozenset(searched.certain),
+            named_needs_half=searched.prior.named_needs_half,
+        )
+
+    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(searched, test.p_value, verdict_on)
+    if (
+        verdict == "unknown"
+        and searched.prior.unknown_explains_most
+        and credible_labels(hypotheses) != ("unknown",)  # otherwise nothing named is left to lead instead
+        and searched.evidences.one_name_outweighs_unnamed()
+    ):
+        # It leads by what was believed before alone. For a light sensor it stays the verdict: of 431 in 5,988 concealed
+        # recordings at most seven would be withdrawn, all of them right.
+        named = [h.effects for h in hypotheses if h.effects not in ((), ("unknown",))]
+        verdict, combination = "cannot_tell", named[0] if named else ()
+    judged = Judged(
+        verdict,
+        combination,
+        test.p_value,
+        hypotheses,
+        aliases=pairs,
+        order_probabilities=dict(posterior.order_probabilities),
+        unknown_shares=searched.probabilities_of_unknown_forms(besides=rare),
+        too_little=prepared.has_too_little_data,
+    )
+    if searched.prior.shared_is_named and not judged.too_little:
+        judged = with_shared_effects(judged, prepared.pure_noise_effect_names, certain=frozenset(searched.certain))
+    return judged
+
+
+def hypotheses_with_verdict(
+    searched: Searched,
+    p_value: float,
+    verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]],
+) -> tuple[tuple[Hypothesis, ...], Names, tuple[Verdict, Names]]:
+    """Return the hypotheses, most probable first, the rare effects that they name (or ()), and the verdict on them.
+
+    A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided (see
+    `decided_rare_effects`), the p-value of the global test is .01 or less, and the verdict is then that they are named.
+    """
+    posterior, shares = searched.posterior, searched.evidences.reported_shares
+    unknown = {mean: p * shares(mean).get(("unknown",), 0.0) for mean, p in posterior.marginal_over_noise.items()}
+    rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
+
+    def shares_with_rare_named(mean: Names) -> Mapping[Names, float]:
+        return {mean: 1.0} if effects_out_of_vocabulary(mean) == rare else shares(mean)
+
+    if rare:
+        hypotheses = ranked_hypotheses(posterior.probabilities, shares_with_rare_named)
+        verdict, combination = verdict_on(hypotheses)
+        if verdict == "named" and {*rare} <= {*combination}:
+            return hypotheses, rare, (verdict, combination)
+    hypotheses = ranked_hypotheses(posterior.probabilities, shares)
+    return hypotheses, (), verdict_on(hypotheses)
+
+
+def decided_rare_effects(leader: Names, unknown: Mapping[Names, float]) -> Names:
+    """Return the rare effects of the `leader` if hardly anything else out of vocabulary explains the readings; else ().
+
+    `unknown` holds the probabilities of all combinations that would count as unknown. Those with the leader's rare
+    effects have half of the probability, and all others together at most a fifth of that. A proposed formula is no rare
+    effect.
+    """
+    rare = effects_out_of_vocabulary(leader)
+    own = sum(p for mean, p in unknown.items() if effects_out_of_vocabulary(mean) == rare)
+    rest = sum(unknown.values()) - own
+    is_formula = any(name.startswith(PROPOSAL) for name in rare)
+    return () if not rare or is_formula or own < 0.5 or rest > OUT_OF_THE_QUESTION * own else rare
+
+
+def with_shared_effects(
+    judged: Judged, noise_names: frozenset[str], *, certain: frozenset[str] = frozenset()
+) -> Judged:
+    """Return the judgement by what hypotheses have in common, where none of them alone decides.
+
+    - `noise` needs half of the probability for nothing on the mean. With less the verdict is `cannot_tell`, with the
+      most probable combination that has an effect on the mean, by classes of aliases.
+    - Instead of `cannot_tell` the shared effects are `named` if one of them is on the mean: they act whatever is left
+      open beside them. As for any other name, the p-value must be .01 or less. Beside them the combination has those
+      effects of the leading set that have more than half of the probability: the best answer, though not certain.
+
+    Parameters
+    ----------
+    judged
+        The judgement by single combinations.
+    noise_names, certain
+        Effects on the noise; effects that the readings show beyond doubt, which need no significant test.
+    """
+    probability = {h.effects: h.probability for h in judged.hypotheses}
+    shared = shared_effects(probability)
+    judged = replace(judged, shared=shared)
+    if judged.verdict == "noise" and sum(p for names, p in probability.items() if {*names} <= noise_names) < 0.5:
+        leader = _leader_on_mean(probability, noise_names, judged.aliases) if judged.p_value <= ALARM else ()
+        judged = replace(judged, verdict="cannot_tell", combination=leader)
+    physics = {*shared} - noise_names
+    if judged.verdict != "cannot_tell" or not physics or (judged.p_value > ALARM and not physics <= certain):
+        return judged
+    leader = max((names for names in probability if {*shared} <= {*names}), key=lambda names: probability[names])
+    likely = [name for name in leader if sum(p for names, p in probability.items() if name in names) > 0.5]
+    return replace(judged, verdict="named", combination=tuple(sorted({*shared, *likely})), leader=leader)
+
+
+def _leader_on_mean(
+    probability: Mapping[Names, float], noise_names: frozenset[str], aliases: tuple[Alias, ...]
+) -> Names:
+    """Return the most probable combination with an effect on the mean, of the most probable class of aliases."""
+    physics = {k: p for k, p in probability.items() if k != ("unknown",) and not {*k} <= noise_names}
+    classes = [_combination_and_alias_swaps(names, aliases) & physics.keys() for names in physics]
+    likeliest = max(classes, key=lambda members: sum(physics[names] for names in members), default=set())
+    return max(likeliest, key=lambda names: physics[names], default=())
+
+
+def _unknown_if_out_of_vocabulary(mean: Names) -> Mapping[Names, float]:
+    return {("unknown",) if effects_out_of_vocabulary(mean) else mean: 1.0}
+
+
+def ranked_hypotheses(
+    probabilities: Mapping[tuple[Names, Names], float],
+    reported_as: Callable[[Names], Mapping[Names, float]] = _unknown_if_out_of_vocabulary,
+) -> tuple[Hypothesis, ...]:
+    """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
+
+    `probabilities` are by the effects on the mean and those on the noise; `reported_as` maps the former to the
+    combinations under which they count, with the share of their probability that each gets.
+    """
+    joined: dict[Names, float] = {}
+    for (mean, noise), p in probabilities.items():
+        for known, share in reported_as(mean).items():
+            key = known if known == ("unknown",) else tuple(sorted((*known, *noise_effects_in_vocabulary(noise))))
+            joined[key] = joined.get(key, 0.0) + p * share
+    total = sum(joined.values())
+    ranked = sorted(joined.items(), key=lambda item: -item[1])
+    return tuple(Hypothesis(key, p / total) for key, p in ranked)
+
+
+def verdict_and_combination(
+    hypotheses: tuple[Hypothesis, ...],
+    p_value: float,
+    *,
+    noise_names: frozenset[str],
+    aliases: tuple[Alias, ...],
+    aliased_with: Callable[[Names], frozenset[Names]],
+    certain: frozenset[str] = frozenset(),
+    named_needs_half: bool = False,
+) -> tuple[Verdict, Names]:
+    """Return the verdict and the combination it names; effects on the mean also need a global test with p up to .01.
+
+    Effects in `certain`, which the readings show beyond doubt, need no significant test. With `named_needs_half`,
+    effects on the mean count whatever effects on the noise are beside them, and need half the probability; otherwise
+    the verdict is `cannot_tell`, with the combination.
+    """
+    if named_needs_half:
+        by_mean, fullest = _joined_over_noise(hypotheses, noise_names)
+        verdict, combination = verdict_from_probabilities(by_mean, noise_names, aliases, aliased_with)
+        if verdict == "named" and max(h.probability for h in by_mean if h.effects == combination) < 0.5:
+            verdict = "cannot_tell"
+        combination = fullest.get(combination, combination)
+    else:
+        verdict, combination = verdict_from_probabilities(hypotheses, noise_names, aliases, aliased_with)
+    doubtful = verdict == "named" and not {*combination} <= noise_names | certain
+    return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
+
+
+def _joined_over_noise(
+    hypotheses: tuple[Hypothesis, ...], noise_names: frozenset[str]
+) -> tuple[tuple[Hypothesis, ...], dict[Names, Names]]:
+    """Join hypotheses with the same effects on the mean; those with effects on the noise alone stay apart.
+
+    Returns
+    -------
+    The joined hypotheses, by their effects on the mean; and by these the effects of the most probable one of each.
+    """
+    joined, fullest = dict[Names, float](), dict[Names, Names]()
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        mean = tuple(name for name in hypothesis.effects if name not in noise_names) or hypothesis.effects
+        joined[mean] = joined.get(mean, 0.0) + hypothesis.probability
+        fullest.setdefault(mean, hypothesis.effects)
+    return tuple(Hypothesis(mean, p) for mean, p in joined.items()), fullest
+
+
+def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
+    """Return the labels of the smallest set of hypotheses with a probability of 95 % or more, most probable first."""
+    out, held = [], 0.0
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        out.append(hypothesis.label)
+        held += hypothesis.probability
+        if held >= _CREDIBLE:
+            break
+    return tuple(out)
+
+
+def verdict_from_probabilities(
+    hypotheses: tuple[Hypothesis, ...],
+    noise_names: frozenset[str],
+    aliases: tuple[Alias, ...],
+    aliased_with: Callable[[Names], frozenset[Names]],
+) -> tuple[Verdict, Names]:
+    """Return the verdict by probabilities and aliases alone, and the combination it names.
+
+    Clean or unknown is the verdict if it has half the probability. Otherwise the most probable combination of effects
+    is `named` (`noise` if all its effects are on the noise). The verdict is `cannot_tell` instead,
+
+    - with half the probability or more, if one aliased with it (`aliased_with`) has over a fifth of its probability;
+    - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
+    - with less, if clean or unknown is more probable, or if there is no combination: then none is named.
+    """
+    probability = {h.effects: h.probability for h in hypotheses}
+    if probability.get(("unknown",), 0.0) >= 0.5:
+        return "unknown", ("unknown",)
+    if probability.get((), 0.0) >= 0.5:
+        return "clean", ()
+    named = {effects: p for effects, p in probability.items() if effects not in ((), ("unknown",))}
+    if not named:
+        return "cannot_tell", ()
+    top = max(named, key=lambda effects: named[effects])
+    if named[top] >= 0.5:
+        if any(named.get(other, 0.0) > OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
+            return "cannot_tell", top
+        return ("noise" if set(top) <= noise_names else "named"), top
+    of_class = _combination_and_alias_swaps(top, aliases)
+    if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
+        return "cannot_tell", top
+    if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
+        return "cannot_tell", ()
+    return ("noise" if set(top) <= noise_names else "named"), top
+
+
+def _combination_and_alias_swaps(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
+    """Return the combination and all that differ from it by one effect swapped for its alias."""
+    both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
+    return {names} | {tuple(sorted({*names} - {name} | {other})) for name, other in both_ways if name in names}

@@ -29,12 +29,10 @@ fig.tight_layout()
 
 # %%
 # Residuals against the predicted reading, before and after the repair.
-fig, ax = plt.subplots(figsize=(8, 4))
-plots.residuals_against(
-    diagnosis.repair.before.readings,
-    diagnosis.repair.before.residuals,
-    diagnosis.repair.after.residuals,
-    label="predicted reading (LEGO units)",
-    unit="LEGO",
-    ax=ax,
+before, after = diagnosis.repair.before, diagnosis.repair.after
+axes = plots.residuals_against_covariates(
+    [("predicted reading (LEGO units)", before.readings)],
+    [("as calibrated", before.residuals), ("repaired", after.residuals)],
+    unit="LEGO units",
 )
+axes[0].figure.tight_layout()

@@ -101,9 +101,6 @@ FIGURES = {
     "standardised_residuals": lambda s: plots.standardised_residuals(
         s.recording, s.recording.readings, s.recording.readings
     ),
-    "residuals_against": lambda s: plots.residuals_against(
-        np.arange(40.0), np.sin(np.arange(40.0)), np.zeros(40), label="time (s)", unit="LEGO"
-    ),
     "readings_needed": lambda s: plots_of_campaigns.readings_needed(ROWS),
     "readings_needed, one row": lambda s: plots_of_campaigns.readings_needed({"inside, naive": row(16.0)}),
     "doubt_against_trust": lambda s: plots_of_campaigns.doubt_against_trust(CONCEALED),

@@ -128,11 +128,8 @@ def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
     [
         lambda: plots.posterior_widths({"a": np.array([50.0, 8.0, 3.0])}),
         lambda: plots.information_gained({"a": np.array([1.0, 2.5])}),
-        lambda: plots.residuals_against(
-            np.arange(40.0), np.zeros(40), np.full(40, np.nan), label="time (s)", unit="LEGO"
-        ),
     ],
-    ids=["widths", "information", "residuals"],
+    ids=["widths", "information"],
 )
 def test_a_figure_returns_its_axes_and_renders(draw):
     ax = draw()

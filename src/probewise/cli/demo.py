@@ -226,7 +226,7 @@ def _frame_png(search: RobotSearch, step: Step) -> bytes:
     """Draw the view of a search after a step; return a PNG."""
     from probewise._words import count_with_noun
     from probewise.report import exploration as report
-    from probewise.report.plots import grid_of_axes, png
+    from probewise.report.plots.canvas import grid_of_axes, png
 
     ax = report.draw_robot_view(
         step,

@@ -27,7 +27,7 @@ from probewise.report.plots.canvas import (
     legend_above,
     legend_below,
 )
-from probewise.report.plots.progress import set_up_width_axes
+from probewise.report.plots.search import set_up_width_axes
 
 __all__ = [
     "confusion_matrix",

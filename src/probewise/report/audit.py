@@ -10,7 +10,8 @@ from probewise.diagnosis.audit import ALIAS, LAMBDA, LEAST_NATS
 from probewise.effects import spoken_name
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots import AxesGrid, audit_matrix, png
+from probewise.report.plots.canvas import AxesGrid, png
+from probewise.report.plots.probabilities import audit_matrix
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
 from probewise.report.words import number_text, typeset_numbers
 

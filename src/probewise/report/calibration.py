@@ -12,15 +12,13 @@ from probewise._words import count_with_noun, unit_after_number
 from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import (
-    AxesGrid,
-    png,
+from probewise.report.plots.canvas import AxesGrid, png
+from probewise.report.plots.readings import (
     predicted_and_recorded_by_scan,
     readings_by_orientation,
-    spatial_sensitivity,
-    ssf_by_n_gaussians,
     standardised_residuals,
 )
+from probewise.report.plots.ssf import spatial_sensitivity, ssf_by_n_gaussians
 from probewise.report.words import (
     decimals_to_show,
     number_text,

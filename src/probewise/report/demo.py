@@ -28,19 +28,16 @@ from probewise.report.html import (
     table,
 )
 from probewise.report.paper_view import paper_view, window_around_runs_mm
-from probewise.report.plots import (
-    AxesGrid,
-    arm_and_sensor,
-    grid_of_axes,
-    hypothesis_probabilities,
-    information_gained,
-    png,
-    posterior_widths,
+from probewise.report.plots.apparatus import arm_and_sensor
+from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
+from probewise.report.plots.probabilities import hypothesis_probabilities
+from probewise.report.plots.readings import (
     quadrant_patterns,
     readings_before_and_after_repair,
     residuals_by_scan,
     sensor_orientations,
 )
+from probewise.report.plots.search import information_gained, posterior_widths
 from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import join_side_by_side
 from probewise.report.words import number_text, typeset_numbers

@@ -22,23 +22,23 @@ from probewise.report.covariate_view import (
     view_along_place_covariate,
     view_along_scan,
 )
-from probewise.report.plots import (
-    heldout_gain_by_scan,
-    hypothesis_probabilities,
+from probewise.report.plots.canvas import stack_of_axes, svg
+from probewise.report.plots.noise import (
     lost_readings_against_predicted,
-    mean_residuals_along,
-    readings_in_order,
     readings_modulo_step,
     residual_autocorrelation,
     residual_histogram,
+    spread_by_level,
+)
+from probewise.report.plots.probabilities import hypothesis_probabilities, n_further_lines
+from probewise.report.plots.residuals import (
+    BEFORE,
+    heldout_gain_by_scan,
+    mean_residuals_along,
+    readings_in_order,
     residuals_against_covariates,
     scan_with_residuals,
-    spread_by_level,
-    stack_of_axes,
-    svg,
 )
-from probewise.report.plots.residuals import BEFORE
-from probewise.report.plots.verdict import n_further_lines
 from probewise.systems import RunTable
 
 _WORTH_A_BAR = 0.005

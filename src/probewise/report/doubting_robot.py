@@ -12,14 +12,9 @@ from probewise.experiment import Exploration, left_out_after_step
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Section, figure, paragraph, table
 from probewise.report.paper_view import window_around_runs_mm
-from probewise.report.plots import (
-    PAGE_IN,
-    AxesGrid,
-    draw_field_legend,
-    effect_probabilities_by_reading,
-    grid_of_axes,
-    png,
-)
+from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_axes, png
+from probewise.report.plots.probabilities import effect_probabilities_by_reading
+from probewise.report.plots.search import draw_field_legend
 from probewise.report.robot_search import RobotSearch
 from probewise.report.words import number_text
 

@@ -22,15 +22,9 @@ from probewise.experiment import (
 )
 from probewise.experiment.state import stop_reason_with_checks
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import (
-    draw_field_legend,
-    effect_probabilities_by_reading,
-    grid_of_axes,
-    information_gained,
-    playing_field,
-    png,
-    posterior_widths,
-)
+from probewise.report.plots.canvas import grid_of_axes, png
+from probewise.report.plots.probabilities import effect_probabilities_by_reading
+from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
 from probewise.report.words import interval_text, number_text, probability_text, value_with_error, words_without_unit
 from probewise.scene import outlines, with_angles_near
 from probewise.scene.any_of import shape_and_columns

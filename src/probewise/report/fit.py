@@ -11,7 +11,8 @@ from probewise._arrays import FloatArray
 from probewise._words import unit_after_number
 from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import recorded_against_predicted, residuals_against_covariates, svg
+from probewise.report.plots.canvas import svg
+from probewise.report.plots.residuals import recorded_against_predicted, residuals_against_covariates
 from probewise.report.words import digits_of_range, number_text, typeset_numbers
 from probewise.systems import RunTable
 

@@ -12,7 +12,8 @@ from probewise.investigation import Investigation, Round
 from probewise.report import diagnosis as of_a_diagnosis
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots import png, probabilities_by_round
+from probewise.report.plots.canvas import png
+from probewise.report.plots.probabilities import probabilities_by_round
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
 from probewise.report.words import probability_text, typeset_numbers
 

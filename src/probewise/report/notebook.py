@@ -22,16 +22,13 @@ from probewise.report import exploration as exploration_report
 from probewise.report import fit as fit_report
 from probewise.report import investigation as investigation_report
 from probewise.report.html import Markup, element, figure, paragraph, table
-from probewise.report.plots import (
-    corner_plot,
-    hypothesis_probabilities,
-    png,
-    posterior_widths,
-    predicted_and_recorded_by_scan,
-    readings_by_orientation,
-    recorded_against_predicted,
-    spatial_sensitivity,
-)
+from probewise.report.plots.canvas import png
+from probewise.report.plots.nested import corner_plot
+from probewise.report.plots.probabilities import hypothesis_probabilities
+from probewise.report.plots.readings import predicted_and_recorded_by_scan, readings_by_orientation
+from probewise.report.plots.residuals import recorded_against_predicted
+from probewise.report.plots.search import posterior_widths
+from probewise.report.plots.ssf import spatial_sensitivity
 from probewise.report.words import value_with_error, words_without_unit
 from probewise.sensor import SSFField
 from probewise.systems import SystemPrediction

@@ -11,7 +11,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise._words import count_with_noun
 from probewise.experiment import Exploration
 from probewise.inquiry import Grid, UtilityMap, entropy_map
-from probewise.report.plots import playing_field
+from probewise.report.plots.search import playing_field
 from probewise.scene import outlines
 
 _FINER = 2  # times as many places per side as the robot's grid, which is coarser than an edge is wide

@@ -148,16 +148,3 @@ def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float
 def _longest_lag(rho: float) -> int:
     """Return the lag at which an AR(1) correlation falls below 0.01; 0 if |rho| is not between 0.01 and 1."""
     return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0
-
-
-def running_mean_curve(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the points of a running mean, means of x and of y, (n_groups,) each.
-
-    Groups are of equal numbers of neighbours in x: at most 20, of four points or more.
-    """
-    ok = np.isfinite(x) & np.isfinite(y)
-    x, y = x[ok], y[ok]
-    if x.size == 0:
-        return x, y
-    groups = np.array_split(np.argsort(x, kind="stable"), max(1, min(20, len(x) // 4)))
-    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])

@@ -21,8 +21,8 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
 
     from probewise.arm.geometry import JOINTS
     from probewise.recordings import write_bytes_atomically
-    from probewise.report.plots import png, reach_map
-    from probewise.report.plots.apparatus import draw_arm_lengths
+    from probewise.report.plots.apparatus import draw_arm_lengths, reach_map
+    from probewise.report.plots.canvas import png
 
     out = None if arguments.out is None else checked_output_file(arguments.out)
     drawing = None if arguments.drawing is None else checked_output_file(arguments.drawing)

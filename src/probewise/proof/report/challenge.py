@@ -20,7 +20,7 @@ from probewise.proof.challenge.systems.table import gains_on_held_out_runs
 from probewise.proof.plots import confusion_matrix, reliability_diagram
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots import png
+from probewise.report.plots.canvas import png
 from probewise.report.terms import explain_new_terms, sections_with_terms_explained
 from probewise.report.words import typeset_numbers
 

@@ -8,7 +8,7 @@ from probewise._words import count_with_noun
 from probewise.proof.plots import doubt_against_trust, effect_and_size_in_words
 from probewise.proof.study import ConcealedRow
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import png
+from probewise.report.plots.canvas import png
 
 
 def summary_sentence(rows: Sequence[ConcealedRow]) -> str:

@@ -21,7 +21,7 @@ from probewise.proof.study import (
 )
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots import png
+from probewise.report.plots.canvas import png
 from probewise.report.words import number_text, value_with_error
 
 _COLUMNS: tuple[tuple[str, str], ...] = (

@@ -1,4 +1,4 @@
-"""The apparatus: the arm over its field, and its sensor seen from below (figure 1 of the paper)."""
+"""The apparatus: the arm over its field, its lengths and reach, and its sensor from below (figure 1 of the paper)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, FancyBboxPatch, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 from matplotlib.transforms import Affine2D
 
 from probewise._arrays import FloatArray
@@ -19,12 +21,17 @@ from probewise.report.plots.canvas import (
     SMALL_PT,
     VERMILLION,
     AxesGrid,
+    add_colour_bar,
     axes_or_new,
+    draw_map,
     grid_of_axes,
     label_axes,
+    paint_out_of_reach,
 )
+from probewise.report.words import number_text
 
 _ROD_MM = 26.0  # distance between the two rods of each parallelogram, as drawn
+_LINES_DEG = 15.0  # step between contours of equal orientation
 _ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": BLACK}
 _LABEL: dict[str, Any] = {"fontsize": SMALL_PT, "textcoords": "offset points", "arrowprops": _ARROW}
 
@@ -34,32 +41,15 @@ def arm_and_sensor(
 ) -> AxesGrid:
     """Draw the arm as it reads at a place, from the side and from above, and its sensor from below (paper, figure 1).
 
-    Parameters
-    ----------
-    geometry
-        Lengths and joints of the arm.
-    place_mm
-        Place of the sensor on the field.
-    outline_mm
-        Outline of the target on the field, (n_vertices, 2).
-
-    Returns
-    -------
-    Axes, (1, 3).
-
-    Raises
-    ------
-    ReachError
-        If the arm cannot read there.
+    `outline_mm`, (n_vertices, 2), is that of the target on the field. Return the axes, (1, 3). ReachError if the arm
+    cannot read at `place_mm`.
     """
-    place = np.array([place_mm], dtype=np.float64)
-    base, shoulder, elbow = geometry.angles_rad(place, geometry.read_height_mm)[0].tolist()
+    base, shoulder, elbow = geometry.angles_rad(np.array([place_mm]), geometry.read_height_mm)[0].tolist()
     if not np.isfinite(base):
         raise ReachError("place_mm", place_mm, geometry.sentence())
     axes = grid_of_axes(1, 3, size_in=(9.6, 3.3), width_ratios=[1.75, 1.6, 0.75])
     side, above, face = axes[0]
-    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
-    _draw_arm_from_side(side, geometry, shoulder, lower)
+    _draw_arm_from_side(side, geometry, shoulder, elbow)
     _draw_arm_from_above(above, geometry, place_mm, outline_mm)
     draw_sensor_face(face, size=1.0)
     face.set_axis_off()
@@ -73,19 +63,8 @@ def arm_and_sensor(
 def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring; return the axes.
 
-    Parameters
-    ----------
-    geometry
-        Lengths and joints of the arm.
-    away_mm
-        Distance from the base's axis at which the sensor reads; None: in the middle of its reach.
-    ax
-        Axes to draw on; a new figure without.
-
-    Raises
-    ------
-    ReachError
-        If the arm cannot read at that distance.
+    The sensor reads at the distance `away_mm` from the base's axis, by default in the middle of its reach; ReachError
+    if it cannot.
     """
     away = (geometry.nearest_mm + geometry.farthest_mm) / 2 if away_mm is None else away_mm
     middle = (geometry.base.low_rad + geometry.base.high_rad) / 2
@@ -93,73 +72,62 @@ def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Ax
     _, shoulder, elbow = geometry.angles_rad(place, geometry.read_height_mm)[0].tolist()
     if not np.isfinite(shoulder):
         raise ReachError("away_mm", away, f"{geometry.nearest_mm:.0f} to {geometry.farthest_mm:.0f} mm")
-    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
     ax = axes_or_new(ax, size_in=(8.2, 5.4))
+    _draw_arm_from_side(ax, geometry, shoulder, elbow, named=False)
+    _draw_lengths(ax, geometry, shoulder, elbow)
+    joint, knee, *_ = _joints_from_side(geometry, shoulder, elbow)
+    motors = (
+        ("base", geometry.base, np.array([0.0, joint[1] + 110.0]), (-12, 16), "right"),
+        ("shoulder", geometry.shoulder, joint, (40, -22), "left"),
+        ("elbow", geometry.elbow, knee, (30, 26), "left"),
+    )
+    for name, mechanics, at, off, ha in motors:
+        text = f"{name}: motor {'ABC'[mechanics.port]}, {abs(mechanics.gear_ratio):g} : 1"
+        ax.annotate(text, tuple(at.tolist()), xytext=off, ha=ha, **_LABEL)
+    ax.set(xlim=(-260, away + 290), ylim=(-110, float(knee[1]) + 110), title="")
+    return ax
+
+
+def _draw_lengths(ax: Axes, geometry: Geometry, shoulder: float, elbow: float) -> None:
+    """Draw a dimension line for each length of the arm, named as in a geometry file."""
+    joint, knee, wrist, eye = _joints_from_side(geometry, shoulder, elbow)
     (forward, height), (upper_mm, lower_mm), (out_mm, drop_mm) = (
         geometry.shoulder_mm,
         geometry.links_mm,
         geometry.sensor_mm,
     )
-    joint = np.array([forward, height])
-    knee = joint + upper_mm * np.array([np.cos(shoulder), np.sin(shoulder)])
-    wrist = knee + lower_mm * np.array([np.cos(lower), np.sin(lower)])
-    _draw_arm_from_side(ax, geometry, shoulder, lower, named=False)
-    across = 40.0 * np.array([-np.sin(shoulder), np.cos(shoulder)])
-    _draw_dimension(ax, joint, knee, across, f"upper_mm {upper_mm:g}")
-    _draw_dimension(ax, knee, wrist, 40.0 * np.array([-np.sin(lower), np.cos(lower)]), f"lower_mm {lower_mm:g}")
-    low = np.array([0.0, -45.0])
-    _draw_dimension(
-        ax, np.array([0.0, 0.0]), np.array([forward, 0.0]), low, f"shoulder_forward_mm {forward:g}", side="left"
-    )
-    up = np.array([-70.0, 0.0])
-    _draw_dimension(
-        ax, np.array([0.0, 0.0]), np.array([0.0, height]), up, f"shoulder_height_mm\n{height:g}", side="left"
-    )
-    eye = wrist + np.array([out_mm, -drop_mm])
-    _draw_dimension(ax, np.array([wrist[0], 0.0]), np.array([eye[0], 0.0]), low, f"forward_mm {out_mm:g}", side="right")
-    _draw_dimension(ax, eye, np.array([eye[0], wrist[1]]), np.array([35.0, 0.0]), f"drop_mm {drop_mm:g}", side="right")
-    said = f"read_height_mm {geometry.read_height_mm:g}"
-    _draw_dimension(ax, np.array([eye[0], 0.0]), eye, np.array([75.0, 0.0]), said, side="right")
-    x, y = joint.tolist()
-    named = (
-        ("base", geometry.base, (0.0, height + 110.0), (-12, 16), "right"),
-        ("shoulder", geometry.shoulder, (x, y), (40, -22), "left"),
-        ("elbow", geometry.elbow, (float(knee[0]), float(knee[1])), (30, 26), "left"),
-    )
-    for name, mechanics, at, off, ha in named:
-        told = f"{name}: motor {'ABC'[mechanics.port]}, {abs(mechanics.gear_ratio):g} : 1"
-        ax.annotate(told, at, xytext=off, ha=ha, **_LABEL)
-    ax.set(xlim=(-260, away + 290), ylim=(-110, float(knee[1]) + 110), title="")
-    return ax
+    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
+    of_upper, of_lower = (40.0 * np.array([-np.sin(turn), np.cos(turn)]) for turn in (shoulder, lower))
+    origin, below_eye, low = np.zeros(2), np.array([eye[0], 0.0]), np.array([0.0, -45.0])
+    for begin, end, away, text, side in (
+        (joint, knee, of_upper, f"upper_mm {upper_mm:g}", "above"),
+        (knee, wrist, of_lower, f"lower_mm {lower_mm:g}", "above"),
+        (origin, np.array([forward, 0.0]), low, f"shoulder_forward_mm {forward:g}", "left"),
+        (origin, np.array([0.0, height]), np.array([-70.0, 0.0]), f"shoulder_height_mm\n{height:g}", "left"),
+        (np.array([wrist[0], 0.0]), below_eye, low, f"forward_mm {out_mm:g}", "right"),
+        (eye, np.array([eye[0], wrist[1]]), np.array([35.0, 0.0]), f"drop_mm {drop_mm:g}", "right"),
+        (below_eye, eye, np.array([75.0, 0.0]), f"read_height_mm {geometry.read_height_mm:g}", "right"),
+    ):
+        _draw_dimension(ax, begin, end, away, text, side)
 
 
-def _draw_dimension(
-    ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, *, side: str = "above"
-) -> None:
+def _draw_dimension(ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, side: str) -> None:
     """Draw a dimension line, with arrows and text, parallel to the part from `begin` to `end` and offset by `away`."""
     a, b = begin + away, end + away
     for here, there in ((begin, a), (end, b)):
-        ax.plot([here[0], there[0]], [here[1], there[1]], color=GREY, linewidth=0.6, zorder=1)
-    arrow = {
-        "arrowstyle": "<|-|>",
-        "color": BLACK,
-        "linewidth": 0.8,
-        "shrinkA": 0.0,
-        "shrinkB": 0.0,
-        "mutation_scale": 7,
-    }
-    ax.annotate("", tuple(b), xytext=tuple(a), arrowprops=arrow)
-    middle = (a + b) / 2
+        ax.plot(*np.array([here, there]).T, color=GREY, linewidth=0.6, zorder=1)
+    arrow: dict[str, Any] = {"arrowstyle": "<|-|>", "linewidth": 0.8, "shrinkA": 0.0, "shrinkB": 0.0}
+    ax.annotate("", tuple(b), xytext=tuple(a), arrowprops={**arrow, "color": BLACK, "mutation_scale": 7})
+    (x, y), turn, ha = (a + b) / 2, 0.0, "center"
     if side == "above":
         turn = float(np.degrees(np.arctan2(*(b - a)[::-1])))
         turn = turn - 180 if turn > 90 else turn
-        off = 12.0 * away / np.hypot(*away)
-        x, y = (middle + off).tolist()
-        ax.text(x, y, text, rotation=turn, ha="center", va="center", fontsize=SMALL_PT)
+        x, y = (a + b) / 2 + 12.0 * away / np.hypot(*away)
     elif side == "left":
-        ax.text(min(a[0], b[0]) - 6, middle[1], text, ha="right", va="center", fontsize=SMALL_PT)
+        x, ha = min(a[0], b[0]) - 6, "right"
     else:
-        ax.text(max(a[0], b[0]) + 6, middle[1] + 2, text, ha="left", va="center", fontsize=SMALL_PT)
+        x, y, ha = max(a[0], b[0]) + 6, y + 2, "left"
+    ax.text(float(x), float(y), text, rotation=turn, ha=ha, va="center", fontsize=SMALL_PT)
 
 
 def draw_sensor_face(
@@ -167,16 +135,8 @@ def draw_sensor_face(
 ) -> None:
     """Draw the sensor seen from below: package, photodiode (white), LED (red) and the ridge between them.
 
-    Parameters
-    ----------
-    ax
-        Axes to draw on.
-    center, size
-        Middle and width of the package, in the axes' units.
-    turned_rad
-        Orientation, anticlockwise in the drawing; at 0 the photodiode is at the top.
-    zorder
-        Of the lowest part.
+    `center` and `size` are the middle and the width of the package in the axes' units. It is turned anticlockwise in
+    the drawing; at 0 the photodiode is at the top. `zorder` is that of the lowest part.
     """
     turn = Affine2D().scale(size).rotate(turned_rad).translate(*center) + ax.transData
     parts = (
@@ -190,37 +150,40 @@ def draw_sensor_face(
         ax.add_patch(part)
 
 
-def _draw_arm_from_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, named: bool = True) -> None:
-    forward, height = geometry.shoulder_mm
-    joint = np.array([forward, height])
+def _joints_from_side(geometry: Geometry, shoulder: float, elbow: float) -> list[FloatArray]:
+    """Return shoulder, elbow, wrist and sensor's face as distance from the base's axis and height, (2,) each, in mm."""
+    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
+    joint = np.array(geometry.shoulder_mm)
     knee = joint + geometry.links_mm[0] * np.array([np.cos(shoulder), np.sin(shoulder)])
     wrist = knee + geometry.links_mm[1] * np.array([np.cos(lower), np.sin(lower)])
-    eye = wrist + np.array([geometry.sensor_mm[0], -geometry.sensor_mm[1]])
+    return [joint, knee, wrist, wrist + np.array([geometry.sensor_mm[0], -geometry.sensor_mm[1]])]
+
+
+def _draw_arm_from_side(ax: Axes, geometry: Geometry, shoulder: float, elbow: float, *, named: bool = True) -> None:
+    joint, knee, wrist, eye = _joints_from_side(geometry, shoulder, elbow)
     ax.axhline(0.0, color=BLACK, linewidth=1.2)
-    ax.add_patch(Rectangle((-45, 0), 90, height - 12, fc="#e3e3e3", ec=GREY, zorder=1))
+    ax.add_patch(Rectangle((-45, 0), 90, joint[1] - 12, fc="#e3e3e3", ec=GREY, zorder=1))
     ax.plot([0, 0], [-25, knee[1] + 70], color=BLACK, linewidth=1.0, linestyle=(0, (6, 3)), zorder=2)
     rods = np.array([[0.0, 0.0], [0.0, _ROD_MM]])
     for away in rods:
-        ax.plot(*np.array([joint + away, knee + away]).T, color=ORANGE, linewidth=3.0, solid_capstyle="round", zorder=3)
-        ax.plot(*np.array([knee + away, wrist + away]).T, color=ORANGE, linewidth=3.0, solid_capstyle="round", zorder=3)
+        for ends in ([joint + away, knee + away], [knee + away, wrist + away]):
+            ax.plot(*np.array(ends).T, color=ORANGE, linewidth=3.0, solid_capstyle="round", zorder=3)
     for end in (joint, knee, wrist):
         ax.plot(*np.array([end, end + rods[1]]).T, color=BLACK, linewidth=2.2, zorder=4)
         ax.plot(*end, marker="o", markersize=6, color="white", markeredgecolor=BLACK, zorder=5)
     ax.plot([wrist[0], eye[0]], [wrist[1], wrist[1]], color=BLACK, linewidth=2.2, zorder=4)
     ax.add_patch(Rectangle((eye[0] - 8, eye[1]), 16, geometry.sensor_mm[1] + 6, fc="#9a9a9a", ec=BLACK, zorder=4))
+    label_axes(ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side" if named else "")
+    ax.set_aspect("equal")
     if not named:
-        label_axes(ax, x="distance from the arm's axis (mm)", y="height (mm)")
-        ax.set_aspect("equal")
         return
     ax.annotate("base turns about this axis", (0, knee[1] + 40), xytext=(10, 12), **_LABEL)
-    ax.annotate("shoulder", (float(joint[0]), float(joint[1])), xytext=(30, -22), **_LABEL)
-    ax.annotate("elbow", (float(knee[0]), float(knee[1]) + _ROD_MM), xytext=(30, -2), **_LABEL)
-    said = f"sensor, {geometry.read_height_mm:g} mm above\nthe surface when it reads"
-    ax.annotate(said, (float(eye[0]), float(eye[1])), xytext=(-90, -36), **_LABEL)
-    far = float(eye[0])
-    ax.set(xlim=(-120, far + 130), ylim=(-140, float(knee[1]) + 110), aspect="equal")
+    ax.annotate("shoulder", tuple(joint.tolist()), xytext=(30, -22), **_LABEL)
+    ax.annotate("elbow", tuple((knee + rods[1]).tolist()), xytext=(30, -2), **_LABEL)
+    height = f"sensor, {geometry.read_height_mm:g} mm above\nthe surface when it reads"
+    ax.annotate(height, tuple(eye.tolist()), xytext=(-90, -36), **_LABEL)
+    ax.set(xlim=(-120, float(eye[0]) + 130), ylim=(-140, float(knee[1]) + 110))
     ax.set_yticks([tick for tick in ax.get_yticks() if 0 <= tick <= knee[1] + 60])
-    label_axes(ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side")
 
 
 def _draw_arm_from_above(
@@ -229,7 +192,7 @@ def _draw_arm_from_above(
     width, height = geometry.field_mm
     ax.add_patch(Rectangle((0, 0), width, height, fc="#222222", ec=BLACK))
     if outline_mm is not None:
-        ax.fill(outline_mm[:, 0], outline_mm[:, 1], color="white")
+        ax.fill(*outline_mm.T, color="white")
     (x, y), (at_x, at_y) = geometry.axis_mm, place_mm
     ax.plot([x, at_x], [y, at_y], color=ORANGE, linewidth=4.0, solid_capstyle="round")
     ax.plot(x, y, marker="o", markersize=11, color="#e3e3e3", markeredgecolor=BLACK)
@@ -237,3 +200,61 @@ def _draw_arm_from_above(
     ax.annotate("base", (x, y), xytext=(12, 0), textcoords="offset points", va="center", fontsize=SMALL_PT)
     ax.set(xlim=(-20, width + 20), ylim=(-20, max(height, y) + 50), aspect="equal")
     label_axes(ax, x="x (mm)", y="y (mm)", title="from above, with the field")
+
+
+def reach_map(
+    orientation_rad: FloatArray,
+    x_mm: FloatArray,
+    y_mm: FloatArray,
+    *,
+    axis_mm: tuple[float, float],
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw an arm's reach over the field, coloured by the sensor's orientation.
+
+    `orientation_rad`, (n_y, n_x), lower row first, is NaN out of reach; `x_mm`, (n_x,), and `y_mm`, (n_y,), are the
+    places of columns and rows; `axis_mm` is that of the arm's axis.
+    """
+    ax = axes_or_new(ax, size_in=(8.2, 5.0))
+    degrees = _unwrapped_about_mean_deg(np.degrees(orientation_rad))
+    image = draw_map(ax, degrees, x_mm, y_mm, cmap="cividis")
+    levels = _contour_levels_deg(degrees)
+    if levels.size:
+        style: dict[str, Any] = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
+        lines = ax.contour(x_mm, y_mm, np.ma.masked_invalid(degrees), levels, **style)
+        for label in ax.clabel(lines, fmt=_angle_text, fontsize=SMALL_PT):
+            label.set_path_effects([withStroke(linewidth=2.0, foreground=BLACK)])
+    left, right, low, high = image.get_extent()
+    paint_out_of_reach(ax)
+    bar = add_colour_bar(ax, image, "orientation of the sensor (degrees)").yaxis
+    bar.set_major_locator(MultipleLocator(_LINES_DEG) if levels.size else MaxNLocator())
+    bar.set_major_formatter(FuncFormatter(lambda angle, _: _angle_text(angle)))
+    ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=BLACK, linewidth=0.8))
+    ax.plot(*axis_mm, marker="o", markersize=9, color=BLACK)
+    ax.annotate("arm's axis", axis_mm, textcoords="offset points", xytext=(8, 0), va="center", fontsize=SMALL_PT)
+    (x, y), margin = axis_mm, 20.0
+    ax.set(xlim=(min(left, x - margin), max(right, x + margin)), ylim=(min(low, y - margin), max(high, y + margin)))
+    ax.set_aspect("equal")
+    share = 100 * float(np.isfinite(degrees).mean())
+    title = f"{share:.0f} % of the field (framed) within reach; grey is out of reach"
+    return label_axes(ax, x="x (mm)", y="y (mm)", title=title)
+
+
+def _unwrapped_about_mean_deg(degrees: FloatArray) -> FloatArray:
+    """Shift angles (degrees) by full turns to within 180 of their mean, so that 179 and -179 have similar colours."""
+    known = np.radians(degrees[np.isfinite(degrees)])
+    middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0
+    return np.asarray(middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0)
+
+
+def _contour_levels_deg(degrees: FloatArray) -> FloatArray:
+    """Return the multiples of 15 degrees within the range of the angles, (n_lines,); none if no angle is finite."""
+    known = degrees[np.isfinite(degrees)]
+    if not known.size:
+        return known
+    return np.arange(np.ceil(known.min() / _LINES_DEG) * _LINES_DEG, known.max(), _LINES_DEG)
+
+
+def _angle_text(degrees: float) -> str:
+    """Write an angle in degrees, taken to -180 to 180, without decimals and with a true minus sign."""
+    return number_text((degrees + 180.0) % 360.0 - 180.0, 0)

@@ -1,4 +1,4 @@
-"""Figures and axes, the palette, legends, and rendering to PNG and SVG.
+"""Figures and axes, the palette, maps, legends, and rendering to PNG and SVG.
 
 Without axes, a plot function opens a pyplot figure, so that `plt.savefig` and `plt.show` find it; `png` and
 `svg` close it, so that a page of many pictures leaves none open.
@@ -19,38 +19,23 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
+from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
 from probewise.errors import ShapeError
-from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
 from probewise.report.words import typeset_numbers
 
-__all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
-__all__ += [
-    "LETTERS_PER_IN",
-    "OUT_OF_REACH",
-    "PAGE_IN",
-    "SMALL_PT",
-    "AxesGrid",
-    "axes_or_grid",
-    "axes_or_new",
-    "close_opened_figures",
-    "grid_of_axes",
-]
-__all__ += [
-    "label_axes",
-    "legend_above",
-    "legend_below",
-    "new_figure",
-    "png",
-    "set_plain_tick_labels",
-    "stack_of_axes",
-    "svg",
-]
+BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
+BLUE, VERMILLION, PURPLE, GREY = "#0072b2", "#d55e00", "#cc79a7", "#8c8c8c"
+CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+"""Okabe and Ito's palette, distinct for the colour-blind."""
 
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
@@ -128,24 +113,18 @@ def close_opened_figures() -> None:
         plt.close(sheet)
 
 
-def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True) -> bytes:
-    """Render the figure of a drawing as PNG; a figure that a plot function opened is closed, others stay open.
+def figure_of(drawing: Axes | AxesGrid | Figure) -> Figure:
+    """Return the figure that axes belong to; none of ours has subfigures."""
+    first = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
+    return first if isinstance(first, Figure) else cast(Figure, first.figure)
 
-    Parameters
-    ----------
-    drawing
-        Axes of the figure, or the figure.
-    dpi
-        Dots per inch.
-    tight
-        Crop empty margins. Without it, figures of equal size give PNGs of equal size, as an animation needs.
+
+def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True) -> bytes:
+    """Render a drawing's figure as PNG; a figure that a plot function opened is closed, others stay open.
+
+    `tight` crops empty margins. Without it, figures of equal size give PNGs of equal size, as an animation needs.
     """
-    if isinstance(drawing, Figure):
-        sheet = drawing
-    else:
-        ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
-        sheet = cast(Figure, ax.figure)  # none of our figures has subfigures
-    buffer = io.BytesIO()
+    sheet, buffer = figure_of(drawing), io.BytesIO()
     sheet.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight" if tight else None)
     if sheet in _OPENED:
         plt.close(sheet)
@@ -161,8 +140,7 @@ def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> Axes
 
 def svg(drawing: Axes | AxesGrid) -> bytes:
     """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
-    ax: Axes = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing
-    sheet = cast(Figure, ax.figure)
+    sheet = figure_of(drawing)
     labels = _tick_labels(sheet)
     sheet.tight_layout(pad=0.4, h_pad=0.9)
     if _tick_labels(sheet) != labels:  # finer ticks of axes that have grown have longer labels
@@ -191,7 +169,7 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
         return 0
-    room = LETTERS_PER_IN * ax.get_position().width * cast(Figure, ax.figure).get_figwidth()
+    room = LETTERS_PER_IN * ax.get_position().width * figure_of(ax).get_figwidth()
     labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
     n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width_letters(labels, n) < room), 1)
     ax.legend(
@@ -237,25 +215,18 @@ def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
 
 
 def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
-    """Draw one legend for all axes below them, where it covers nothing.
+    """Draw one legend for all axes of a figure with constrained layout, below them, where it covers nothing.
 
-    Parameters
-    ----------
-    axes
-        Axes of one figure with constrained layout.
-    n_columns
-        Entries in a row at most.
-    ground, ink
-        Colours behind the entries and of their text.
+    It has at most `n_columns` entries in a row, text of the colour `ink`, and `ground` behind it.
     """
-    every: list[Axes] = [ax for ax in (axes.flat if isinstance(axes, np.ndarray) else [axes]) if ax is not None]
-    found = {label: handle for ax in every for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    if found:
-        cast(Figure, every[0].figure).legend(
-            list(found.values()),
-            list(found),
+    every: list[Axes] = list(axes.flat) if isinstance(axes, np.ndarray) else [axes]
+    handles = {label: handle for ax in every for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    if handles:
+        figure_of(every[0]).legend(
+            list(handles.values()),
+            list(handles),
             loc="outside lower center",
-            ncols=min(n_columns, len(found)),
+            ncols=min(n_columns, len(handles)),
             frameon=ground != "none",
             facecolor=ground,
             framealpha=1.0,
@@ -276,3 +247,43 @@ def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
         ax.set_title(title, fontsize="medium", loc="left")
     ax.spines[["top", "right"]].set_visible(False)
     return ax
+
+
+def finish(ax: Axes, *, x: str, y: str, plain: str = "xy") -> Axes:
+    """Label axes, write the ticks of the axes in `plain` in full, place the legend above; return the axes."""
+    label_axes(ax, x=x, y=y)
+    set_plain_tick_labels(ax, x="x" in plain, y="y" in plain)
+    legend_above(ax)
+    return ax
+
+
+def hide_unused(axes: AxesGrid, n: int) -> None:
+    """Hide all axes of a grid after the first `n`."""
+    for ax in list(axes.flat)[n:]:
+        ax.set_visible(False)
+
+
+def draw_map(ax: Axes, values: FloatArray, x: FloatArray, y: FloatArray, **style: Any) -> AxesImage:
+    """Draw values, (n_y, n_x), lower row first, as pixels about the places `x`, (n_x,), and `y`, (n_y,); NaN is blank.
+
+    Places must be even, and `style` goes to `Axes.imshow`.
+    """
+    dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+    extent = (float(x[0] - dx), float(x[-1] + dx), float(y[0] - dy), float(y[-1] + dy))
+    shown = np.ma.masked_invalid(values)
+    return ax.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **style)
+
+
+def paint_out_of_reach(ax: Axes) -> None:
+    """Paint the axes' background grey, with an entry for the legend: what a map leaves blank is out of reach."""
+    ax.set_facecolor(OUT_OF_REACH)
+    ax.add_patch(Rectangle((0.0, 0.0), 0.0, 0.0, facecolor=OUT_OF_REACH, label="out of the arm's reach"))
+
+
+def add_colour_bar(ax: Axes, image: ScalarMappable, label: str) -> Axes:
+    """Add a colour bar beside axes, of the same height, and return its axes."""
+    ax.figure.colorbar(image, cax=ax.inset_axes((1.015, 0.0, 0.022, 1.0)))
+    bar = cast(Axes, ax.child_axes[-1])
+    bar.set_ylabel("\n".join(textwrap.wrap(label, 32)), fontsize=SMALL_PT)
+    bar.tick_params(labelsize=SMALL_PT)
+    return bar

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -44,6 +44,7 @@ _MASSES = (0.68, 0.95)
 _SHADES = ("#aecfe6", "#4d9bcb")  # colours of the larger and of the smaller mass
 _MOST_POINTS = 4000
 _LEFT_IN, _BOTTOM_IN, _TOP_IN, _RIGHT_IN, _GAP_IN = 0.9, 0.9, 0.65, 0.2, 0.06  # points in a panel of a corner plot
+_A_RUN, _NEW = "a NestedResult, as nested.run returns it", "new points"
 _DEPTH = "−ln X (X: prior mass left)"
 _FEW = 6  # parameters up to which a corner plot fits a page and has numbers
 
@@ -54,20 +55,9 @@ def trace_plot(
     """Draw each parameter of the dead points against the remaining log volume, darker where the posterior mass is.
 
     On top: posterior mass per nat of log volume. To the right of each trace: the parameter's marginal posterior, on a
-    scale of its own.
+    scale of its own. `parameters` are the names to draw, in this order; default: all.
 
-    Parameters
-    ----------
-    result
-        The run.
-    parameters
-        Names of the parameters to draw, in this order; default: all. ParameterError for an unknown name or none.
-    axes
-        Axes to draw on, of the shape returned; a new figure without.
-
-    Returns
-    -------
-    Axes, (1 + number of parameters drawn, 2).
+    Return the axes, (1 + number of parameters drawn, 2). ParameterError for an unknown name or none.
     """
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
@@ -83,9 +73,7 @@ def trace_plot(
     shown = _thinned_rows(result.n_dead)
     shown = shown[np.argsort(mass[shown], kind="stable")]
     top, key = axes[0]
-    top.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
-    top.plot(depth, mass, color=BLUE, linewidth=1.2)
-    top.set_ylim(bottom=0)
+    _draw_mass(top, depth, mass, linewidth=1.2)
     label_axes(top, x="", y="posterior\nper nat", title=_evidence_text(result))
     key.axis("off")
     scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
@@ -96,17 +84,8 @@ def trace_plot(
     for row, i in enumerate(columns, start=1):
         trace, side = axes[row]
         values = result.theta[:, i]
-        trace.scatter(
-            depth[shown],
-            values[shown],
-            c=mass[shown] / mass.max(),
-            cmap=_WEIGHT,
-            vmin=0,
-            vmax=1,
-            s=5,
-            linewidths=0,
-            rasterized=True,
-        )
+        colours: dict[str, Any] = {"c": mass[shown] / mass.max(), "cmap": _WEIGHT, "vmin": 0, "vmax": 1}
+        trace.scatter(depth[shown], values[shown], s=5, linewidths=0, rasterized=True, **colours)
         last = row == n
         label_axes(trace, x=_DEPTH if last else "", y=_parameter_label(result.names[i]))
         span = _axis_limits(result, i)
@@ -137,20 +116,11 @@ def corner_plot(
     Intervals of single parameters are central ones; up to six parameters also have their median and 95 % interval
     written above. Regions of pairs are those of highest density, from a histogram of the weighted samples
     smoothed by a kernel that narrows as the effective sample size grows. Up to six parameters fit the width of a page;
-    with more, the figure grows and its text does not shrink.
+    with more, the figure grows and its text does not shrink. `parameters` are the names to draw, in this order;
+    default: all.
 
-    Parameters
-    ----------
-    result
-        The run, or weighted samples.
-    parameters
-        Names of the parameters to draw, in this order; default: all. ParameterError for an unknown name or none.
-    axes
-        Axes to draw on, (n, n); those above the diagonal are hidden. A new figure without.
-
-    Returns
-    -------
-    Axes, (n, n), of the n parameters drawn; None above the diagonal.
+    Return the axes, (n, n), of the n parameters drawn; None above the diagonal, where axes given are hidden.
+    ParameterError for an unknown name or none.
     """
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
@@ -159,10 +129,9 @@ def corner_plot(
     drawn = np.full((n, n), None, dtype=np.object_)
     spans = [_axis_limits(result, i) for i in columns]
     for (row, column), ax in np.ndenumerate(cells):
-        if ax is None:
-            continue
         if column > row:
-            ax.set_axis_off()
+            if ax is not None:
+                ax.set_axis_off()
             continue
         drawn[row, column] = ax
         if row == column:
@@ -221,59 +190,36 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     Every new point is equally likely to take any rank (Fowlie, Handley & Su 2020). Too many low ranks mean that chains
     are too short to leave the likelihood bound; too many high ranks mean that a region was lost. The band holds all
     bars at once in 99 of 100 correct runs (binomial, Šidák's correction); bars outside it are red.
-
-    Parameters
-    ----------
-    result
-        The run.
-    ax
-        Axes to draw on; a new figure without.
     """
-    require_kind("result", result, NestedResult, "a NestedResult, as nested.run returns it")
-    ax = axes_or_new(ax, size_in=(6.4, 3.6))
+    require_kind("result", result, NestedResult, _A_RUN)
+    ax = label_axes(axes_or_new(ax, size_in=(6.4, 3.6)), x="rank among the live points (0: worst, 1: best)", y=_NEW)
     n = result.insertion_rank.size
     if n == 0:
         ax.text(0.5, 0.5, "no point was inserted", transform=ax.transAxes, ha="center", va="center")
-        return label_axes(ax, x="rank among the live points (0: worst, 1: best)", y="new points")
+        return ax
     edges = np.linspace(0.0, 1.0, int(np.clip(n / 60, 4, 25)) + 1)
     counts = _new_points_per_bar(result.insertion_rank, result.insertion_n_ranked, edges)
     n_bars = len(counts)
     tail = (1.0 - 0.99 ** (1.0 / n_bars)) / 2.0
     low, high = (float(binom.ppf(q, n, 1.0 / n_bars)) for q in (tail, 1.0 - tail))
     outside = (counts < low) | (counts > high)
-    ax.bar(
-        edges[:-1],
-        counts,
-        width=1.0 / n_bars,
-        align="edge",
-        color=np.where(outside, VERMILLION, "#aecfe6"),
-        edgecolor="white",
-        linewidth=0.6,
-    )
+    colour = np.where(outside, VERMILLION, _SHADES[0])
+    ax.bar(edges[:-1], counts, 1.0 / n_bars, align="edge", color=colour, edgecolor="white", linewidth=0.6)
     ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label="99 % of correct runs")
     ax.axhline(n / n_bars, color=BLACK, linewidth=0.9, label="uniform")
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1.3 * max(high, counts.max()))
     ax.legend(frameon=False, fontsize=SMALL_PT, loc="upper right", ncols=2)  # leaves room for the text above every bar
-    title = f"{n} new points, p = {result.insertion_p_value:.2g}"
-    return label_axes(ax, x="rank among the live points (0: worst, 1: best)", y="new points", title=title)
+    ax.set_title(f"{n} {_NEW}, p = {result.insertion_p_value:.2g}", fontsize="medium", loc="left")
+    return ax
 
 
 def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     """Draw the course of a run: likelihood, posterior mass, live points and cumulative evidence against log volume.
 
-    Parameters
-    ----------
-    result
-        The run.
-    axes
-        Axes to draw on, (4, 1); a new figure without.
-
-    Returns
-    -------
-    Axes, (4, 1). The likelihood's axis leaves out values far below those that carry posterior mass.
+    Return the axes, (4, 1). The likelihood's axis leaves out values far below those that carry posterior mass.
     """
-    require_kind("result", result, NestedResult, "a NestedResult, as nested.run returns it")
+    require_kind("result", result, NestedResult, _A_RUN)
     axes = axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
     depth, mass = -result.log_volume, _mass_per_nat(result)
     likelihood, posterior, alive, evidence = axes[:, 0]
@@ -283,9 +229,7 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     likelihood.plot(depth, result.log_likelihood, color=BLUE, linewidth=1.4)
     likelihood.set_ylim(floor - 0.03 * (peak - floor), peak + 0.05 * (peak - floor))
     label_axes(likelihood, x="", y="ln likelihood", title=_evidence_text(result))
-    posterior.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
-    posterior.plot(depth, mass, color=BLUE, linewidth=1.4)
-    posterior.set_ylim(bottom=0)
+    _draw_mass(posterior, depth, mass, linewidth=1.4)
     label_axes(posterior, x="", y="posterior per nat")
     alive.plot(depth, result.n_at_death, color=BLUE, linewidth=0.8)
     alive.set_ylim(0, 1.1 * float(result.n_at_death.max()))
@@ -302,12 +246,18 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     return axes
 
 
+def _draw_mass(ax: Axes, depth: FloatArray, mass: FloatArray, *, linewidth: float) -> None:
+    ax.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
+    ax.plot(depth, mass, color=BLUE, linewidth=linewidth)
+    ax.set_ylim(bottom=0)
+
+
 def _evidence_text(result: Posterior) -> str:
     return f"ln Z = {value_with_error(result.log_z, result.log_z_error)}"
 
 
 def _checked_parameter_columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
-    require_like("result", result, ("names", "theta"), "a NestedResult, as nested.run returns it, or weighted samples")
+    require_like("result", result, ("names", "theta"), f"{_A_RUN}, or weighted samples")
     if not result.names:
         raise ParameterError("names", result.names, "one parameter or more; without any there is nothing to draw")
     if parameters is None:

@@ -1,21 +1,53 @@
-"""The readings of a recording along its scans: the paper's figure of four orientations."""
+"""Readings of a recording by a light sensor, scan by scan: as recorded, as predicted, before and after a repair.
+
+The paper's figures 3 (the sensor over the edge), 4 (quadrants), 5 (data of the four orientations) and 7 (predicted).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.recordings import Plan, Recording
-from probewise.recordings.patterns import HalfPlane
+from probewise.errors import ParameterError
+from probewise.recordings import HalfPlane, Plan, Quadrant, Recording
 from probewise.recordings.plan import require_recording
-from probewise.report.plots.canvas import CYCLE, axes_or_new, label_axes, legend_above
+from probewise.report.plots.apparatus import draw_sensor_face
+from probewise.report.plots.canvas import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    GREY,
+    PAGE_IN,
+    SMALL_PT,
+    VERMILLION,
+    AxesGrid,
+    axes_or_grid,
+    axes_or_new,
+    figure_of,
+    grid_of_axes,
+    hide_unused,
+    label_axes,
+    legend_above,
+    legend_below,
+)
+from probewise.report.words import decimals_to_show, number_text, number_unsigned_zero
 
-MARKERS = ("o", "s", "D", "^", "v", "P", "X")
-MAX_NAMED = 8  # tracks in the legend; with more there is none
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X")
+_MOST_NAMED = 8  # tracks in the legend, panels, and names of single readings; with more there is none
+_SD_95 = 1.96
+_MOST_GROUPS, _LEAST_ROWS = 18, 5  # of neighbours in a running mean
+_VISIBLE_CHANGE = 0.3  # share of the repair's largest change: the figure shows where the change exceeds it
+_BEFORE, _AFTER = "calibrated model", "repaired model"
+_ALONG_EDGE, _ALONG_SCAN = "distance from the edge{} (mm)", "place along the scan (mm)"
+_DARK, _BRIGHT = "#1b1b1b", "#ffffff"
+_AROUND_MM = 16.0  # half width of the drawing of a quadrant
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +65,9 @@ class Track:
 
 
 def tracks_and_single_rows(plan: Plan) -> tuple[list[Track], IntArray]:
-    """Split the rows of a plan into tracks and single rows.
-
-    Returns
-    -------
-    The tracks, one per scan and pattern with three or more distinct positions; and the row numbers of all other rows.
-    """
-    found: list[Track] = []
-    single: list[IntArray] = []
+    """Split a plan into tracks, one per scan and pattern with three or more positions, and the rows of no track."""
+    tracks: list[Track] = []
+    single = [np.empty(0, dtype=np.int64)]
     for scan_rows in plan.rows_by_scan():
         for code in np.unique(plan.pattern[scan_rows]):
             rows = scan_rows[plan.pattern[scan_rows] == code]
@@ -48,15 +75,12 @@ def tracks_and_single_rows(plan: Plan) -> tuple[list[Track], IntArray]:
             along = _signed_position_mm(plan, rows, pattern)
             if np.unique(np.round(along, 6)).size < 3:
                 single.append(rows)
-                continue
-            found.append(Track(_track_label(plan, rows), rows, along, isinstance(pattern, HalfPlane)))
-    names = [t.label for t in found]
+            else:
+                tracks.append(Track(_track_label(plan, rows), rows, along, isinstance(pattern, HalfPlane)))
+    names = [t.label for t in tracks]
     if len(set(names)) < len(names):  # several scans at one orientation: the scan's name tells them apart
-        found = [
-            Track(f"{t.label} ({plan.scan_names[plan.scan[t.rows[0]]]})", t.rows, t.along_mm, t.from_edge)
-            for t in found
-        ]
-    return found, np.concatenate(single) if single else np.empty(0, dtype=np.int64)
+        tracks = [replace(t, label=f"{t.label} ({plan.scan_names[plan.scan[t.rows[0]]]})") for t in tracks]
+    return tracks, np.concatenate(single)
 
 
 def _signed_position_mm(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
@@ -72,47 +96,297 @@ def _signed_position_mm(plan: Plan, rows: IntArray, pattern: object) -> FloatArr
 def _track_label(plan: Plan, rows: IntArray) -> str:
     degrees = np.unique(np.round(np.degrees(plan.orientation_rad[rows]), 1) % 360)
     label = f"{degrees[0]:g}°" if degrees.size == 1 else plan.scan_names[plan.scan[rows[0]]]
-    if len(plan.rows_by_pattern()) > 1 and not isinstance(
-        plan.patterns.get(plan.pattern_names[plan.pattern[rows[0]]]), HalfPlane
-    ):
-        label += f" over {plan.pattern_names[plan.pattern[rows[0]]]}"
+    pattern = plan.pattern_names[plan.pattern[rows[0]]]
+    if len(plan.rows_by_pattern()) > 1 and not isinstance(plan.patterns.get(pattern), HalfPlane):
+        label += f" over {pattern}"
     return label
 
 
-def track_axis_label(found: Sequence[Track]) -> str:
-    """Return the horizontal axis's label: distance from the edge if all tracks cross one, else place along the scan."""
-    if all(t.from_edge for t in found):
-        return "distance from the edge, white side positive (mm)"
-    return "place along the scan (mm)"
+def _along_label(tracks: Sequence[Track], side: str = "") -> str:
+    """Return the label of the axis of positions: distance from the edge if all tracks cross one."""
+    return _ALONG_EDGE.format(side) if all(t.from_edge for t in tracks) else _ALONG_SCAN
+
+
+def _symbol_of_track(k: int) -> dict[str, Any]:
+    marker, colour = _MARKERS[k % len(_MARKERS)], CYCLE[k % len(CYCLE)]
+    return {"linestyle": "none", "marker": marker, "color": colour, "markerfacecolor": "none"}
 
 
 def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> Axes:
-    """Draw readings against distance from the edge, a symbol for each orientation (paper, figure of the data).
+    """Draw readings against distance from the edge, a symbol for each orientation (paper, figure 5).
 
-    Parameters
-    ----------
-    recording
-        Rows over half-planes are drawn by signed distance from the edge, others by position along the scan. Single rows
-        (the quadrants) are drawn by `predicted_and_recorded_by_scan` only.
-    ax
-        Axes to draw on; a new figure without.
+    Rows over half-planes are drawn by signed distance from the edge, others by position along the scan. Single rows
+    (the quadrants) are drawn by `predicted_and_recorded_by_scan` only.
     """
     require_recording(recording)
     ax = axes_or_new(ax)
-    found, _ = tracks_and_single_rows(recording.plan)
-    for k, track in enumerate(found):
+    tracks, _ = tracks_and_single_rows(recording.plan)
+    size = 4 if len(tracks) <= _MOST_NAMED else 2
+    for k, track in enumerate(tracks):
         ok = recording.usable[track.rows]
-        ax.plot(
-            track.along_mm[ok],
-            recording.readings[track.rows][ok],
-            linestyle="none",
-            marker=MARKERS[k % len(MARKERS)],
-            markersize=4 if len(found) <= MAX_NAMED else 2,
-            markerfacecolor="none",
-            markeredgewidth=1.0,
-            color=CYCLE[k % len(CYCLE)],
-            label=track.label,
-        )
-    if 0 < len(found) <= MAX_NAMED:
+        along, readings = track.along_mm[ok], recording.readings[track.rows][ok]
+        ax.plot(along, readings, markersize=size, markeredgewidth=1.0, label=track.label, **_symbol_of_track(k))
+    if 0 < len(tracks) <= _MOST_NAMED:
         legend_above(ax, title="orientation of the sensor")
-    return label_axes(ax, x=track_axis_label(found), y=f"reading ({recording.plan.instrumentation.unit_after_number})")
+    unit = recording.plan.instrumentation.unit_after_number
+    return label_axes(ax, x=_along_label(tracks, ", white side positive"), y=f"reading ({unit})")
+
+
+def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes:
+    """Draw the sensor in each orientation of the scans over half-planes, with its symbol (paper, figure 3).
+
+    The symbols are those of `readings_by_orientation`. ParameterError if no scan crosses a half-plane.
+    """
+    require_recording(recording)
+    plan = recording.plan
+    lines = [(k, track) for k, track in enumerate(tracks_and_single_rows(plan)[0]) if track.from_edge]
+    if not lines:
+        raise ParameterError("recording", recording.source or "as given", "one with a scan over a half_plane")
+    turns = {track.label: (k, float(plan.orientation_rad[track.rows[0]])) for k, track in lines}
+    n = len(turns)
+    ax = axes_or_new(ax, size_in=(1.55 * n, 2.9))
+    edge = plan.patterns[plan.pattern_names[int(plan.pattern[lines[0][1].rows[0]])]]
+    assert isinstance(edge, HalfPlane)
+    for left, shade in zip((0.0, n / 2), _shades_out_and_in(edge), strict=True):
+        ax.add_patch(Rectangle((left, 0.0), n / 2, 1.0, fc=shade, ec=BLACK))
+    for place, (label, (k, turn)) in enumerate(turns.items()):
+        at = place + 0.5
+        draw_sensor_face(ax, center=(at, 0.5), size=0.62, turned_rad=turn)
+        draw_sensor_face(ax, center=(at, 1.75), size=0.9, turned_rad=turn)
+        ax.plot(at - 0.16, 2.42, markersize=7, markeredgewidth=1.4, **_symbol_of_track(k))
+        ax.text(at - 0.02, 2.42, label, va="center")
+    along = np.concatenate([track.along_mm for _, track in lines])
+    ax.annotate("", (n - 0.3, -0.2), xytext=(0.3, -0.2), arrowprops={"arrowstyle": "-|>", "color": BLACK})
+    span = f"{number_unsigned_zero(along.min(), 0)} to {number_unsigned_zero(along.max(), 0)} mm"
+    ax.text(n / 2, -0.28, f"every scan runs across the edge, {span}", ha="center", va="top")
+    ax.set(xlim=(-0.05, n + 0.05), ylim=(-0.62, 2.65), aspect="equal")
+    ax.set_axis_off()
+    return ax
+
+
+def _shades_out_and_in(pattern: HalfPlane | Quadrant) -> tuple[str, str]:
+    return (_DARK, _BRIGHT) if pattern.inside >= pattern.outside else (_BRIGHT, _DARK)
+
+
+def quadrant_patterns(recording: Recording) -> AxesGrid:
+    """Draw each quadrant pattern with its corner and the mean of the usable readings there (paper, figure 4).
+
+    Return the axes, (n_rows, 2). ParameterError if there are no readings over quadrants.
+    """
+    require_recording(recording)
+    plan = recording.plan
+    quadrants = [
+        (name, pattern, recording.readings[rows[recording.usable[rows]]])
+        for name, rows in plan.rows_by_pattern()
+        if isinstance(pattern := plan.patterns.get(name), Quadrant)
+    ]
+    if not quadrants:
+        raise ParameterError("recording", recording.source or "as given", "one with readings over a quadrant")
+    n_rows = -(-len(quadrants) // 2)
+    axes = grid_of_axes(n_rows, 2, size_in=(4.6, 2.35 * n_rows + 0.1))
+    for ax in axes.flat:
+        ax.set_axis_off()
+    unit = plan.instrumentation.unit_after_number
+    for ax, (name, pattern, readings) in zip(axes.flat, quadrants, strict=False):
+        mean = float(readings.mean()) if readings.size else float("nan")
+        _draw_quadrant(ax, pattern, number_text(mean, decimals_to_show(mean, 1)))
+        ax.set_title(f"{name.replace('_', ' ')} ({unit})", fontsize="medium", loc="left")
+    return axes
+
+
+def _draw_quadrant(ax: Axes, pattern: Quadrant, reading: str) -> None:
+    outside, inside = _shades_out_and_in(pattern)
+    (x, y), (dx, dy) = pattern.corner_mm, pattern.direction
+    whole = ((-_AROUND_MM, -_AROUND_MM), 2 * _AROUND_MM, 2 * _AROUND_MM)
+    ax.add_patch(Rectangle(*whole, fc=outside, ec="none"))
+    (x0, x1), (y0, y1) = sorted((x, dx * _AROUND_MM)), sorted((y, dy * _AROUND_MM))
+    ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fc=inside, ec="none"))
+    ax.add_patch(Rectangle(*whole, fc="none", ec=BLACK, clip_on=False))
+    ink, ink_around = (BLACK, "white") if inside == _BRIGHT else ("white", BLACK)
+    middle = ((x + dx * _AROUND_MM) / 2, (y + dy * _AROUND_MM) / 2)
+    ax.text(*middle, reading, ha="center", va="center", color=ink, fontsize="large")
+    corner = f"({number_unsigned_zero(x, 0)}, {number_unsigned_zero(y, 0)}) mm"
+    ax.text(x - dx * 1.2, y - dy * 1.2, corner, ha="right" if dx > 0 else "left", va="top", color=ink_around)
+    ax.plot(0.0, 0.0, marker="+", markersize=10, markeredgewidth=1.4, color=GREY)
+    ax.set(xlim=(-_AROUND_MM, _AROUND_MM), ylim=(-_AROUND_MM, _AROUND_MM), aspect="equal")
+
+
+def predicted_and_recorded_by_scan(
+    recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: AxesGrid | None = None
+) -> AxesGrid:
+    """Draw recorded and predicted readings with the 95 % band of new readings (paper, figure 7).
+
+    Each panel shows a scan over one pattern, the last one all single readings; of more than eight panels, evenly spaced
+    ones are drawn. `mean` is the predicted reading of each row and `sd` that of one new reading, (n_points,).
+
+    Return the axes, (n_rows, 3) (two columns where there are two or four panels, one for one panel).
+    """
+    require_recording(recording)
+    tracks, alone = tracks_and_single_rows(recording.plan)
+    most = min(len(tracks), _MOST_NAMED - bool(alone.size))
+    evenly = np.unique(np.linspace(0, max(len(tracks) - 1, 0), most).round().astype(np.int64))
+    shown = [tracks[i] for i in evenly]
+    n_panels = max(len(shown) + bool(alone.size), 1)
+    n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
+    n_rows = -(-n_panels // n_columns)
+    width = 4.4 * n_columns if n_columns < 3 else PAGE_IN
+    opened = axes is None
+    axes = axes_or_grid(axes, n_rows, n_columns, size_in=(width, 0.4 + 2.4 * n_rows), sharey=True)
+    for ax, track in zip(axes.flat, shown, strict=False):
+        _draw_track(ax, recording, track, mean, sd)
+        label_axes(ax, x="", y="", title=track.label)
+    if alone.size:
+        ax = axes.flat[len(shown)]
+        _draw_single_readings(ax, recording, alone, mean, sd)
+        label_axes(ax, x="", y="", title="single readings")
+    hide_unused(axes, n_panels)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"reading ({recording.plan.instrumentation.unit_after_number})")
+    for ax in list(axes.flat)[max(n_panels - n_columns, 0) : len(shown)]:
+        ax.set_xlabel(_along_label(shown))
+    if opened:
+        legend_below(axes)
+    else:
+        axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
+    return axes
+
+
+def _draw_track(ax: Axes, recording: Recording, track: Track, mean: FloatArray, sd: FloatArray) -> None:
+    order = np.argsort(track.along_mm, kind="stable")
+    rows, along = track.rows[order], track.along_mm[order]
+    ok, half = recording.usable[rows], _SD_95 * sd[rows]
+    ax.fill_between(
+        along, mean[rows] - half, mean[rows] + half, color=GREY, alpha=0.35, lw=0, label="holds 95 % of new readings"
+    )
+    if ok.any():
+        ax.plot(along[ok], recording.readings[rows][ok], ".", color=VERMILLION, markersize=3.5, label="recorded")
+    ax.plot(along, mean[rows], color=BLACK, linewidth=1.1, label="predicted")
+
+
+def _draw_single_readings(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray, sd: FloatArray) -> None:
+    at, ok, plan = np.arange(len(rows)), recording.usable[rows], recording.plan
+    ax.errorbar(at, mean[rows], yerr=_SD_95 * sd[rows], fmt="_", color=BLACK, capsize=4, markersize=12)
+    ax.plot(at[ok], recording.readings[rows][ok], "o", color=VERMILLION, markersize=5)
+    if len(rows) <= _MOST_NAMED:
+        names = [plan.pattern_names[code].replace("_", " ") for code in plan.pattern[rows]]
+        ax.set_xticks(at, names, rotation=30, ha="right", fontsize=SMALL_PT)
+    ax.margins(x=0.15)
+
+
+def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
+    """Draw (recorded minus predicted) / sd by reading number; dashed lines at ±1.96 should hold 95 %.
+
+    Parameters are as for `predicted_and_recorded_by_scan`.
+    """
+    require_recording(recording)
+    ax = axes_or_new(ax, size_in=(7.2, 2.8))
+    ok = np.flatnonzero(recording.usable)
+    ax.plot(ok + 1, (recording.readings[ok] - mean[ok]) / sd[ok], ".", color=BLUE, markersize=3)
+    for level in (-_SD_95, 0.0, _SD_95):
+        ax.axhline(level, color=GREY, linewidth=0.8, linestyle="-" if level == 0 else "--")
+    return label_axes(ax, x="reading number", y="(recorded − predicted) / sd")
+
+
+def residuals_by_scan(
+    recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9, columns: int = 3
+) -> AxesGrid:
+    """Draw the residuals of two models along the `most` scans that the repair changes most, a panel each.
+
+    `before` and `after` are the predictions of the calibrated and of the repaired model, (n_points,). All panels have
+    the same scales. Return the axes, (n_rows, columns); those without a scan are hidden.
+    """
+    require_recording(recording)
+    tracks, _ = tracks_and_single_rows(recording.plan)
+    change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in tracks]
+    shown = [tracks[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
+    n_rows = max(-(-len(shown) // columns), 1)
+    axes = grid_of_axes(n_rows, columns, size_in=(3.2 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
+    for ax, track in zip(axes.flat, shown, strict=False):
+        _draw_residuals_of_both(ax, recording, [track], before, after, markersize=2.2, alpha=0.4)
+        scan = recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])]
+        label_axes(ax, x="", y="", title=scan.replace("_", " "))
+    hide_unused(axes, len(shown))
+    sheet, edge = figure_of(axes), _along_label([])
+    sheet.supxlabel(edge if _along_label(shown) == edge else f"{edge}, or {_ALONG_SCAN}", fontsize=10)
+    sheet.supylabel(f"recorded − predicted ({recording.plan.instrumentation.unit_after_number})", fontsize=10)
+    lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in (VERMILLION, BLUE)]
+    sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize=SMALL_PT)
+    return axes
+
+
+def readings_before_and_after_repair(
+    recording: Recording, rows: IntArray, before: FloatArray, after: FloatArray, *, name: str = ""
+) -> AxesGrid:
+    """Draw readings with the curves of two models, and below them the residuals, around where the models differ.
+
+    `rows`, (n_rows,), are those of one scan, or of several over one pattern in one orientation; `before` and `after`
+    are predictions, (n_points,); `name` is the title. Return the axes, (2, 1).
+
+    ParameterError if no three of the readings lie along a line.
+    """
+    require_recording(recording)
+    tracks, _ = tracks_and_single_rows(recording.plan.take(rows))
+    if not tracks:
+        raise ParameterError("rows", rows.tolist(), "readings at three places or more along one line")
+    tracks = [replace(track, rows=rows[track.rows]) for track in tracks]
+    axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
+    above, below = axes[:, 0]
+    for k, track in enumerate(tracks):
+        order = np.argsort(track.along_mm, kind="stable")
+        at, along = track.rows[order], track.along_mm[order]
+        ok = recording.usable[at]
+        above.plot(along[ok], recording.readings[at][ok], ".", color=BLACK, markersize=4, label="" if k else "recorded")
+        for predicted, colour, model in ((before, VERMILLION, _BEFORE), (after, BLUE, _AFTER)):
+            above.plot(along, predicted[at], color=colour, linewidth=1.5, label="" if k else model)
+    limits = _limits_around_change(tracks, np.abs(after - before))
+    _draw_residuals_of_both(below, recording, tracks, before, after, markersize=4, alpha=0.5, limits=limits)
+    below.set_xlim(limits)
+    unit = recording.plan.instrumentation.unit_after_number
+    above.legend(frameon=False, fontsize=SMALL_PT)
+    label_axes(above, x="", y=f"reading ({unit})", title=name)
+    label_axes(below, x=_along_label(tracks), y=f"recorded − predicted\n({unit})")
+    return axes
+
+
+def _limits_around_change(tracks: Sequence[Track], change: FloatArray) -> tuple[float, float]:
+    """Return limits of the x axis (mm): where models differ by 30 % of the most or more, with as wide a margin."""
+    along = np.concatenate([track.along_mm for track in tracks])
+    by_place = np.concatenate([change[track.rows] for track in tracks])
+    differs = along[by_place >= _VISIBLE_CHANGE * max(float(by_place.max()), 1e-300)]
+    margin = float(np.ptp(differs)) + 1.0
+    low, high = float(differs.min()) - margin, float(differs.max()) + margin
+    return max(float(along.min()), low), min(float(along.max()), high)
+
+
+def _draw_residuals_of_both(
+    ax: Axes,
+    recording: Recording,
+    tracks: Sequence[Track],
+    before: FloatArray,
+    after: FloatArray,
+    *,
+    markersize: float,
+    alpha: float,
+    limits: tuple[float, float] = (-np.inf, np.inf),
+) -> None:
+    """Draw each usable residual of both models along tracks, within the limits, and running means."""
+    rows, along = (np.concatenate(parts) for parts in zip(*((t.rows, t.along_mm) for t in tracks), strict=True))
+    ok = recording.usable[rows] & (along >= limits[0]) & (along <= limits[1])
+    rows, along = rows[ok], along[ok]
+    for predicted, colour in ((before, VERMILLION), (after, BLUE)):
+        residual = recording.readings[rows] - predicted[rows]
+        ax.plot(along, residual, ".", color=colour, markersize=markersize, alpha=alpha)
+        ax.plot(*_running_mean_by_position(along, residual), color=colour, linewidth=1.8)
+    ax.axhline(0.0, color=BLACK, linewidth=0.7)
+
+
+def _running_mean_by_position(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean position and mean residual, (n_bins,) each, in up to 18 bins of equal width, none of them empty."""
+    if along.size == 0:
+        return along, residual
+    edges = np.linspace(along.min(), along.max(), min(_MOST_GROUPS, max(along.size // _LEAST_ROWS, 1)) + 1)
+    group = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(group, minlength=len(edges) - 1)
+    some = count > 0
+    middle = np.bincount(group, along, minlength=len(count))[some] / count[some]
+    return middle, np.bincount(group, residual, minlength=len(count))[some] / count[some]

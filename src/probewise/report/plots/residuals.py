@@ -1,13 +1,12 @@
-"""Residuals of the calibrated and of the repaired model: along a covariate, in one scan, scan by scan."""
+"""Residuals of the calibrated and of the repaired model: along covariates, in one scan, by held-out part."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from probewise._arrays import FloatArray
@@ -21,21 +20,36 @@ from probewise.report.plots.canvas import (
     SMALL_PT,
     VERMILLION,
     AxesGrid,
+    figure_of,
+    finish,
     label_axes,
     legend_above,
     set_plain_tick_labels,
     stack_of_axes,
 )
-from probewise.report.residual_means import ResidualMeans, running_mean_curve
+from probewise.report.residual_means import ResidualMeans
 from probewise.report.words import number_text, number_unsigned_zero
 
 BEFORE, AFTER = "as calibrated", "repaired"
+_CHANCE = "95 % by chance alone"
+_STYLES = ((VERMILLION, "o", "-"), (BLUE, "s", (0, (4, 1.5))))
 _CROWDED = 500  # number of dots from which they are paler
 _MANY = 1500  # number of dots from which they are an image inside the SVG
 _ASIDE = 0.15  # offset of the means before and after from a categorical value's position
 _LEAST_SHADE = 0.008  # least width of a shaded interval, as a share of the axes' width
 _MOST_SHADE = 0.5  # the largest, from which on the rest of the axis is what stands out
 _MOST_SCANS = 12
+_RUNNING_MEANS = 20
+
+
+def running_mean_curve(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return means of x and of y, (n_groups,) each, over up to 20 groups of equal numbers of neighbours in x."""
+    ok = np.isfinite(x) & np.isfinite(y)
+    x, y = x[ok], y[ok]
+    if x.size == 0:
+        return x, y
+    groups = np.array_split(np.argsort(x, kind="stable"), max(1, min(_RUNNING_MEANS, len(x) // 4)))
+    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
 
 
 def mean_residuals_along(
@@ -64,46 +78,37 @@ def mean_residuals_along(
     names
         Names of the values 0, 1, 2 ... of a categorical covariate.
     after
-        What the later of the two models is called.
-    ax
-        Axes to draw on; a new figure without.
+        Name of the later of the two models.
     """
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     if each is not None:
         _draw_dots(ax, *each, GREY, "one reading")
     ax.axhline(0, color=BLACK, linewidth=0.7)
+    band: dict[str, Any] = {"color": GREY, "alpha": 0.3, "label": _CHANCE}
     if names:
-        ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, color=GREY, alpha=0.3, label=_CHANCE)
+        ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, **band)
     elif len(means.at) == 1:
-        ax.errorbar(means.at, [0.0], yerr=means.chance, color=GREY, linewidth=8, alpha=0.3, label=_CHANCE)
+        ax.errorbar(means.at, [0.0], yerr=means.chance, linewidth=8, **band)
     else:
-        ax.fill_between(means.at, -means.chance, means.chance, color=GREY, alpha=0.3, linewidth=0, label=_CHANCE)
+        ax.fill_between(means.at, -means.chance, means.chance, linewidth=0, **band)
     aside = _ASIDE if names and means.after is not None else 0.0
-    said = "mean, " if each is not None else ""
+    mean = "mean, " if each is not None else ""
     drawn = ((means.before, VERMILLION, "o", BEFORE, -aside), (means.after, BLUE, "s", after, aside))
     for values, colour, marker, name, step in drawn:
         if values is not None:
-            line = f"{marker}" if names else f"{marker}-"
-            ax.plot(means.at + step, values, line, color=colour, ms=4.5, lw=1.4, label=f"{said}{name}")
+            line = marker if names else f"{marker}-"
+            ax.plot(means.at + step, values, line, color=colour, ms=4.5, lw=1.4, label=f"{mean}{name}")
     if names:
         _label_x_by_name(ax, names)
     if window is not None:
         low, high = ax.get_xlim()
         middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
         if 2 * half < _MOST_SHADE * (high - low):  # nothing stands out where nearly all is shaded
-            shade: dict[str, Any] = {
-                "color": SKY,
-                "alpha": 0.25,
-                "linewidth": 0,
-                "label": "stands out here",
-                "zorder": 0,
-            }
-            ax.axvspan(middle - half, middle + half, **shade)
+            ends = (middle - half, middle + half)
+            ax.axvspan(*ends, color=SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
     averaged = each is None and int(means.size.max(initial=1)) > 1
-    label_axes(ax, x=label, y=f"{'mean residual' if averaged else 'residual'} ({unit})")
-    set_plain_tick_labels(ax, x=not names)
-    legend_above(ax)
-    return ax
+    y = f"{'mean residual' if averaged else 'residual'} ({unit})"
+    return finish(ax, x=label, y=y, plain="y" if names else "xy")
 
 
 def scan_with_residuals(
@@ -117,20 +122,9 @@ def scan_with_residuals(
 ) -> AxesGrid:
     """Draw the readings of one scan with each model's predictions, and below them the residuals.
 
-    Parameters
-    ----------
-    along, readings
-        Position or time, and readings, (n_rows,); NaN where there is no usable reading.
-    models
-        Name and predicted readings, (n_rows,), the calibrated model first.
-    joined
-        Whether the rows lie along a line, so that a curve may join them.
-    label, unit
-        Label of the x axis with its unit; unit of the readings.
-
-    Returns
-    -------
-    The two axes, shape (2,).
+    `along`, `readings` and the predictions of the `models` (name and predictions, the calibrated model first) have the
+    shape (n_rows,), NaN where there is no usable reading. Without `joined`, no curve joins the rows. `label` is that of
+    the x axis with its unit, `unit` the readings'. Return the two axes, (2,).
     """
     axes = stack_of_axes([2.5, 2.0])
     above, below = axes
@@ -138,17 +132,14 @@ def scan_with_residuals(
     below.axhline(0, color=BLACK, linewidth=0.7)
     for (name, predicted), (colour, marker, line) in zip(models, _STYLES, strict=False):
         style = {"color": colour, "marker": marker, "markersize": 3.2, "alpha": 0.8, "linestyle": "none"}
-        curve = {"color": colour, "linewidth": 1.6, "linestyle": line} if joined else {**style, "markersize": 6.0}
-        above.plot(along, predicted, label=f"predicted, {name}", **curve)
+        curve = {"color": colour, "linewidth": 1.6, "linestyle": line}
+        above.plot(along, predicted, label=f"predicted, {name}", **curve if joined else {**style, "markersize": 6.0})
         below.plot(along, readings - predicted, label=f"residual, {name}", **{**style, "alpha": 0.5})
         if joined:
-            below.plot(*running_mean_curve(along, readings - predicted), color=colour, linewidth=1.6, linestyle=line)
+            below.plot(*running_mean_curve(along, readings - predicted), **curve)
     below.sharex(above)
-    label_axes(above, x="", y=f"reading ({unit})")
-    label_axes(below, x=label, y=f"residual ({unit})")
-    for ax in axes:
-        set_plain_tick_labels(ax)
-        legend_above(ax)
+    finish(above, x="", y=f"reading ({unit})")
+    finish(below, x=label, y=f"residual ({unit})")
     return axes
 
 
@@ -167,36 +158,19 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
 def residuals_against_covariates(
     covariates: Sequence[tuple[str, FloatArray]], models: Sequence[tuple[str, FloatArray]], *, unit: str
 ) -> AxesGrid:
-    """Draw all residuals against each covariate, with running means, one panel per covariate.
+    """Draw all residuals against each covariate, with running means, one panel per covariate; return the axes, (n,).
 
-    Parameters
-    ----------
-    covariates
-        Label with its unit, and values, (n_points,).
-    models
-        Name and residuals, (n_points,), NaN where there is no usable reading; the calibrated model first.
-    unit
-        Of the readings.
-
-    Returns
-    -------
-    The axes, shape (n_covariates,).
+    `covariates` are labels with units, and values, (n_points,); `models` names and residuals, (n_points,), NaN where
+    there is no usable reading, the calibrated model first; `unit` is the readings'.
     """
     axes = stack_of_axes([2.2] * len(covariates))
     for ax, (label, at) in zip(axes, covariates, strict=True):
         ax.axhline(0, color=BLACK, linewidth=0.7)
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
             _draw_dots(ax, at, residuals, colour, "")
-            ax.plot(
-                *running_mean_curve(at, residuals),
-                color=colour,
-                linewidth=2.0,
-                linestyle=line,
-                label=f"running mean, {name}",
-            )
-        label_axes(ax, x=label, y=f"residual ({unit})")
-        set_plain_tick_labels(ax)
-        legend_above(ax)
+            curve = running_mean_curve(at, residuals)
+            ax.plot(*curve, color=colour, linewidth=2.0, linestyle=line, label=f"running mean, {name}")
+        finish(ax, x=label, y=f"residual ({unit})")
     return axes
 
 
@@ -205,16 +179,8 @@ def heldout_gain_by_scan(
 ) -> Axes:
     """Draw the gain on each held-out scan in nats per reading, largest on top, and the mean with its standard error.
 
-    Parameters
-    ----------
-    scans
-        Name and gain of each; of more than twelve, only the six largest and the six smallest gains are drawn.
-    mean, sd
-        Mean over all held-out readings, and its standard error.
-    part
-        Name of the held-out unit, such as "scan".
-    ax
-        Axes to draw on; a new figure without.
+    `scans` are names and gains; of more than twelve, only the six largest and the six smallest gains are drawn. `mean`
+    and `sd` are over all held-out readings; `part` is the name of a held-out unit.
     """
     ranked = sorted(scans, key=lambda pair: -pair[1])
     if len(ranked) > _MOST_SCANS:
@@ -224,19 +190,30 @@ def heldout_gain_by_scan(
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[BLUE if gain >= 0 else VERMILLION for gain in gains])
     ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, zorder=0)
-    said = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number_text(sd, 3)} nats per reading"
-    ax.axvline(mean, color=GREY, linewidth=1.4, label=said)
+    total = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number_text(sd, 3)} nats per reading"
+    ax.axvline(mean, color=GREY, linewidth=1.4, label=total)
     ax.axvline(0, color=BLACK, linewidth=0.7)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
     ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
-    label_axes(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}")
-    set_plain_tick_labels(ax, y=False)
+    return finish(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}", plain="x")
+
+
+def recorded_against_predicted(
+    readings: FloatArray, predicted: FloatArray, sd: FloatArray, *, label: str, unit: str, ax: Axes | None = None
+) -> Axes:
+    """Draw each reading (NaN: none) against its prediction, with one sd of a new reading, (n_points,) each.
+
+    `label` and `unit` are those of the readings.
+    """
+    ax = ax if ax is not None else stack_of_axes([4.2])[0]
+    there = np.isfinite(readings)
+    x, y = predicted[there], readings[there]
+    ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=BLUE, alpha=0.6, label="readings, ± 1 sd")
+    ends = [min(x.min(), y.min()), max(x.max(), y.max())]
+    ax.plot(ends, ends, color=BLACK, lw=0.9, label="as predicted")
+    label_axes(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
     legend_above(ax)
     return ax
-
-
-_CHANCE = "95 % by chance alone"
-_STYLES = ((VERMILLION, "o", "-"), (BLUE, "s", (0, (4, 1.5))))
 
 
 def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
@@ -249,7 +226,7 @@ def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) 
 
 def _label_x_by_name(ax: Axes, names: Sequence[str]) -> None:
     """Label the positions 0, 1, 2 ... of the x axis by name; slanted and thinned where names do not fit."""
-    width_in = cast(Figure, ax.figure).get_figwidth()  # none of our figures has subfigures
+    width_in = figure_of(ax).get_figwidth()
     fits = sum(len(name) + 2 for name in names) < 12 * width_in
     skip = max(1, round(len(names) / (4 * width_in)))
     slant: dict[str, Any] = {} if fits else {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}

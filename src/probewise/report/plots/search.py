@@ -1,0 +1,186 @@
+"""A robot's search: its view of the field (the paper's figures 2 and 8), and its progress from reading to reading."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.patches import Polygon
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import ArrayLike
+
+from probewise._arrays import FloatArray
+from probewise._words import count_with_noun
+from probewise.report.plots.canvas import (
+    BLACK,
+    COPPER,
+    CYCLE,
+    SMALL_PT,
+    AxesGrid,
+    add_colour_bar,
+    axes_or_new,
+    draw_map,
+    label_axes,
+    legend_above,
+    legend_below,
+    paint_out_of_reach,
+)
+
+_LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
+_NEXT_GREEN = "#00e08a"  # the palette's green, lighter, so that the next place shows on copper
+_CARD_YELLOW = "#ffd54a"
+_OUTLINE_BLUE = "#3fa7ff"  # likewise; hypotheses are blue, as in the paper
+_DARK_EDGE = "#c8c8c8"  # edge of a square whose reading was dark
+_GROUND = "#2a1a12"  # of the legend, as dark as the map at its darkest: everything on the map shows on it
+_NOTHING = 1e-9  # of a utility
+
+
+def playing_field(
+    utility: FloatArray,
+    x_mm: FloatArray,
+    y_mm: FloatArray,
+    *,
+    outlines_mm: Sequence[FloatArray] = (),
+    places_mm: FloatArray | None = None,
+    readings: FloatArray | None = None,
+    levels: tuple[float, float] = (1.0, 100.0),
+    next_mm: tuple[float, float] | None = None,
+    truth_mm: FloatArray | None = None,
+    cards_mm: Sequence[FloatArray] = (),
+    title: str = "",
+    utility_label: str = "entropy (bits)",
+    utility_max: float | None = None,
+    lego_scale: bool = False,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the field with the utility map, hypotheses and readings (paper, figures of the entropy map).
+
+    Parameters
+    ----------
+    utility
+        Utility of a reading at each place, such as its bits, (n_y, n_x), lower row first; NaN out of the arm's reach.
+    x_mm, y_mm
+        Places of the columns and rows, shapes (n_x,) and (n_y,).
+    outlines_mm
+        Outline of each sampled hypothesis, shape (n_vertices, 2) each.
+    places_mm, readings
+        Places of the readings, shape (n_readings, 2), and their values, (n_readings,).
+    levels
+        Reading of black and of white, for the brightness of the squares.
+    next_mm
+        The place chosen next.
+    truth_mm
+        Outline of the true target, drawn dashed; None if unknown.
+    cards_mm
+        Corners of each card whose place and albedo are known, (4, 2).
+    utility_max
+        Upper end of the colour scale, for comparable figures; default: the map's maximum.
+    lego_scale
+        Whether to add the paper's coordinates, LEGO distance units, at the top.
+    """
+    ax = axes_or_new(ax, size_in=(8.2, 5.2))
+    if np.isnan(utility).any():
+        paint_out_of_reach(ax)
+    top = utility_max if utility_max is not None else float(np.nanmax(utility))
+    if top <= _NOTHING:
+        top = 1.0  # a scale of nothing would have a power of ten
+    image = draw_map(ax, utility, x_mm, y_mm, cmap=COPPER, vmin=0.0, vmax=top)
+    add_colour_bar(ax, image, utility_label)
+    if len(outlines_mm):
+        ax.add_collection(LineCollection(list(outlines_mm), colors=_OUTLINE_BLUE, linewidths=0.7, alpha=0.75))
+        ax.plot([], [], color=_OUTLINE_BLUE, label=f"{len(outlines_mm)} hypotheses drawn from the posterior")
+    if truth_mm is not None:
+        ax.plot(*truth_mm.T, color="white", linewidth=1.4, linestyle=(0, (5, 3)), label="the true target")
+    for n, corners in enumerate(cards_mm):
+        label = "" if n else "known card"
+        ax.add_patch(Polygon(corners, fill=False, edgecolor=_CARD_YELLOW, linewidth=1.4, hatch="//", label=label))
+    if places_mm is not None and readings is not None and len(places_mm):
+        low, high = levels
+        shade = np.clip((np.asarray(readings) - low) / max(high - low, 1e-9), 0, 1)
+        colours: dict[str, Any] = {
+            "c": np.repeat(shade[:, None], 3, axis=1),
+            "edgecolors": np.where(shade < 0.5, _DARK_EDGE, BLACK),
+        }
+        ax.scatter(places_mm[:, 0], places_mm[:, 1], s=34, marker="s", linewidths=0.9, zorder=3, **colours)
+        for name, colour, rim in (("dark reading", "black", _DARK_EDGE), ("bright reading", "white", BLACK)):
+            ax.plot([], [], "s", color=colour, markersize=6, markeredgecolor=rim, label=name)
+    if next_mm is not None:
+        style: dict[str, Any] = {
+            "c": _NEXT_GREEN,
+            "edgecolors": BLACK,
+            "linewidths": 1.0,
+            "zorder": 4,
+            "label": "next place",
+        }
+        ax.scatter(*next_mm, s=52, marker="s", **style)
+    left, right, low, high = image.get_extent()
+    ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
+    if lego_scale:
+        lego = ax.secondary_xaxis("top", functions=(_to_lego, _from_lego))
+        lego.set_xlabel("LEGO distance units (8 mm)", fontsize=SMALL_PT)
+        lego.tick_params(labelsize=SMALL_PT)
+    if title:
+        ax.set_title(title, fontsize="medium", loc="left")
+    return ax
+
+
+def _to_lego(mm: ArrayLike) -> FloatArray:
+    return np.asarray(mm, dtype=np.float64) / _LEGO_UNIT_MM
+
+
+def _from_lego(units: ArrayLike) -> FloatArray:
+    return np.asarray(units, dtype=np.float64) * _LEGO_UNIT_MM
+
+
+def draw_field_legend(axes: Axes | AxesGrid) -> None:
+    """Draw one legend for all playing fields of a figure, below them."""
+    legend_below(axes, n_columns=3, ground=_GROUND, ink="white")
+
+
+def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
+    """Draw the largest posterior sd (mm) after each reading, (n_readings,), of each run by name, and the target.
+
+    The default is the paper's stopping rule: 4 mm, half the spacing of LEGO holes (section 3.2).
+    """
+    ax = axes_or_new(ax, size_in=(6.4, 3.6))
+    for (name, sd), colour in zip(widths_mm.items(), itertools.cycle(CYCLE), strict=False):
+        label = f"{name}: {count_with_noun(len(sd), 'reading')}"
+        ax.plot(np.arange(1, len(sd) + 1), sd, marker="o", markersize=3.5, color=colour, label=label)
+    legend_above(ax)
+    return set_up_width_axes(ax, target_mm)
+
+
+def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
+    """Label axes of posterior sds (log scale, mm) by number of readings, draw the target's line; return the axes."""
+    ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
+    ax.annotate(
+        f"{target_mm:g} mm,\ntarget",
+        (1.0, target_mm),
+        xycoords=("axes fraction", "data"),
+        xytext=(4, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=SMALL_PT,
+    )
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return label_axes(ax, x="number of readings", y="widest posterior sd (mm)")
+
+
+def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None) -> Axes:
+    """Draw prior minus posterior differential entropy (bits) after each reading, (n_readings,), of each run by name."""
+    ax = axes_or_new(ax, size_in=(6.4, 3.6))
+    for (name, gained), colour in zip(bits.items(), itertools.cycle(CYCLE), strict=False):
+        per_reading = gained[-1] / len(gained) if len(gained) else 0.0
+        number, label = np.arange(len(gained) + 1), f"{name}: {per_reading:.2f} bits per reading"
+        ax.plot(number, np.r_[0.0, gained], marker="o", markersize=3.5, color=colour, label=label)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend_above(ax)
+    return label_axes(ax, x="number of readings", y="information about the shape (bits)")

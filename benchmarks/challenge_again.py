@@ -14,7 +14,7 @@ from pathlib import Path
 
 from challenges_side_by_side import read_cases
 
-from probewise.proof.challenge.run import run_cases
+from probewise.proof.challenge import run_cases
 
 
 def main() -> None:

@@ -18,14 +18,14 @@ from typing import Any
 
 from scipy.stats import binomtest
 
-from probewise.proof.campaign import read_campaign
-from probewise.proof.challenge.scoring import (
-    Result,
+from probewise.proof.campaign import Result, read_campaign
+from probewise.proof.scoring import (
     credible_set_holds_truth,
+    is_leading_name_right,
     is_out_of_vocabulary,
     is_recognised_as_out_of_vocabulary,
 )
-from probewise.proof.challenge.table import is_confidently_wrong, is_leading_name_right, names_effect_on_mean, score
+from probewise.proof.tables import is_confidently_wrong, names_effect_on_mean, score
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text_of_rows
 

@@ -34,7 +34,8 @@ from probewise.experiment.acquisition import predict_readings_and_utilities
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.particles import Particles, update
 from probewise.inquiry import Grid
-from probewise.proof.study import REFERENCE, Trial, arm_of, experiment_of
+from probewise.proof.configurations import REFERENCE
+from probewise.proof.trial import Trial, arm_of, experiment_of
 from probewise.scene import SHAPES, HypothesisScene
 from probewise.scene import Field as PlayingField
 

@@ -24,10 +24,11 @@ import numpy as np
 from probewise.diagnosis import diagnose, weigh_thoroughly
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.proof.campaign import run_campaign
-from probewise.proof.challenge import NullRefit
-from probewise.proof.challenge.case import Task
-from probewise.proof.challenge.estimates import estimated_share
-from probewise.proof.sensors import PLANS, draw_case
+from probewise.proof.challenge import Task
+from probewise.proof.estimates import estimated_share
+from probewise.proof.null_refit import NullRefit
+from probewise.proof.sensors.cases import draw_case
+from probewise.proof.sensors.plans import PLANS
 
 Result = Mapping[str, Any]
 _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")

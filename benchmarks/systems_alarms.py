@@ -30,8 +30,8 @@ from probewise.diagnosis.search.search import search
 from probewise.diagnosis.verdict import run_global_test
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.proof.campaign import run_campaign
-from probewise.proof.challenge.case import Task
-from probewise.proof.systems import draw_system_case, system_stratum_of, write_system_case
+from probewise.proof.challenge import Task
+from probewise.proof.systems.cases import draw_system_case, system_stratum_of, write_system_case
 from probewise.recordings import write_text_atomically
 from probewise.systems import read_run_table, read_simulator, table_for
 

@@ -19,8 +19,8 @@ from typing import Any
 from tqdm import tqdm
 
 from probewise.proof.campaign import read_campaign
-from probewise.proof.challenge.systems.case import nats_of_alternatives
-from probewise.proof.systems import draw_system_case
+from probewise.proof.system_challenge import nats_of_alternatives
+from probewise.proof.systems.cases import draw_system_case
 from probewise.recordings import write_text_atomically
 
 

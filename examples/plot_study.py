@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+from probewise.proof.estimates import Estimate
 from probewise.proof.plots import readings_needed
-from probewise.proof.study import Estimate
 
 near = (Path("docs"), Path("../docs"), Path(sys.argv[0]).resolve().parent.parent / "docs")
 file = next(path for docs in near if (path := docs / "results" / "study.csv").exists())

@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise import nested
 from probewise.priors import Uniform
-from probewise.proof.systems import draw_system
+from probewise.proof.systems.cases import draw_system
 from probewise.recordings import paper_plan
 from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
 from probewise.sensor.gaussian import mean_albedo_under_gaussians
@@ -98,7 +98,7 @@ def test_a_move():
 
 
 def test_a_system(tmp_path):
-    spring = example("SPRING", "probewise.proof.systems.formulas")
+    spring = example("SPRING", "probewise.proof.systems.kinds")
     drawn = draw_system(spring, rng=np.random.default_rng(5))
     file = tmp_path / "spring.py"
     file.write_text(spring.text.replace("{noise}", ""), encoding="utf-8")

@@ -8,8 +8,8 @@ import pytest
 from probewise.arm import Pose, Reading
 from probewise.experiment.pace import EACH_S, EffectInPacedTime, Pace
 from probewise.experiment.rivals import GainLoss, rivals_of
-from probewise.proof.study import experiment_of
-from probewise.proof.study.rows import REFERENCE
+from probewise.proof.configurations import REFERENCE
+from probewise.proof.trial import experiment_of
 
 
 def readings(each_s, start_s=0.0):

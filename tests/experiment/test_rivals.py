@@ -55,10 +55,14 @@ from probewise.experiment.rivals import rivals_of
 from probewise.experiment.utility_near_end import _ENDS, _LABEL, utility_map_and_must_continue
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
-from probewise.proof.study import ConcealedTrial, arm_of, concealed_csv_rows, experiment_of, run_concealed_trial
-from probewise.proof.study.concealed import _arm_in_concealed_world
-from probewise.proof.study.rows import REFERENCE
-from probewise.proof.study.trial import Trial, timed_steps
+from probewise.proof.concealed_study import (
+    ConcealedTrial,
+    _arm_in_concealed_world,
+    concealed_csv_rows,
+    run_concealed_trial,
+)
+from probewise.proof.configurations import REFERENCE
+from probewise.proof.trial import Trial, arm_of, experiment_of, timed_steps
 from probewise.recordings import Instrumentation, Plan, Uniform
 from probewise.report.exploration import page_html, robot_view_png
 from probewise.sensor import mixture_parameter_names

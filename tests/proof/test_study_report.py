@@ -8,9 +8,11 @@ import pytest
 
 from probewise.experiment import CLEAN, least_readings
 from probewise.proof import plots
-from probewise.proof.report import concealed
-from probewise.proof.report import study as report
-from probewise.proof.study import REFERENCE, ConcealedTrial, SearchConfiguration, Study, concealed_rows, experiment_of
+from probewise.proof import study_page as report
+from probewise.proof.concealed_study import ConcealedTrial, concealed_rows
+from probewise.proof.configurations import REFERENCE, SearchConfiguration
+from probewise.proof.study import Study
+from probewise.proof.trial import experiment_of
 
 ROWS = [REFERENCE, SearchConfiguration(model="naive")]
 
@@ -116,10 +118,10 @@ def concealed_runs():
 
 def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
     rows = concealed_rows(concealed_runs())
-    assert concealed.summary_sentence(rows).startswith(
+    assert report.concealed_summary_sentence(rows).startswith(
         "Sure and wrong: 3 of 6 runs where the robot trusts its sensor, 0 of 6 runs where it doubts it"
     )
-    page = concealed.page_html(rows, command="probewise study --concealed")
+    page = report.concealed_page_html(rows, command="probewise study --concealed")
     assert "backlash (play) of the arm, 6" in page
     assert "0.00 | 1.00" in page
 

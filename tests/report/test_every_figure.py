@@ -14,9 +14,9 @@ from probewise.errors import ShapeError
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 from probewise.proof import plots as plots_of_campaigns
-from probewise.proof.challenge import Bin
-from probewise.proof.challenge.estimates import estimated_share
-from probewise.proof.study import ConcealedRow, Estimate
+from probewise.proof.concealed_study import ConcealedRow
+from probewise.proof.estimates import Estimate, estimated_share
+from probewise.proof.scoring import Bin
 from probewise.recordings import read_recording, shipped
 from probewise.report import plots
 from probewise.sensor import SSFField

@@ -9,9 +9,8 @@ from probewise.errors import ParameterError
 from probewise.experiment import with_cards
 from probewise.experiment.rivals import rivals_of
 from probewise.inquiry import CardedForecast, TabulatedChain, forecast_of
-from probewise.proof.study import experiment_of
-from probewise.proof.study.rows import REFERENCE
-from probewise.proof.study.trial import BRIGHT, DARK, footprint_pixels
+from probewise.proof.configurations import REFERENCE
+from probewise.proof.trial import BRIGHT, DARK, experiment_of, footprint_pixels
 from probewise.recordings import Disc, Plan
 from probewise.scene import Card, CardedScene
 from probewise.world import World

@@ -10,28 +10,11 @@ import pytest
 from scipy.stats import kstest
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors import (
-    INSIDE,
-    NEEDS_SENSOR,
-    NOISE_LEVELS,
-    NOISE_NAMES,
-    OUTSIDE,
-    PLANS,
-    SINGLES,
-    SSFS,
-    WHEEL,
-    Stratum,
-    draw_case,
-    draw_plan_with_displaced_patterns,
-    draw_sensor,
-    held_out_plans,
-    held_out_recordings,
-    stratum_of,
-)
-from probewise.proof.sensors.effect_samplers import CleanSetup
-from probewise.proof.sensors.regions import CovariateRegion, region_of_effect
-from probewise.proof.sensors.sensors import draw_spot
-from probewise.proof.sensors.sizing import EffectSizer
+from probewise.proof.sensors.cases import WHEEL, Stratum, draw_case, held_out_recordings, stratum_of
+from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, OUTSIDE, SINGLES, CleanSetup
+from probewise.proof.sensors.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
+from probewise.proof.sensors.sensors import NOISE_LEVELS, NOISE_NAMES, SSFS, draw_sensor, draw_spot
+from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer, region_of_effect
 from probewise.recordings import fingerprint, read_recording, write_recording
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.proof.sensors import INSIDE, OUTSIDE
+from probewise.proof.sensors.effects import INSIDE, OUTSIDE
 from probewise.recordings import HalfPlane
 from probewise.world import Blob, World, gaussian_spot
 from probewise.world.concealed import (

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.proof.sensors import EffectSizer, amplitude_of_size
-from probewise.proof.sensors.effect_samplers import CleanSetup
-from probewise.proof.sensors.sizing import noise_effect_size
+from probewise.proof.sensors.effects import CleanSetup
+from probewise.proof.sensors.sizing import EffectSizer, amplitude_of_size, noise_effect_size
 from probewise.world import World, gaussian_spot
 from probewise.world.concealed import (
     AmbientGradient,

@@ -48,9 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge; write its table and report; return the exit status."""
     from probewise._progress import progress_shown
-    from probewise.proof.challenge import RunCaseInRounds, run_case, run_challenge, score, score_rounds
-    from probewise.proof.challenge.systems import run_system_case, score_systems
-    from probewise.proof.report import challenge as report
+    from probewise.proof import challenge_page as report
+    from probewise.proof.challenge import RunCaseInRounds, run_case, run_challenge
+    from probewise.proof.rounds import score_rounds
+    from probewise.proof.system_challenge import run_system_case
+    from probewise.proof.system_tables import score_systems
+    from probewise.proof.tables import score
 
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")

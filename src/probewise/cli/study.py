@@ -24,7 +24,7 @@ from probewise.errors import ParameterError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from probewise.proof.study import SearchConfiguration
+    from probewise.proof.configurations import SearchConfiguration
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
 MOST_CIRCLES = 10_000  # as of `probewise.proof.study`, which takes a second to import
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks; write its table and report; return the exit status."""
     from probewise._progress import progress_shown
-    from probewise.proof.report import study as report
+    from probewise.proof import study_page as report
     from probewise.proof.study import run_study
 
     out = checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
@@ -115,8 +115,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run the remaining tasks of the study of concealed effects; write its table and report; return the exit status."""
-    from probewise.proof.report import concealed as report
-    from probewise.proof.study import concealed_csv_rows, concealed_rows, run_concealed
+    from probewise.proof import study_page as report
+    from probewise.proof.concealed_study import concealed_csv_rows, concealed_rows, run_concealed
     from probewise.recordings.table import csv_text_of_rows
 
     others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
@@ -140,15 +140,15 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     rows, drawings = concealed_rows(found), Drawings(out)
     with staged_output(out, outdated=(PAGE,)) as stage:
         stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
-    drawings.write_report({}, lambda _: report.page_html(rows, command=_concealed_command_line(arguments)))
-    print_result(report.summary_sentence(rows), quiet=arguments.quiet)
+    drawings.write_report({}, lambda _: report.concealed_page_html(rows, command=_concealed_command_line(arguments)))
+    print_result(report.concealed_summary_sentence(rows), quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
     drawings.raise_if_any_failed()
     return 0
 
 
 def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:
-    from probewise.proof.study import SearchConfiguration, paper_comparison_rows, standard_rows
+    from probewise.proof.configurations import SearchConfiguration, paper_comparison_rows, standard_rows
 
     given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
     if arguments.beside_paper:

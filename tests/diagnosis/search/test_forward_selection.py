@@ -9,8 +9,8 @@ from probewise.calibration import read_sensor, write_sensor
 from probewise.diagnosis import Diagnosis, diagnose
 from probewise.diagnosis.sensors import sensor_from_samples
 from probewise.experiment import experiment_for
-from probewise.proof.challenge import NullRefit
-from probewise.proof.sensors import Case, draw_case
+from probewise.proof.null_refit import NullRefit
+from probewise.proof.sensors.cases import Case, draw_case
 from probewise.scene import Circle, Field
 
 

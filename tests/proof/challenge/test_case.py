@@ -5,8 +5,9 @@ import json
 import pytest
 
 from probewise.errors import FileError, ParameterError
-from probewise.proof.challenge import Task, run_case, run_challenge, score
-from probewise.proof.sensors import stratum_of
+from probewise.proof.challenge import Task, run_case, run_challenge
+from probewise.proof.sensors.cases import stratum_of
+from probewise.proof.tables import score
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):
     def fails(*_, **__):
         raise ZeroDivisionError("by zero")
 
-    monkeypatch.setattr("probewise.proof.challenge.case.draw_case", fails)
+    monkeypatch.setattr("probewise.proof.challenge.draw_case", fails)
     found = run_case(Task(1, 0))
     assert (found["failed"], found["at"]) == ("ZeroDivisionError: by zero", "drawing")
     assert found["kind"] == stratum_of(0)[0].kind

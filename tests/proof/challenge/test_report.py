@@ -7,9 +7,11 @@ import json
 import pytest
 
 from probewise.cli import main
+from probewise.proof import challenge_page as report
 from probewise.proof import plots
-from probewise.proof.challenge import Task, confusion_counts, reliability_bins, score
-from probewise.proof.report import challenge as report
+from probewise.proof.challenge import Task
+from probewise.proof.scoring import confusion_counts, reliability_bins
+from probewise.proof.tables import score
 
 
 @pytest.fixture

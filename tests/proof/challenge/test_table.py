@@ -5,17 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from probewise.proof.challenge import (
-    Estimate,
-    ScoreRow,
-    calibration_error,
-    confusion_counts,
-    detected_and_named_by_effect,
-    reliability_bins,
-    score,
-)
-from probewise.proof.challenge.estimates import estimated_mean, estimated_share, estimated_statistic
-from probewise.proof.challenge.table import is_confidently_wrong
+from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic
+from probewise.proof.scoring import calibration_error, confusion_counts, reliability_bins
+from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, is_confidently_wrong, score
 
 
 def row(results, name):

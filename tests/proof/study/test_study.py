@@ -7,16 +7,9 @@ import pytest
 
 from probewise.errors import FileError, ParameterError
 from probewise.proof.campaign import run_campaign
-from probewise.proof.study import (
-    REFERENCE,
-    SearchConfiguration,
-    Trial,
-    paper_comparison_rows,
-    read_study,
-    run_study,
-    run_trial,
-)
-from probewise.proof.study.trial import experiment_of_trial
+from probewise.proof.configurations import REFERENCE, SearchConfiguration, paper_comparison_rows
+from probewise.proof.study import read_study, run_study
+from probewise.proof.trial import Trial, experiment_of_trial, run_trial
 
 ROWS = [REFERENCE, SearchConfiguration(model="naive")]
 BRIEF = {"n_circles": 2, "max_readings": 3}

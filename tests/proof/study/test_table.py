@@ -7,14 +7,9 @@ import pytest
 from scipy.stats import chi2, poisson
 
 from probewise.errors import ParameterError
-from probewise.proof.study import (
-    POPULATIONS,
-    SearchConfiguration,
-    noise_of_run_in_sds,
-    share_with_interval,
-    standard_rows,
-    summarise,
-)
+from probewise.proof.configurations import POPULATIONS, SearchConfiguration, noise_of_run_in_sds, standard_rows
+from probewise.proof.estimates import estimated_share
+from probewise.proof.study import summarise
 
 
 def trial(readings: int, *, reached: bool = True, first_white: int | None = 3, error_mm: float = 1.0) -> dict:
@@ -37,7 +32,7 @@ def trial(readings: int, *, reached: bool = True, first_white: int | None = 3, e
 @pytest.mark.parametrize(("k", "n"), [(0, 50), (1, 7), (89, 100), (200, 200)])
 def test_a_share_has_wilsons_interval(k, n):
     """Its ends are as many standard errors of theirs from the share as 95 % of a normal distribution (Wilson 1927)."""
-    found, z2 = share_with_interval(k, n), chi2.ppf(0.95, 1)
+    found, z2 = estimated_share([True] * k + [False] * (n - k)), chi2.ppf(0.95, 1)
     ends = np.roots([1 + z2 / n, -2 * k / n - z2 / n, (k / n) ** 2])
     assert (found.value, found.low, found.high) == pytest.approx((k / n, min(ends), max(ends)), abs=1e-12)
 

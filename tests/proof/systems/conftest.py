@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from probewise.proof.systems.chain import simulate_noise_free
-from probewise.proof.systems.forms.true_system import TrueSystem
-from probewise.proof.systems.kind import Law, Prior, SystemKind
-from probewise.proof.systems.table import SystemTable
-from probewise.proof.systems.vocabulary import forms_of
+from probewise.proof.systems.form import TrueSystem
+from probewise.proof.systems.forms import forms_of
+from probewise.proof.systems.kind import Law, Prior, SystemKind, SystemTable
+from probewise.proof.systems.simulate import simulate_noise_free
 
 T = np.array([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0])
 

@@ -5,9 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from probewise.proof.systems.forms.inputs import behind_gear_play
-from probewise.proof.systems.forms.readings import delayed_values, direction_of_change
-from probewise.proof.systems.table import SystemTable
+from probewise.proof.systems.forms import behind_gear_play, delayed_values, direction_of_change
+from probewise.proof.systems.kind import SystemTable
 
 
 def _rows(t, run=None, **columns):

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.proof.sensors import Stratum
-from probewise.proof.systems import KINDS, SystemCase, draw_system, simulator_file_text, write_system_case
-from probewise.proof.systems.formulas import FLOW
+from probewise.proof.sensors.cases import Stratum
+from probewise.proof.systems.cases import KINDS, SystemCase, draw_system, simulator_file_text, write_system_case
+from probewise.proof.systems.forms import forms_of
+from probewise.proof.systems.kinds import FLOW
 from probewise.proof.systems.noise import noise_of_size
-from probewise.proof.systems.vocabulary import forms_of
 from probewise.systems import System, read_run_table, read_simulator
 
 

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from probewise.proof.systems import (
+from probewise.proof.systems import cases
+from probewise.proof.systems.alternatives import nats_of_alternative
+from probewise.proof.systems.cases import (
     KINDS,
-    cases,
+    SYSTEMS_WHEEL,
+    _draw_effect_of_size,
     draw_system,
     draw_system_case,
-    nats_of_alternative,
     system_stratum_of,
     truth_json,
 )
-from probewise.proof.systems.cases import _draw_effect_of_size
+from probewise.proof.systems.forms import forms_of
 from probewise.proof.systems.rivals import rivals_with_nats
-from probewise.proof.systems.strata import SYSTEMS_WHEEL
-from probewise.proof.systems.vocabulary import forms_of
 
 BY_NAME = {kind.name: kind for kind in KINDS}
 

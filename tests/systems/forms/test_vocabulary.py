@@ -5,7 +5,7 @@ import pytest
 
 from probewise.diagnosis.words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.effects import name_without_copy_suffix
-from probewise.proof.systems.vocabulary import FAMILIES
+from probewise.proof.systems.forms import FAMILIES
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 

@@ -2,24 +2,191 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.effect_samplers import CleanSetup
-from probewise.proof.sensors.in_vocabulary import INSIDE, PAIRABLE, SINGLES
-from probewise.proof.sensors.out_of_vocabulary import OUTSIDE
+from probewise.proof.sensors.effects import INSIDE, NO_PHYSICS, OUTSIDE, PAIRABLE, SINGLES, CleanSetup
 from probewise.proof.sensors.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
-from probewise.proof.sensors.regions import region_of_effect
-from probewise.proof.sensors.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise_model
-from probewise.proof.sensors.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
-from probewise.proof.sensors.strata import Stratum, stratum_of
-from probewise.proof.sensors.truth import AliasedEffect, HiddenEffect, Truth
+from probewise.proof.sensors.sensors import NOISE_LEVELS, NOISE_NAMES, OTHER_NOISE, SSFS, draw_sensor, with_noise_model
+from probewise.proof.sensors.sizing import (
+    CovariateRegion,
+    EffectSizer,
+    NormAfterRefit,
+    amplitude_of_size,
+    region_of_effect,
+)
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.world.concealed import Disturbs
+from probewise.world.concealed import Concealed, Disturbs
 from probewise.world.world import World
+
+CaseKind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_order"]
+"""What a case conceals: nothing, one effect, two, one out of vocabulary, an aliased one, or one more Gaussian."""
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """A case's kind (`CaseKind`), lambda of each effect (0 for clean), and whether its noise is one of OTHER_NOISE."""
+
+    kind: CaseKind
+    size: float = 0.0
+    other_noise: bool = False
+
+
+WHEEL: tuple[Stratum, ...] = (
+    *[Stratum("clean")] * 20,
+    *[Stratum("clean", other_noise=True)] * 5,
+    *[Stratum("single", 8.0)] * 12,
+    Stratum("single", 8.0, other_noise=True),
+    *[Stratum("single", 5.0)] * 2,
+    *[Stratum("single", 6.0)] * 2,
+    *[Stratum("single", 12.0)] * 3,
+    *[Stratum("single", 20.0)] * 5,
+    *[Stratum("pair", 12.0)] * 3,
+    *[Stratum("outside", 12.0)] * 3,
+    *[Stratum("outside", 20.0)] * 2,
+    Stratum("alias", 12.0),
+    Stratum("ssf_order", 12.0),
+)
+"""The cycle of 60 cases. A hundred cycles have 2,500 clean cases (500 of them with other noise), 2,500 of one effect
+(1,300 at lambda 8, of these 100 with other noise; 500 at 20), 300 pairs, 500 outside the vocabulary, 100 aliases and
+100 with one more Gaussian.
+"""
+
+_STRIDE = 23  # coprime to the length of the cycle, so that successive cases differ in kind
+
+
+def stratum_of(number: int) -> tuple[Stratum, int]:
+    """Return the stratum of case `number`, and how many cases of that stratum have smaller numbers."""
+    cycle, slot = divmod(number, len(WHEEL))
+    order = [WHEEL[k * _STRIDE % len(WHEEL)] for k in range(len(WHEEL))]
+    stratum = order[slot]
+    return stratum, cycle * order.count(stratum) + order[:slot].count(stratum)
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """One concealed effect.
+
+    Parameters
+    ----------
+    effect
+        The effect with its parameters.
+    size_lambda
+        Norm of its change after a refit of the null model, in noise sds.
+    region
+        Region where it acts; None: not a local effect.
+    """
+
+    effect: Concealed
+    size_lambda: float
+    region: CovariateRegion | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.effect.name
+
+    @property
+    def in_vocabulary(self) -> bool:
+        """Whether the effect is in the vocabulary of a diagnosis."""
+        return self.name in INSIDE
+
+    @property
+    def residual_covariates(self) -> tuple[str, ...]:
+        """Names of the covariates along which the effect's residual is visible."""
+        return (INSIDE.get(self.name) or OUTSIDE[self.name]).residual_covariates
+
+    @property
+    def parameters(self) -> dict[str, object]:
+        """Parameters of the effect, name to value."""
+        return dict(vars(self.effect))
+
+
+@dataclass(frozen=True)
+class AliasedEffect:
+    """An effect aliased with the concealed one, not itself in the recording, and their cosine after the refit."""
+
+    effect: Concealed
+    cosine: float
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth of a case.
+
+    Parameters
+    ----------
+    seed, number
+        Seed and number of the case.
+    stratum
+        Stratum of the case.
+    ssf, noise_level, noise_model, plan
+        Names in SSFS, NOISE_LEVELS, NOISE_MODELS and PLANS.
+    noise_sd, black, white
+        Noise sd and levels of the sensor, in reading units.
+    hidden
+        Concealed effects, in the order of the vocabulary.
+    cosine
+        Cosine of a pair after the refit; None: no pair.
+    alias
+        The alias of the concealed effect, in the stratum of aliases; otherwise None.
+    """
+
+    seed: int
+    number: int
+    stratum: Stratum
+    ssf: str
+    noise_level: str
+    noise_model: str
+    plan: str
+    noise_sd: float
+    black: float
+    white: float
+    hidden: tuple[HiddenEffect, ...] = ()
+    cosine: float | None = None
+    alias: AliasedEffect | None = None
+
+    @property
+    def combination(self) -> tuple[str, ...]:
+        """Names that a perfect diagnosis gives, sorted; ("unknown",) if any effect is outside the vocabulary.
+
+        A noise model that the vocabulary has is among them, "ssf_order" is not; () if none is left.
+        """
+        if any(not hidden.in_vocabulary for hidden in self.hidden):
+            return ("unknown",)
+        names = {hidden.name for hidden in self.hidden} - NO_PHYSICS
+        if self.noise_model in NOISE_NAMES:
+            names.add(NOISE_NAMES[self.noise_model])
+        return tuple(sorted(names))
+
+    def to_json(self) -> str:
+        """Return the truth as a string of strict JSON, "format": "truth/1"."""
+        content = {
+            "format": "truth/1",
+            **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},
+            "stratum": dataclasses.asdict(self.stratum),
+            "combination": self.combination,
+            "hidden": [
+                {
+                    "name": hidden.name,
+                    "in_vocabulary": hidden.in_vocabulary,
+                    "parameters": hidden.parameters,
+                    "size_lambda": hidden.size_lambda,
+                    "shows_in": hidden.residual_covariates,
+                    "region": None if hidden.region is None else dataclasses.asdict(hidden.region),
+                }
+                for hidden in self.hidden
+            ],
+            "alias": None if self.alias is None else {"name": self.alias.effect.name, "cosine": self.alias.cosine},
+        }
+        return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
 
 ALIASES: tuple[tuple[str, str], ...] = (
     ("backlash", "edge_misplacement"),

@@ -1,4 +1,4 @@
-"""Find the amplitude at which an effect has a requested size lambda."""
+"""The amplitude at which an effect has a requested size lambda, and the region where a local effect acts."""
 
 from __future__ import annotations
 
@@ -12,11 +12,27 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.proof.sensors.effect_samplers import CleanSetup
+from probewise.proof.sensors.effects import CleanSetup
 from probewise.recordings.plan import Recording
-from probewise.world.concealed import Concealed, CorrelatedNoise, Disturbs, Dropouts, Outliers, SignalDependentNoise
+from probewise.world.concealed import (
+    AlbedoPatch,
+    AmbientStep,
+    Concealed,
+    CorrelatedNoise,
+    Disturbs,
+    Dropouts,
+    EdgeShadow,
+    Glint,
+    HeightOffset,
+    Outliers,
+    PlaceStep,
+    Saturation,
+    ScanAngleError,
+    ScanMisplacement,
+    SignalDependentNoise,
+)
 from probewise.world.concealed.stages import AFTER_VIEW
 from probewise.world.world import View
 
@@ -192,3 +208,41 @@ def _outlier_divergence(share: float, size: float) -> float:
         return float(density * (math.log(density) - norm.logpdf(z, scale=even)))
 
     return 2 * float(quad(integrand, 0, 12 * wide, points=[2.0, 4.0], limit=200)[0])
+
+
+@dataclass(frozen=True)
+class CovariateRegion:
+    """The interval `low` to `high` of `covariate`, in its unit; for the covariate "scan", the names `scans` instead."""
+
+    covariate: str
+    low: float | None = None
+    high: float | None = None
+    scans: tuple[str, ...] = ()
+
+
+def region_of_effect(effect: Concealed, sizer: EffectSizer) -> CovariateRegion | None:
+    """Return the region of a local effect, or None for any other.
+
+    Effects on named scans: those scans. Ambient step: from the step to the last reading. Saturation: its level to the
+    largest reading. Edge shadow: distances at which it is at least half its maximum. Stain, glint, step in X: the range
+    of X in which it changes readings of scans along X by at least half its maximum.
+    """
+    plan, clean = sizer.clean_recording.plan, sizer.clean_recording.readings
+    match effect:
+        case ScanMisplacement():
+            return CovariateRegion("scan", scans=(effect.scan,))
+        case ScanAngleError() | HeightOffset():
+            return CovariateRegion("scan", scans=effect.scans)
+        case AmbientStep():
+            return CovariateRegion("time", effect.at_s, float(plan.time_s[-1]))
+        case Saturation():
+            return CovariateRegion("level", effect.level, float(clean.max()))
+        case EdgeShadow():
+            return CovariateRegion("edge_distance", 0.0, effect.w * math.sqrt(2 * math.log(2)))
+        case AlbedoPatch() | Glint() | PlaceStep():
+            along_x: BoolArray = np.abs(plan.direction_of_motion[:, 0]) > 0
+            strength = np.where(along_x, np.abs(sizer.recording_with_effects(effect).readings - clean), 0.0)
+            there = plan.x_mm[strength >= strength.max() / 2]
+            return CovariateRegion("place", float(there.min()), float(there.max()))
+        case _:
+            return None

@@ -1,21 +1,22 @@
-"""Draw a case: a system, its concealed effects, a recording, and held-out runs to test the diagnosis on."""
+"""Draw a case: a system, its concealed effects, a recording, and held-out runs; write it as a user would provide it."""
 
 from __future__ import annotations
 
+import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
+from probewise.proof.sensors.cases import Stratum
 from probewise.proof.sensors.sizing import amplitude_of_size
-from probewise.proof.sensors.strata import Stratum
-from probewise.proof.systems.chain import simulate_noise_free
-from probewise.proof.systems.designs import design_runs
 from probewise.proof.systems.fit import (
     AddedForm,
     LeastSquaresFit,
@@ -23,18 +24,45 @@ from probewise.proof.systems.fit import (
     names_of_fitted_parameters,
     project_out,
 )
-from probewise.proof.systems.forms.form import Form, FormWithParameters, parameter_arrays
-from probewise.proof.systems.forms.out_of_vocabulary import OUT_OF_VOCABULARY, forms_out_of_vocabulary
-from probewise.proof.systems.forms.true_system import TrueSystem
-from probewise.proof.systems.formulas import FORMULAS
-from probewise.proof.systems.kind import SystemKind
-from probewise.proof.systems.laws import LAWS
+from probewise.proof.systems.form import Form, FormWithParameters, TrueSystem, parameter_arrays
+from probewise.proof.systems.forms import FAMILIES, forms_of
+from probewise.proof.systems.kind import SystemKind, SystemTable, design_runs
+from probewise.proof.systems.kinds import FORMULAS, LAWS
 from probewise.proof.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
-from probewise.proof.systems.residual_covariates import residual_covariates_of
-from probewise.proof.systems.rivals import TELLING_NATS, rivals_with_nats, vocabulary_name
-from probewise.proof.systems.strata import system_stratum_of
-from probewise.proof.systems.table import SystemTable
-from probewise.proof.systems.vocabulary import FAMILIES, forms_of
+from probewise.proof.systems.rivals import TELLING_NATS, residual_covariates_of, rivals_with_nats, vocabulary_name
+from probewise.proof.systems.simulate import simulate_noise_free
+from probewise.proof.systems.unlisted import OUT_OF_VOCABULARY, forms_out_of_vocabulary
+from probewise.recordings import write_text_atomically
+from probewise.recordings.table import csv_text
+
+SYSTEMS_WHEEL: tuple[Stratum, ...] = (
+    *[Stratum("clean")] * 6,
+    *[Stratum("clean", other_noise=True)] * 4,
+    Stratum("single", 6.0),
+    *[Stratum("single", 8.0)] * 2,
+    *[Stratum("single", 12.0)] * 2,
+    Stratum("single", 20.0),
+    *[Stratum("pair", 12.0)] * 2,
+    *[Stratum("outside", 20.0)] * 2,
+)
+"""Twenty cycles are 400 cases."""
+
+_STRIDE = 7  # coprime to the length of the cycle, so that successive cases differ in kind
+
+
+def system_stratum_of(number: int) -> tuple[Stratum, int]:
+    """Return the stratum of case `number`, and how many earlier cases have its kind and `other_noise`, at any size."""
+    order = [SYSTEMS_WHEEL[k * _STRIDE % len(SYSTEMS_WHEEL)] for k in range(len(SYSTEMS_WHEEL))]
+
+    def have_same_kind_and_noise(a: Stratum, b: Stratum) -> bool:
+        return (a.kind, a.other_noise) == (b.kind, b.other_noise)
+
+    turn, slot = divmod(number, len(order))
+    own = order[slot]
+    return own, turn * sum(have_same_kind_and_noise(s, own) for s in order) + sum(
+        have_same_kind_and_noise(s, own) for s in order[:slot]
+    )
+
 
 KINDS: tuple[SystemKind, ...] = (*FORMULAS, *LAWS)
 """Every kind of system."""
@@ -403,3 +431,83 @@ def _effect_with_rivals(
     )
     left = (target - fitted.readings) / drawn.kind.sd
     return replace(effect, rivals=rivals, covariates=residual_covariates_of(effect.form, left, drawn.true_system))
+
+
+def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tuple[Path, Path, Path, Path]:
+    """Write simulator.py, table.csv, table_test.csv and truth.json into a directory; return the paths in this order."""
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    seen = case.drawn.diagnosed_row_numbers
+    later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
+    texts = {
+        "simulator.py": simulator_file_text(case),
+        "table.csv": table_text(case, seen),
+        "table_test.csv": table_text(case, later),
+        "truth.json": json.dumps(truth_json(case), indent=1, allow_nan=False) + "\n",
+    }
+    for name, text in texts.items():
+        write_text_atomically(directory / name, text)
+    simulator, table, test, truth = (directory / name for name in texts)
+    return simulator, table, test, truth
+
+
+def simulator_file_text(case: SystemCase) -> str:
+    """Return the text of simulator.py: the nominal model as a user would provide it, with the line on noise."""
+    return case.drawn.kind.text.replace("{noise}\n", f"{case.noise_text}\n" if case.noise_text else "")
+
+
+def table_text(case: SystemCase, rows: IntArray) -> str:
+    """Return the rows with these indices, readings last, as CSV text with a header."""
+    kind, laid = case.drawn.kind, case.drawn.table
+    decimals = {**kind.decimals, **{c.name: c.decimals for c in kind.logged}, kind.reading: kind.reading_decimals}
+    columns: dict[str, list[str]] = {}
+    if kind.run is not None:
+        columns[kind.run] = [case.labels[k] for k in laid.run[rows]]
+    names = [n for n in (kind.time, *kind.drives) if n is not None]
+    values = {**laid.columns, kind.reading: case.readings}
+    for name in (*names, *(n for n in laid.columns if n not in names), kind.reading):
+        columns[name] = [f"{value:.{decimals[name]}f}" for value in values[name][rows].tolist()]
+    return csv_text(dict(columns))
+
+
+def truth_json(case: SystemCase) -> dict[str, Any]:
+    """Return a dict for truth.json: effects, their aliases ("rivals"), parameters, noise, noise-free readings."""
+    seen = case.drawn.diagnosed_row_numbers
+    later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
+    pair = len(case.effects) == 2
+    effects = [_effect_json(effect) for effect in case.effects]
+    if case.noise.name not in ("white", "quantised", "t4"):
+        effects.append(
+            {
+                "name": case.noise.name,
+                "side": "noise",
+                "parameters": dict(case.noise.parameters),
+                "lambda": case.noise.size_lambda,
+            }
+        )
+    return {
+        "effects": effects,
+        "rivals": [] if pair or not case.effects else _alias_name_and_nats_rows(case.effects[0]),
+        "rivals_of": {effect.name: _alias_name_and_nats_rows(effect) for effect in case.effects} if pair else {},
+        "covariates": list(case.effects[0].covariates) if len(case.effects) == 1 else [],
+        "parameters": dict(case.drawn.shared),
+        "noise_sd": case.drawn.kind.sd,
+        "noise_free": case.noise_free[seen].tolist(),
+        "noise_free_test": case.noise_free[later].tolist(),
+        "system": case.drawn.kind.name,
+        "stratum": {"kind": case.stratum.kind, "size": case.stratum.size},
+        "noise": case.noise.name,
+        "seed": case.seed,
+        "number": case.number,
+    }
+
+
+def _effect_json(effect: SystemEffect) -> dict[str, Any]:
+    own = {"name": effect.name, "side": effect.form.side, "parameters": effect.parameters, "lambda": effect.size_lambda}
+    return (
+        own if effect.in_vocabulary else {**own, "side": "strange", "on_the_list": False, "formula": effect.form.shape}
+    )
+
+
+def _alias_name_and_nats_rows(effect: SystemEffect) -> list[list[Any]]:
+    return [[name, round(nats, 3)] for name, nats in effect.aliases.items()]

@@ -11,10 +11,9 @@ from scipy.optimize import least_squares
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.proof.systems.chain import simulate_noise_free
-from probewise.proof.systems.forms.form import Form, FormWithParameters
-from probewise.proof.systems.kind import SystemKind
-from probewise.proof.systems.table import SystemTable
+from probewise.proof.systems.form import Form, FormWithParameters
+from probewise.proof.systems.kind import SystemKind, SystemTable
+from probewise.proof.systems.simulate import simulate_noise_free
 
 _STEP = 1e-4  # step of a coordinate for derivatives
 _FORM_STEP = 0.1  # of the form's own step

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from probewise._arrays import FloatArray
-from probewise.proof.systems.table import SystemTable
+from probewise.proof.systems.kind import SystemTable
 
 OTHER_NOISE = (
     "correlated_noise",

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from probewise.proof.challenge import run_challenge
-from probewise.proof.challenge.case import Task
-from probewise.proof.challenge.systems import run_system_case, score_systems
+from probewise.proof.challenge import Task, run_challenge
+from probewise.proof.system_challenge import run_system_case
+from probewise.proof.system_tables import score_systems
 
 
 @pytest.mark.slow

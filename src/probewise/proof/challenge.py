@@ -1,0 +1,395 @@
+"""A challenge: sensors with concealed effects, each drawn, diagnosed blind and compared with the truth."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, own_arithmetic
+from probewise._kinds import checked_whole
+from probewise._version import __version__
+from probewise.calibration import FittedSensor, predict
+from probewise.diagnosis import Diagnosis, EffectFound, ModelSamples, Place, diagnose, model_with
+from probewise.effects import VOCABULARY, Extent
+from probewise.effects.noise_distribution import log_gaussian_density
+from probewise.errors import DoubtfulResultWarning, ParameterError, ProbewiseError
+from probewise.investigation import investigate
+from probewise.progress import Progress, silent
+from probewise.proof.campaign import run_campaign
+from probewise.proof.null_refit import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
+from probewise.proof.sensors.cases import Case, HiddenEffect, draw_case, held_out_recordings, stratum_of
+from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup
+from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer
+from probewise.recordings.plan import Plan, Recording
+from probewise.sensor import footprint_of
+from probewise.world.concealed import Disturbs, Quantisation
+from probewise.world.world import World
+
+__all__ = ["RunCaseInRounds", "Task", "run_case", "run_cases", "run_challenge"]
+
+_NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
+
+
+def effect_truths_and_intervals(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
+    """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
+
+    Angles are compared modulo a turn. Parameters with one value per run are left out.
+    """
+    out = {}
+    for stated in found.parameters:
+        truth = parameters.get(stated.name)
+        if not isinstance(truth, float) or stated.name in _NOT_STATED:
+            continue
+        low, high = stated.interval95
+        if stated.unit == "rad":
+            truth += 2 * math.pi * round(((low + high) / 2 - truth) / (2 * math.pi))
+        out[stated.name] = [truth, low, high]
+    return out
+
+
+def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str, list[float]]:
+    """Pair the true moments of the footprint, and the levels, with their 95 % intervals: name -> [truth, low, high].
+
+    Names: "u_mm", "v_mm", "var_u_mm2", "var_v_mm2", "cov_uv_mm2", "I_min", "I_max".
+    """
+    mean, covariance = world.spot.moments()
+    n_ssf = 6 * samples.n_gaussians
+    of_samples = _footprint_moments(samples.theta[:, :n_ssf], samples.n_gaussians)
+    truths = {
+        "u_mm": mean[0],
+        "v_mm": mean[1],
+        "var_u_mm2": covariance[0, 0],
+        "var_v_mm2": covariance[1, 1],
+        "cov_uv_mm2": covariance[0, 1],
+        "I_min": world.black,
+        "I_max": world.white,
+    }
+    values = np.concatenate([of_samples, samples.theta[:, n_ssf : n_ssf + 2]], axis=1)
+    low, high = np.quantile(values, [0.025, 0.975], axis=0)
+    return {
+        name: [float(truth), float(a), float(b)] for (name, truth), a, b in zip(truths.items(), low, high, strict=True)
+    }
+
+
+def _footprint_moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
+    """Return mean u and v, variances of u and v, and covariance of the whole mixture, (n_samples, 5)."""
+    f = footprint_of(theta, n_gaussians)
+
+    def average(values: FloatArray) -> FloatArray:
+        return np.asarray(np.sum(f.weight * values, axis=-1).reshape(len(theta)))
+
+    u, v = average(f.u_mm), average(f.v_mm)
+    columns = (
+        u,
+        v,
+        average(f.var_u + f.u_mm**2) - u**2,
+        average(f.var_v + f.v_mm**2) - v**2,
+        average(f.cov_uv + f.u_mm * f.v_mm) - u * v,
+    )
+    return np.stack(columns, axis=1)
+
+
+def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
+    """Return intersection over union of an effect's region and the first of `places` in its covariate; 0 if none."""
+    place = next((p for p in places if p.covariate == region.covariate), None)
+    if place is None:
+        return 0.0
+    if region.scans:  # an effect with several scans is located in each by itself, with its own strength
+        own = {p.scan for p in places if (p.covariate, p.p_value, p.z) == ("scan", place.p_value, place.z)}
+        return len(own & {*region.scans}) / len(own | {*region.scans})
+    if region.low is None or region.high is None or place.start is None or place.end is None:
+        return 0.0
+    both = min(region.high, place.end) - max(region.low, place.start)
+    either = max(region.high, place.end) - min(region.low, place.start)
+    return max(both, 0.0) / either if either > 0 else float(both == 0.0)
+
+
+def log_densities_of_scans(
+    case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator
+) -> dict[str, dict[str, float]]:
+    """Return the log predictive density of each held-out scan under up to four models, in nats, summed over readings.
+
+    "null" and "repaired" are the diagnosis's models without effects and with those found. "right", if all concealed
+    effects are in the vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the
+    same readings. "true" is an upper limit (exact for white noise): it knows the noise-free readings and the noise sd.
+
+    Returns
+    -------
+    Values by name of the scan ("angle", "pattern", "direction"), then of the model.
+    """
+    fitting, *drawing = rng.spawn(4)
+    models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
+    extent = Extent.of(case.recording)
+    names = [h.name for h in case.truth.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
+    showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
+    if showing and len(showing) == len(case.truth.hidden):
+        with suppress(ParameterError):  # under a model with dropouts, none of these readings was lost
+            models["right"] = model_with(case.recording, showing, rng=fitting)
+    scans = held_out_recordings(case)
+    scores: dict[str, dict[str, float]] = {}
+    for (name, samples), child in zip(models.items(), drawing, strict=False):
+        if name == "repaired" and samples is diagnosis.null:  # nothing is concealed: the right model is the null
+            scores[name] = scores["null"]
+            continue
+        sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
+        scores[name] = {scan: _total_log_density(sensor, recording) for scan, recording in scans.items()}
+    scores["true"] = {
+        scan: _true_log_density(case.world.expected_readings(recording.plan), case.world.noise_sd, recording)
+        for scan, recording in scans.items()
+    }
+    return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
+
+
+def _total_log_density(sensor: FittedSensor, recording: Recording) -> float:
+    return float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
+
+
+def _true_log_density(expected: FloatArray, sd: float, recording: Recording) -> float:
+    return float(log_gaussian_density(recording.readings, expected, sd)[recording.usable].sum())
+
+
+_OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
+_LEAST_PROBABILITY = 1e-3
+_LEAST_COSINE = 0.5
+
+
+@dataclass(frozen=True)
+class Task:
+    """One case of a challenge: the challenge's secret seed and the case's number, from 0."""
+
+    seed: int
+    number: int
+
+    @property
+    def key(self) -> str:
+        """The case's key in the campaign's file."""
+        return f"{self.seed} / {self.number}"
+
+    def generators(self, n: int) -> list[np.random.Generator]:
+        """Return `n` generators for running the case, independent of those that draw it."""
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(self.number, _OWN))).spawn(n)
+
+
+@dataclass(frozen=True)
+class RunCaseInRounds:
+    """A function that runs a case in up to `rounds` rounds: record, diagnose, then take the advised readings.
+
+    It is a dataclass, not a closure, so that it can be pickled for another process.
+    """
+
+    rounds: int
+
+    def __call__(self, task: Task) -> dict[str, Any]:
+        """Return the result of `run_case` and, under "rounds", each round's diagnosis and number of readings."""
+        return _case_result(task, partial(_investigation_result, rounds=self.rounds))
+
+
+@own_arithmetic
+def run_case(task: Task) -> dict[str, Any]:
+    """Draw a case and diagnose it from its recording alone; return the diagnosis and the truth.
+
+    Returns
+    -------
+    A dict for JSON: the stratum ("kind", "size", "other_noise"), the truth ("truth", sorted names; "hidden", a dict per
+    effect), the diagnosis (`statements_to_score`). If drawing or diagnosis failed: "failed", the reason, and "at".
+    """
+    return _case_result(task, _diagnosis_result)
+
+
+def _case_result(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[str, Any]:
+    stratum, _ = stratum_of(task.number)
+    result: dict[str, Any] = asdict(stratum)
+    refit = NullRefit()
+    at = "drawing"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
+        try:
+            case = draw_case(task.seed, task.number, norm_after_refit=refit)
+            result |= _truth_result(case, refit)
+            at = "diagnosis"
+            result |= diagnosed(case, task)
+        # A campaign of thousands survives a case that breaks the diagnosis, and reports it.
+        except (ProbewiseError, ArithmeticError, LookupError, ValueError) as error:
+            result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
+    return result
+
+
+def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
+    truth = case.truth
+    plain = replace(case.world, concealed=(), step=None)
+    sizer = EffectSizer(CleanSetup(case.recording.plan, plain), refit)
+    return {
+        "plan": truth.plan,
+        "ssf": truth.ssf,
+        "noise_level": truth.noise_level,
+        "noise_model": truth.noise_model,
+        "readings": len(case.recording),
+        "truth": list(truth.combination),
+        "hidden": _effect_results(truth.hidden, sizer, refit),
+        "alias": None if truth.alias is None else truth.alias.effect.name,
+        "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
+    }
+
+
+def _effect_results(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
+    """Return one dict per effect; in a pair with "size_beside", its size in sds when the other is in the model."""
+    each = [_effect_result(one, sizer, refit) for one in hidden]
+    if len(hidden) == 2:
+        both = sizer.recording_with_effects(*(one.effect for one in hidden))
+        left = residual_norms_with_one_named(refit, sizer.clean_recording, both, [one.name for one in hidden])
+        for own, other in zip(each, reversed(each), strict=True):
+            own["size_beside"] = left[other["name"]] / sizer.setup.world.noise_sd
+    return each
+
+
+def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
+    """Return an effect as a dict; "cosines" are those above 0.5 with effects of the vocabulary, by name."""
+    # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
+    on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
+    like = (
+        {}
+        if on_noise
+        else cosines_with_vocabulary(refit, sizer.clean_recording, sizer.recording_with_effects(hidden.effect))
+    )
+    return {
+        "name": hidden.name,
+        "size_lambda": hidden.size_lambda,
+        "on_noise": on_noise,
+        "in_vocabulary": hidden.in_vocabulary,
+        "shows_in": list(hidden.residual_covariates),
+        "cosines": {name: rho for name, rho in like.items() if rho > _LEAST_COSINE},
+    }
+
+
+def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
+    blind, later, files = task.generators(3)
+    begun_s = time.process_time()
+    diagnosis = diagnose(case.recording, rng=blind)
+    cpu_s = time.process_time() - begun_s
+    found = {effect.name: effect for effect in diagnosis.effects}
+    named = [h for h in case.truth.hidden if h.name in diagnosis.combination and h.name in found]
+    region = case.truth.hidden[0].region if len(case.truth.hidden) == 1 else None
+    return {
+        **statements_to_score(diagnosis),
+        "where": [place.covariate for place in diagnosis.where],
+        "overlap": None if region is None else place_overlap(region, diagnosis.where),
+        "parameters": {h.name: effect_truths_and_intervals(h.parameters, found[h.name]) for h in named},
+        "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
+        "held_out": log_densities_of_scans(case, diagnosis, rng=files),
+        "settled": _result_after_advice(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
+        "cpu_s": cpu_s,
+    }
+
+
+def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
+    thinking, reading = task.generators(2)
+
+    def recording_of_round(number: int, plan: Plan, _: str) -> Recording:
+        return case.recording if number == 1 else case.world.simulate(plan, rng=reading)
+
+    begun_s = time.process_time()
+    told = [
+        {**statements_to_score(each.diagnosis), "readings": len(each.recording), "settled": each.settled}
+        for each in investigate(recording_of_round, case.recording.plan, rounds=rounds, rng=thinking)
+    ]
+    return {**told[-1], "readings": len(case.recording), "rounds": told, "cpu_s": time.process_time() - begun_s}
+
+
+def statements_to_score(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return "verdict", "p_value", "combination", "hypotheses" ([names, probability]) and "credible_set", for JSON."""
+    return {
+        "verdict": diagnosis.verdict,
+        "p_value": diagnosis.p_value,
+        "combination": list(diagnosis.combination),
+        "hypotheses": [
+            [list(h.effects), h.probability] for h in diagnosis.hypotheses if h.probability > _LEAST_PROBABILITY
+        ],
+        "credible_set": list(diagnosis.judged.credible),
+    }
+
+
+def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
+    """Diagnose the recording together with simulated readings of the advised plan; None if none was advised."""
+    asked = diagnosis.next_measurement
+    if asked is None:
+        return None
+    more = case.world.simulate(asked.plan, rng=rng)
+    return {"readings": len(more), **statements_to_score(diagnose([case.recording, more], rng=rng))}
+
+
+def run_challenge(
+    n_cases: int,
+    *,
+    seed: int,
+    work: Callable[[Task], Mapping[str, Any]] = run_case,
+    of: str = "",
+    path: str | os.PathLike[str],
+    executor: Executor | None = None,
+    progress: Progress = silent,
+) -> tuple[Mapping[str, Any], ...]:
+    """Run the first cases of a challenge, or resume an interrupted one.
+
+    Parameters
+    ----------
+    n_cases
+        Number of cases, from case 0. It may be raised later: cases in the file are not run again.
+    seed
+        The secret seed: with its number, it determines a case.
+    work
+        Function that runs a case; by default the light sensor's.
+    of
+        Name of what is diagnosed, if not the light sensor; a file of another name is refused.
+    path
+        The campaign's file.
+    executor
+        Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
+    progress
+        Called with the number of finished cases.
+
+    Returns
+    -------
+    Results of `work`, in the order of the cases.
+
+    Raises
+    ------
+    ParameterError
+        If `n_cases` is less than 1.
+    FileError, NotConvergedError
+        See `run_campaign`.
+    """
+    checked_whole("n_cases", n_cases, most=100_000)
+    return run_cases(range(n_cases), seed=seed, work=work, of=of, path=path, executor=executor, progress=progress)
+
+
+def run_cases(
+    numbers: Iterable[int],
+    *,
+    seed: int,
+    work: Callable[[Task], Mapping[str, Any]] = run_case,
+    of: str = "",
+    path: str | os.PathLike[str],
+    executor: Executor | None = None,
+    progress: Progress = silent,
+) -> tuple[Mapping[str, Any], ...]:
+    """Run the cases of these numbers, or resume them; all else is as in `run_challenge`."""
+    tasks = [Task(seed, number) for number in numbers]
+    results = run_campaign(
+        work,
+        {task.key: task for task in tasks},
+        path=path,
+        settings={"challenge": __version__, "seed": seed} | ({"of": of} if of else {}),
+        executor=executor,
+        progress=progress,
+        noun="cases",
+    )
+    return tuple(results[task.key] for task in tasks)

@@ -1,0 +1,186 @@
+"""A study: every row over its circles, run as a campaign and summarised as a table (paper, section 4, "Results")."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import poisson
+
+from probewise._kinds import checked_whole
+from probewise._version import __version__
+from probewise.errors import FileError, ParameterError
+from probewise.progress import Progress, silent
+from probewise.proof.campaign import read_campaign, run_campaign
+from probewise.proof.configurations import MOST_CIRCLES, SearchConfiguration
+from probewise.proof.estimates import Estimate, estimated_share, mean_with_error, median_with_interval
+from probewise.proof.trial import WRONG_MM, Trial, run_trial
+
+__all__ = ["Study", "Summary", "read_study", "run_study", "summarise"]
+
+_CHANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One row of the table.
+
+    Attributes
+    ----------
+    n_runs
+        Number of runs, one per circle.
+    reached
+        Share of runs that reached the target precision within the limit of readings, with its 95 % interval.
+    mean, median
+        Readings needed, a miss counted as the limit; mean with standard error, median with 95 % interval (NaN bounds
+        for fewer than `LEAST_FOR_MEDIAN` runs).
+    to_white
+        Readings up to the first one on white, a run without one counted as the limit.
+    after_white
+        Readings after the first one on white, over runs that reached the precision.
+    bits_each
+        Bits per reading: prior minus posterior differential entropy.
+    error_mm
+        Largest error of a length at the stop, median over runs that reached the precision; NaN if none did.
+    wrong
+        Number of runs that reached the precision with an error above `WRONG_MM`.
+    wrong_expected, wrong_limit
+        Number expected from their own posteriors, and the 99 % quantile of a Poisson distribution with that mean.
+    held
+        Share of the 95 % intervals at the stop that hold the truth, over runs that reached the precision.
+    arm_s
+        Arm time per run in seconds, with the standard error.
+    cpu_s
+        Processor time per decision, median over runs of each run's median, in seconds.
+    """
+
+    n_runs: int
+    reached: Estimate
+    mean: Estimate
+    median: Estimate
+    to_white: Estimate
+    after_white: Estimate
+    bits_each: Estimate
+    error_mm: float
+    wrong: int
+    wrong_expected: float
+    wrong_limit: int
+    held: Estimate
+    arm_s: Estimate
+    cpu_s: float
+
+
+def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summary:
+    """Summarise the runs of one row, each a result of `run_trial`.
+
+    Raises ParameterError if there are fewer than two runs, which have no standard error.
+    """
+    if len(trials) < 2:
+        raise ParameterError("number of trials", len(trials), "2 or more, so that there is a standard error")
+    sure = [t for t in trials if t["reached"]]
+    needed = np.array([t["readings"] if t["reached"] else max_readings for t in trials], dtype=np.float64)
+    after = [t["readings"] - t["first_white"] for t in sure if t["first_white"] is not None]
+    met = np.array([max_readings if t["first_white"] is None else t["first_white"] for t in trials], dtype=np.float64)
+    errors = np.array([t["error_mm"] for t in sure])
+    expected = float(sum(t["chance_wrong"] for t in sure))
+    return Summary(
+        n_runs=len(trials),
+        reached=estimated_share([bool(t["reached"]) for t in trials]),
+        mean=mean_with_error(needed),
+        median=median_with_interval(needed),
+        to_white=mean_with_error(met),
+        after_white=mean_with_error(np.array(after, dtype=np.float64)),
+        bits_each=mean_with_error(np.array([t["bits"] / t["readings"] for t in trials])),
+        error_mm=float(np.median(errors)) if len(errors) else math.nan,
+        wrong=int((errors > WRONG_MM).sum()),
+        wrong_expected=expected,
+        wrong_limit=int(poisson.isf(_CHANCE, expected)) if expected > 0 else 0,
+        held=mean_with_error(np.array([np.mean(t["held"]) for t in sure])),
+        arm_s=mean_with_error(np.array([t["arm_s"] for t in trials])),
+        cpu_s=float(np.median([t["cpu_s"] for t in trials])),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Results (`run_trial`) of each row, in the order of the circles, and the limit of readings."""
+
+    trials: Mapping[SearchConfiguration, tuple[Mapping[str, Any], ...]]
+    max_readings: int
+
+    def table(self) -> dict[SearchConfiguration, Summary]:
+        """Return the summary of every row with two or more runs, by row."""
+        return {row: summarise(t, max_readings=self.max_readings) for row, t in self.trials.items() if len(t) > 1}
+
+
+def run_study(
+    rows: Mapping[SearchConfiguration, int] | Sequence[SearchConfiguration],
+    n_circles: int | None = None,
+    *,
+    path: str | os.PathLike[str],
+    max_readings: int = 100,
+    executor: Executor | None = None,
+    progress: Progress = silent,
+) -> Study:
+    """Run every row over the first circles of its population, or resume an interrupted study; return the results.
+
+    Parameters
+    ----------
+    rows
+        The rows; a mapping gives each its own number of circles.
+    n_circles
+        Circles per row, unless `rows` gives them.
+    path
+        The campaign's file. Rows and circles may be added later: runs in the file are not repeated.
+    max_readings
+        A run that has not reached the target precision after this many readings is a miss.
+    executor
+        Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
+    progress
+        Called with the number of finished runs.
+
+    Raises
+    ------
+    ParameterError
+        If there is no row, or a row has no circle.
+    FileError, NotConvergedError
+        See `run_campaign`.
+    """
+    wanted = dict(rows) if isinstance(rows, Mapping) else dict.fromkeys(rows, n_circles or 0)
+    if not wanted:
+        raise ParameterError("rows", rows, "one row or more, such as those of standard_rows()")
+    for row, n in wanted.items():
+        checked_whole(f"circles of the row {row.name!r}", n, most=MOST_CIRCLES)
+    # Circle by circle, so that an interrupted study has equally many runs in each row.
+    trials = [Trial(row, k, max_readings) for k in range(max(wanted.values())) for row, n in wanted.items() if k < n]
+    results = run_campaign(
+        run_trial,
+        {trial.key: trial for trial in trials},
+        path=path,
+        settings={"study": __version__, "max_readings": max_readings},
+        executor=executor,
+        progress=progress,
+        noun="runs",
+    )
+    own = {row: tuple(results[Trial(row, k).key] for k in range(n)) for row, n in wanted.items()}
+    return Study(own, max_readings)
+
+
+def read_study(path: str | os.PathLike[str], rows: Sequence[SearchConfiguration]) -> Study:
+    """Read the results of these rows from a study's file, finished or not; runs not in the file are left out.
+
+    Raises FileError if the file does not belong to a study.
+    """
+    found = read_campaign(path)
+    if "study" not in found.settings:
+        raise FileError(Path(path), "no study's campaign", "a file that `probewise study` wrote")
+    numbers = range(1 + max((int(key.rpartition(" / ")[2]) for key in found.results), default=-1))
+    keys = {row: [Trial(row, k).key for k in numbers] for row in rows}
+    trials = {row: tuple(found.results[k] for k in own if k in found.results) for row, own in keys.items()}
+    return Study(trials, found.settings["max_readings"])

@@ -1,0 +1,593 @@
+"""Every effect of the vocabulary, built for one system: on readings, inputs, clock, parameters and rates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.proof.systems.form import (
+    Form,
+    Instants,
+    Modulation,
+    Numbers,
+    TrueSystem,
+    draw_log_uniform,
+    linear_drift,
+    proportional_to_column,
+    settling,
+    sinusoid_in_time,
+    start_values_of_single_member,
+    start_values_of_wave,
+    step_at_change_point,
+    value_per_run,
+    wave_bank,
+)
+from probewise.proof.systems.kind import SystemTable
+
+GAIN, OFFSET, _HYSTERESIS, _BEND, _LAG, _CEILING = range(6)
+_N_WAVES = 240
+
+
+def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
+    """Yield every form on the reading that this system can have."""
+    yield from _modulated_forms(true)
+    yield from _hysteresis_bend_and_saturation_forms(true)
+    yield from _lag_and_delay_forms(true)
+
+
+def modulated_reading_form(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
+    """Return the form that adds a modulation to the reading or, with `gain`, multiplies by 1 + modulation."""
+
+    def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        change = how.value_at(Instants.at_rows(rows), v)
+        return np.asarray(y * (1 + change) if gain else y + change)
+
+    typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
+    first = true.noise_sd / typical / how.reach
+    return Form(
+        name,
+        "reading",
+        act=act,
+        of_amplitude=how.of_amplitude,
+        draw=how.draw,
+        bank=how.bank(first),
+        start_values=how.start_values,
+        steps=how.steps(first),
+        first=first,
+        limit=1e4 * first,
+        covariates=how.covariates,
+        signed=how.signed,
+        order=GAIN if gain else OFFSET,
+    )
+
+
+def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
+    timed = true.table.time is not None
+    both = {"step": step_at_change_point(true)}
+    if timed:
+        both["drift"] = linear_drift(true)
+    if true.kind.run is not None and len(true.table.rows_by_run) > 1:
+        both["per_run"] = value_per_run(true)
+    for kind, how in both.items():
+        yield modulated_reading_form(true, f"offset_{kind}", how)
+        yield modulated_reading_form(true, f"gain_{kind}", how, gain=True)
+    for column in true.varying_columns:
+        yield modulated_reading_form(true, f"sensitivity:{column}", proportional_to_column(true, column))
+    if timed:
+        yield modulated_reading_form(true, "interference", sinusoid_in_time(true, _N_WAVES))
+        if true.kind.run is not None:  # a table that does not name its runs cannot show that it settles in each
+            yield modulated_reading_form(true, "settling", settling(true))
+
+
+def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
+    """Return the sign of the change from the row before in a run; 0 keeps the last sign, the first row has the next."""
+    out = np.zeros_like(y)
+    for own in rows.rows_by_run:
+        for i in range(len(y)):
+            signs = np.sign(np.diff(y[i, own]))
+            moving = np.flatnonzero(signs)
+            if not moving.size:
+                continue
+            last = moving[np.clip(np.searchsorted(moving, np.arange(len(signs)), side="right") - 1, 0, None)]
+            out[i, own] = np.concatenate([[signs[moving[0]]], signs[last]])
+    return out
+
+
+def _hysteresis_bend_and_saturation_forms(true: TrueSystem) -> Iterator[Form]:
+    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.noise_sd
+    yield Form(
+        "hysteresis",
+        "reading",
+        act=lambda y, rows, v: y + v["a"] * direction_of_change(y, rows),
+        of_amplitude=lambda a, drawn: {"a": a},
+        draw=lambda rng: {},
+        bank=[[{"a": sd}]],
+        start_values=start_values_of_single_member,
+        steps={"a": sd},
+        first=sd,
+        limit=1e3 * sd,
+        covariates=("previous",),
+        order=_HYSTERESIS,
+    )
+
+    def bend(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        z = (y - low) / (high - low)
+        return np.asarray(y + v["a"] * (high - low) * (np.sign(z) * np.abs(z) ** v["power"] - z))
+
+    if not high > low:
+        return
+    first = sd / (high - low)
+    yield Form(
+        "nonlinearity",
+        "reading",
+        act=bend,
+        of_amplitude=lambda a, drawn: {"a": a, **drawn},
+        draw=lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))},
+        bank=[[{"a": first, "power": p}] for p in (0.5, 0.7, 1.4, 2.0, 3.0, 4.5)],
+        start_values=start_values_of_single_member,
+        steps={"a": first, "power": 0.05},
+        first=first,
+        limit=0.5,
+        covariates=("level",),
+        order=_BEND,
+        also_in_truth={"lo": low, "hi": high},
+    )
+    for upper in (True, False):
+        end, sign = (high, -1.0) if upper else (low, 1.0)
+        levels = end + sign * (high - low) * np.geomspace(0.004, 0.5, 14)
+        yield Form(
+            "saturation" if upper else "saturation (floor)",
+            "reading",
+            act=_make_clip(upper),
+            of_amplitude=_make_clip_level_of_amplitude(end, sign),
+            draw=lambda rng: {},
+            bank=[[{"level": float(level)}] for level in levels],
+            start_values=lambda group, amounts: dict(group[0]),
+            steps={"level": 0.01 * (high - low)},
+            first=2 * sd,
+            limit=0.5 * (high - low),
+            covariates=("level",),
+            signed=False,
+            order=_CEILING,
+        )
+
+
+def _make_clip(upper: bool) -> Callable[[FloatArray, SystemTable, Numbers], FloatArray]:
+    """Return a `Form.act` that limits readings to the parameter "level": at most this if `upper`, else at least."""
+    bound = np.minimum if upper else np.maximum
+    return lambda y, rows, v: np.asarray(bound(y, v["level"]))
+
+
+def _make_clip_level_of_amplitude(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
+    """Return a `Form.of_amplitude`: the clip level is `end` + `sign` times the amplitude."""
+    return lambda a, drawn: {"level": end + sign * a}
+
+
+def delayed_values(values: FloatArray, rows: SystemTable, tau: FloatArray) -> FloatArray:
+    """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs: interpolated, constant before the first row."""
+    n = max(len(values), len(tau))
+    values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
+    out = np.empty(values.shape)
+    for own in rows.rows_by_run:
+        t = rows.t[own]
+        for i in range(n):
+            out[i, own] = np.interp(t - tau[i, 0], t, values[i, own])
+    return out
+
+
+def _lagged(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+    tau = np.maximum(np.broadcast_to(v["tau_s"], (max(len(y), len(v["tau_s"])), 1)), 1e-12)
+    out = np.array(np.broadcast_to(y, (len(tau), y.shape[1])))
+    for own in rows.rows_by_run:
+        for before, row in pairwise(own):
+            stays = np.exp(-(rows.t[row] - rows.t[before]) / tau[:, 0])
+            out[:, row] = stays * out[:, before] + (1 - stays) * out[:, row]
+    return out
+
+
+def _lag_and_delay_forms(true: TrueSystem) -> Iterator[Form]:
+    if true.table.time is None:
+        return
+    gap = true.table.median_gap
+    acts = {
+        "lag": (_lagged, 0.3),
+        "delay": (lambda y, rows, v: delayed_values(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02),
+    }
+    for name, (act, least) in acts.items():
+        yield Form(
+            name,
+            "reading",
+            act=act,
+            of_amplitude=lambda a, drawn: {"tau_s": a},
+            draw=lambda rng: {},
+            bank=[[{"tau_s": float(tau)}] for tau in gap * np.geomspace(least, 12, 10)],
+            start_values=lambda group, amounts: dict(group[0]),
+            steps={"tau_s": 0.02 * gap},
+            first=0.45 * gap,
+            limit=15 * gap,
+            covariates=("previous",),
+            signed=False,
+            order=_LAG,
+        )
+
+
+Change = Callable[[FloatArray, SystemTable, Numbers], Any]
+
+
+def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
+    """Yield the forms on each column that the law or formula uses, and the drift of the clock."""
+    for column in true.kind.drives:
+        yield from _forms_of_column(true, column)
+    time = true.table.time
+    # A clock error is detectable only if the law or the formula uses time.
+    if time is not None and (true.kind.law is not None or true.kind.restarts_time):
+        yield _linear_one_parameter_form(
+            "clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time)
+        )
+
+
+def _make_act_on_column(
+    column: str, change: Change
+) -> Callable[[Mapping[str, FloatArray], SystemTable, Numbers], dict[str, Any]]:
+    """Return a `Form.act` that replaces one column by `change(column, rows, parameters)`."""
+    return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
+
+
+def _linear_one_parameter_form(
+    name: str, column: str, change: Change, first: float, limit: float, covariates: tuple[str, ...]
+) -> Form:
+    return Form(
+        name,
+        "input",
+        act=_make_act_on_column(column, change),
+        of_amplitude=lambda a, drawn: {"a": a},
+        draw=lambda rng: {},
+        bank=[[{"a": first}]],
+        start_values=start_values_of_single_member,
+        steps={"a": first},
+        first=first,
+        limit=limit,
+        covariates=covariates,
+        uses=(),
+    )
+
+
+def _nonlinear_one_parameter_form(
+    name: str, number: str, change: Change, column: str, tried: FloatArray, covariates: tuple[str, ...], late: str = ""
+) -> Form:
+    return Form(
+        name,
+        "input",
+        act=_make_act_on_column(column, change),
+        of_amplitude=lambda a, drawn: {number: a},
+        draw=lambda rng: {},
+        bank=[[{number: float(size)}] for size in tried],
+        start_values=lambda group, amounts: dict(group[0]),
+        steps={number: 0.02 * float(tried[len(tried) // 2])},
+        first=float(tried[len(tried) // 2]),
+        limit=float(tried[-1]),
+        covariates=covariates,
+        signed=False,
+        late=late,
+    )
+
+
+def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
+    values, spread = true.table.columns[column], true.sd_of(column)
+    low, high = float(values.min()), float(values.max())
+    span, own = high - low, (column, "level")
+    if not span > 0:
+        return
+    yield _linear_one_parameter_form(
+        f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own
+    )
+    yield _linear_one_parameter_form(
+        f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own
+    )
+    levels = high - span * np.geomspace(0.004, 0.5, 12)
+    yield Form(
+        f"input_saturation:{column}",
+        "input",
+        act=_make_act_on_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
+        of_amplitude=lambda a, drawn: {"level": high - a},
+        draw=lambda rng: {},
+        bank=[[{"level": float(level)}] for level in levels],
+        start_values=lambda group, amounts: dict(group[0]),
+        steps={"level": 0.01 * span},
+        first=0.05 * span,
+        limit=0.6 * span,
+        covariates=own,
+        signed=False,
+    )
+    sizes = span * np.geomspace(1e-4, 0.3, 10)
+    if low <= 0.1 * span:
+        yield _nonlinear_one_parameter_form(
+            f"dead_zone:{column}",
+            "width",
+            lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0),
+            column,
+            sizes,
+            own,
+        )
+    moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
+    if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
+        yield _nonlinear_one_parameter_form(
+            f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column)
+        )
+    if len(np.unique(values)) > 20:
+        waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
+
+        def column_plus_sine_error(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+            return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
+
+        first = 0.01 * spread
+        bank = [
+            [{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")
+        ]
+        yield Form(
+            f"periodic_error:{column}",
+            "input",
+            act=_make_act_on_column(column, column_plus_sine_error),
+            of_amplitude=lambda a, drawn: {"a": a, **drawn},
+            draw=lambda rng: {
+                "period": span / draw_log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
+                "phase": float(rng.uniform(0, 2 * np.pi)),
+            },
+            bank=bank,
+            start_values=start_values_of_wave,
+            steps={"a": first, "period": 0.002 * span, "phase": 0.05},
+            first=first,
+            limit=0.2 * span,
+            covariates=own,
+            signed=False,
+        )
+    if true.table.time is not None:
+        taus = true.table.median_gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
+        yield _nonlinear_one_parameter_form(
+            f"input_delay:{column}",
+            "tau_s",
+            lambda c, rows, v: delayed_values(c, rows, np.maximum(v["tau_s"], 0.0)),
+            column,
+            taus,
+            ("previous", column),
+            late=column,
+        )
+
+
+def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+    """Return a column, (n_samples, n_points), behind gear play `v["width"]`: it rests until the play is taken up.
+
+    At the start of each run, the play is taken up in the direction of the first motion.
+    """
+    half = 0.5 * np.maximum(v["width"][:, 0], 0.0)
+    out = np.empty((max(len(c), len(half)), c.shape[1]))
+    for own in rows.rows_by_run:
+        moves = np.diff(c[0, own])
+        ways = moves[moves != 0]
+        at = c[:, own[0]] - half * (np.sign(ways[0]) if ways.size else 0.0)
+        for row in own:
+            at = np.minimum(np.maximum(at, c[:, row] - half), c[:, row] + half)
+            out[:, row] = at
+    return out
+
+
+_N_FORCING_WAVES = 20
+
+
+def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
+    """Yield the forms by which each parameter may vary: in a step, a drift, from run to run, with a column."""
+    common = {"steps": step_at_change_point(true)}
+    if true.table.time is not None:
+        common["drifts"] = linear_drift(true)
+    for name in true.kind.priors:
+        own = dict(common)
+        if name not in true.kind.per_run and true.kind.run is not None and len(true.table.rows_by_run) > 1:
+            own["differs"] = value_per_run(true)
+        if name in true.kind.per_run and true.kind.law is not None:
+            own = {}  # initial values do not vary within a run
+        for kind, how in own.items():
+            yield varying_parameter_form(true, f"{kind}:{name}", name, how)
+        if not (name in true.kind.per_run and true.kind.law is not None):
+            for column in true.varying_columns:
+                yield varying_parameter_form(
+                    true, f"depends:{name}:{column}", name, proportional_to_column(true, column)
+                )
+
+
+def varying_parameter_form(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
+    """Return the form `name` by which the parameter `target` varies as the modulation `how`, e.g. a step."""
+    first = 0.003 * float(np.abs(true.parameters[target]).mean()) / how.reach
+    return Form(
+        name,
+        "parameter",
+        act=how.value_at,
+        of_amplitude=how.of_amplitude,
+        draw=how.draw,
+        bank=how.bank(0.1 * first),
+        start_values=how.start_values,
+        steps=how.steps(first),
+        first=first,
+        limit=200 * first,
+        covariates=how.covariates,
+        target=target,
+        uses=how.uses,
+        breaks=how.breaks,
+    )
+
+
+def rate_term_form(
+    true: TrueSystem,
+    name: str,
+    state: str,
+    push: Callable[[Any, Any, Any], Any],
+    size: float,
+    covariates: tuple[str, ...],
+    uses: tuple[str, ...] = (),
+    shape: str = "",
+    signed: bool = True,
+) -> Form:
+    """Return the form of a term a push(states, now, parameters) in the rate of a state; `size`: push's magnitude."""
+    first = 0.01 * true.rms_rate(state) / size
+    return Form(
+        name,
+        "rate",
+        act=lambda s, now, v: v["a"] * push(s, now, v),
+        of_amplitude=lambda a, drawn: {"a": a},
+        draw=lambda rng: {},
+        bank=[[{"a": 0.1 * first}]],
+        start_values=start_values_of_single_member,
+        steps={"a": first},
+        first=first,
+        limit=300 * first,
+        covariates=covariates,
+        target=state,
+        uses=uses,
+        shape=shape,
+        signed=signed,
+    )
+
+
+def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
+    """Yield the terms that may be missing from the rate of each state, dry friction and an upper bound included."""
+    if true.kind.law is None:
+        return
+    for state, values in true.states.items():
+        size = float(np.abs(values).max())
+        own = (f"state:{state}", "time")
+        yield rate_term_form(
+            true, f"damping:{state}", state, _make_term_of_state(state, lambda r: -r), size, own, signed=False
+        )
+        drags = _make_term_of_state(state, lambda r: -np.abs(r) * r)
+        yield rate_term_form(true, f"drag:{state}", state, drags, size**2, own, signed=False)
+        yield rate_term_form(
+            true, f"forcing:{state}", state, _make_term_of_state(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
+        )
+        for other, there in true.states.items():
+            most = float(np.abs(there).max())
+            seen = (f"state:{other}", "time")
+            yield rate_term_form(
+                true, f"cubic:{state}:{other}", state, _make_term_of_state(other, lambda r: -(r**3)), most**3, seen
+            )
+            yield rate_term_form(
+                true, f"quadratic:{state}:{other}", state, _make_term_of_state(other, lambda r: -(r**2)), most**2, seen
+            )
+            if other != state:
+                yield rate_term_form(
+                    true, f"coupling:{state}:{other}", state, _make_term_of_state(other, lambda r: -r), most, seen
+                )
+        yield _periodic_forcing_form(true, state)
+        yield from _friction_and_bound_forms(true, state)
+
+
+def _make_term_of_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
+    """Return a `push` for `rate_term_form` that is a function `term` of one state."""
+    return lambda s, now, v: term(s[state])
+
+
+def _periodic_forcing_form(true: TrueSystem, state: str) -> Form:
+    how = sinusoid_in_time(true, _N_FORCING_WAVES)
+    first = 0.02 * true.rms_rate(state)
+    return Form(
+        f"periodic_forcing:{state}",
+        "rate",
+        act=lambda s, now, v: how.value_at(now, v),
+        of_amplitude=how.of_amplitude,
+        draw=how.draw,
+        bank=how.bank(0.1 * first),
+        start_values=how.start_values,
+        steps=how.steps(first),
+        first=first,
+        limit=100 * first,
+        covariates=how.covariates,
+        signed=False,
+        target=state,
+    )
+
+
+def _friction_and_bound_forms(true: TrueSystem, state: str) -> Iterator[Form]:
+    speed, values = true.rms_rate(state), true.states[state]
+    sizes = speed * np.geomspace(1e-3, 0.3, 4)
+    yield Form(
+        f"friction:{state}",
+        "rate",
+        act=lambda s, now, v: 0.0,
+        of_amplitude=lambda a, drawn: {"a": a},
+        draw=lambda rng: {},
+        bank=[[{"a": float(size)}] for size in sizes],
+        start_values=lambda group, amounts: dict(group[0]),
+        steps={"a": 0.01 * speed},
+        first=0.02 * speed,
+        limit=2 * speed,
+        covariates=(f"state:{state}", "level"),
+        signed=False,
+        target=state,
+        sticks=True,
+    )
+    low, high = float(values.min()), float(values.max())
+    levels = high - (high - low) * np.array([0.01, 0.04, 0.12, 0.3])
+    yield Form(
+        f"limit:{state}",
+        "rate",
+        act=lambda s, now, v: 0.0,
+        of_amplitude=lambda a, drawn: {"level": high - a},
+        draw=lambda rng: {},
+        bank=[[{"level": float(level)}] for level in levels],
+        start_values=lambda group, amounts: dict(group[0]),
+        steps={"level": 0.01 * (high - low)},
+        first=0.05 * (high - low),
+        limit=0.6 * (high - low),
+        covariates=(f"state:{state}", "level"),
+        signed=False,
+        target=state,
+        stops=True,
+    )
+
+
+FAMILIES = (
+    "offset_drift",
+    "offset_step",
+    "offset_per_run",
+    "gain_drift",
+    "gain_step",
+    "gain_per_run",
+    "nonlinearity",
+    "saturation",
+    "hysteresis",
+    "lag",
+    "delay",
+    "settling",
+    "interference",
+    "sensitivity",
+    "input_offset",
+    "input_gain",
+    "input_delay",
+    "input_saturation",
+    "dead_zone",
+    "periodic_error",
+    "backlash",
+    "clock_drift",
+    "drifts",
+    "steps",
+    "differs",
+    "depends",
+    "damping",
+    "drag",
+    "friction",
+    "forcing",
+    "periodic_forcing",
+    "cubic",
+    "quadratic",
+    "coupling",
+    "limit",
+)
+"""Names of forms without targets."""
+
+
+def forms_of(true: TrueSystem) -> list[Form]:
+    """Return every form of the vocabulary, once for each of its possible targets in this system."""
+    of_rates = forms_of_rates(true) if true.kind.defines_states else ()
+    return [*forms_of_readings(true), *forms_of_inputs(true), *forms_of_parameters(true), *of_rates]

@@ -1,0 +1,563 @@
+"""Twelve kinds of system: six static, whose reading depends only on the row, and six with a law in continuous time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.proof.systems.kind import (
+    Columns,
+    IrrelevantColumn,
+    Law,
+    Prior,
+    SystemKind,
+    irregular_times,
+    random_steps,
+    random_waves,
+    sweep_there_and_back,
+)
+
+Rng = np.random.Generator
+
+
+def _bath_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    t = irregular_times(rng, n, 4.0)
+    return t, {"bath_c": rng.uniform(35, 55) * regime + 0.2 * np.sin(t / rng.uniform(9, 20))}
+
+
+BATH = SystemKind(
+    name="thermometer in a bath",
+    reading="probe_c",
+    unit="degC",
+    run="dip",
+    text="""# A thermometer is dipped from room temperature into a warm bath.
+import numpy as np
+
+reading, unit = "probe_c", "degC"
+time, run = "t_s", "dip"
+parameters = {"tau_s": ("log", 3, 300), "start_c": ("normal", 21, 3), "scale": ("normal", 1.0, 0.1)}
+per_run = ["start_c"]
+{noise}
+
+def simulate(p, data):
+    gone = np.exp(-data["t_s"] / p["tau_s"])
+    return p["scale"] * data["bath_c"] * (1 - gone) + p["start_c"] * gone
+""",
+    priors={"tau_s": Prior("log", 3, 300), "start_c": Prior("normal", 21, 3), "scale": Prior("normal", 1.0, 0.1)},
+    per_run=("start_c",),
+    draw=lambda rng: {"tau_s": float(rng.uniform(18, 45)), "scale": float(rng.normal(1.0, 0.01))},
+    draw_run=lambda rng: {"start_c": float(rng.normal(21, 2))},
+    design=_bath_design,
+    decimals={"t_s": 2, "bath_c": 2},
+    drives=("bath_c",),
+    sd=0.05,
+    formula=lambda p, u: (
+        p["scale"] * u["bath_c"] * (1 - np.exp(-u["t_s"] / p["tau_s"])) + p["start_c"] * np.exp(-u["t_s"] / p["tau_s"])
+    ),
+    restarts_time=True,
+    logged=(
+        IrrelevantColumn("room_c", 21.5, 0.8, 0.03, 2, 4.0),
+        IrrelevantColumn("stir_rpm", 300, 15, 3, 0),
+        IrrelevantColumn("rh_pct", 45, 3, 0.3, 1),
+    ),
+    n_runs=5,
+)
+
+
+def _cup_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    t = irregular_times(rng, n, 1.3)
+    return t, {"room_c": rng.uniform(18, 24) * (1.25 if regime > 1 else 1.0) + 0.5 * np.sin(t / rng.uniform(10, 25))}
+
+
+CUP = SystemKind(
+    name="cooling cup",
+    reading="tea_c",
+    unit="degC",
+    run="cup",
+    time="t_min",
+    time_unit="min",
+    text="""# Tea cools in a cup, one cup after the other.
+from numpy import exp
+
+reading, unit = "tea_c", "degC"
+time, time_unit = "t_min", "min"
+run = "cup"
+parameters = {"tau_min": ("log", 5, 300), "hot_c": ("normal", 75, 15)}
+per_run = ["hot_c"]
+controls = ["room_c"]
+{noise}
+
+def simulate(p, data):
+    return data["room_c"] + (p["hot_c"] - data["room_c"]) * exp(-data["t_min"] / p["tau_min"])
+""",
+    priors={"tau_min": Prior("log", 5, 300), "hot_c": Prior("normal", 75, 15)},
+    per_run=("hot_c",),
+    draw=lambda rng: {"tau_min": float(rng.uniform(25, 60))},
+    draw_run=lambda rng: {"hot_c": float(rng.normal(76, 6))},
+    design=_cup_design,
+    decimals={"t_min": 2, "room_c": 2},
+    drives=("room_c",),
+    sd=0.12,
+    formula=lambda p, u: u["room_c"] + (p["hot_c"] - u["room_c"]) * np.exp(-u["t_min"] / p["tau_min"]),
+    restarts_time=True,
+    logged=(
+        IrrelevantColumn("rh_pct", 50, 4, 0.4, 1),
+        IrrelevantColumn("fill_ml", 240, 6, 0.4, 1),
+        IrrelevantColumn("baro_hpa", 1012, 2, 0.1, 1),
+    ),
+    n_runs=5,
+    reading_decimals=3,
+)
+
+
+def _photodiode_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    far = 90.0 * (1.5 if regime > 1 else 1.0)
+    return irregular_times(rng, n, 1.0), {"dist_mm": sweep_there_and_back(rng, n, 20.0, far)}
+
+
+PHOTODIODE = SystemKind(
+    name="photodiode against distance",
+    reading="diode_mv",
+    unit="mV",
+    run="sweep",
+    time=None,
+    text="""# A lamp on a rail is moved to and from a photodiode.
+reading, unit = "diode_mv", "mV"
+run = "sweep"
+parameters = {"dark_mv": ("normal", 0, 5), "power": ("log", 1e4, 1e7), "behind_mm": (0, 30)}
+{noise}
+vectorized = True
+
+def simulate(p, data):
+    return p["dark_mv"] + p["power"] / (data["dist_mm"] + p["behind_mm"]) ** 2
+""",
+    priors={"dark_mv": Prior("normal", 0, 5), "power": Prior("log", 1e4, 1e7), "behind_mm": Prior("uniform", 0, 30)},
+    draw=lambda rng: {
+        "dark_mv": float(rng.normal(0, 2)),
+        "power": float(rng.uniform(2e5, 5e5)),
+        "behind_mm": float(rng.uniform(8, 20)),
+    },
+    design=_photodiode_design,
+    decimals={"dist_mm": 2},
+    drives=("dist_mm",),
+    sd=0.4,
+    formula=lambda p, u: p["dark_mv"] + p["power"] / (u["dist_mm"] + p["behind_mm"]) ** 2,
+    logged=(
+        IrrelevantColumn("board_c", 27, 1.5, 0.05, 2, 6.0),
+        IrrelevantColumn("rail_v", 5.0, 0.01, 0.002, 4),
+        IrrelevantColumn("rh_pct", 42, 3, 0.3, 1),
+    ),
+    n_runs=5,
+    reading_decimals=3,
+)
+
+
+def _flow_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    most = 12.0 * regime
+    return irregular_times(rng, n, 6.0), {
+        "flow_lpm": random_steps(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)
+    }
+
+
+FLOW = SystemKind(
+    name="orifice flow meter",
+    reading="drop_kpa",
+    unit="kPa",
+    run="series",
+    text="""# The pressure drop over an orifice grows as the square of the flow through it.
+reading, unit = "drop_kpa", "kPa"
+time, run = "t_s", "series"
+parameters = {"zero_kpa": ("normal", 0, 0.5), "k": ("log", 0.01, 1)}
+controls = ["flow_lpm"]
+{noise}
+
+def simulate(p, data):
+    return p["zero_kpa"] + p["k"] * data["flow_lpm"] ** 2
+""",
+    priors={"zero_kpa": Prior("normal", 0, 0.5), "k": Prior("log", 0.01, 1)},
+    draw=lambda rng: {"zero_kpa": float(rng.normal(0, 0.2)), "k": float(rng.uniform(0.08, 0.2))},
+    design=_flow_design,
+    decimals={"t_s": 1, "flow_lpm": 3},
+    drives=("flow_lpm",),
+    sd=0.03,
+    formula=lambda p, u: p["zero_kpa"] + p["k"] * u["flow_lpm"] ** 2,
+    logged=(
+        IrrelevantColumn("water_c", 18, 1.5, 0.05, 2, 8.0),
+        IrrelevantColumn("pump_v", 24, 0.1, 0.02, 3),
+        IrrelevantColumn("baro_hpa", 1009, 2, 0.1, 1),
+    ),
+    n_runs=4,
+)
+
+
+def _lens_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    low, high = (440, 640) if regime == 1 else (400, 700)
+    return irregular_times(rng, n, 9.0), {"nm": sweep_there_and_back(rng, n, low, high)}
+
+
+LENS = SystemKind(
+    name="dispersion of a lens",
+    reading="focus_mm",
+    unit="mm",
+    run=None,
+    text="""# The focal length of a lens against the wavelength (Cauchy).
+reading, unit = "focus_mm", "mm"
+time = "t_s"
+parameters = {"radius_mm": ("normal", 100, 2), "b_um2": (0.0, 0.02)}
+{noise}
+
+def simulate(p, data):
+    index = 1.504 + p["b_um2"] / (data["nm"] / 1000) ** 2
+    return p["radius_mm"] / (2 * (index - 1))
+""",
+    priors={"radius_mm": Prior("normal", 100, 2), "b_um2": Prior("uniform", 0, 0.02)},
+    draw=lambda rng: {"radius_mm": float(rng.normal(100, 0.5)), "b_um2": float(rng.uniform(0.003, 0.008))},
+    design=_lens_design,
+    decimals={"t_s": 1, "nm": 1},
+    drives=("nm",),
+    sd=0.01,
+    formula=lambda p, u: p["radius_mm"] / (2 * (1.504 + p["b_um2"] / (u["nm"] / 1000) ** 2 - 1)),
+    logged=(
+        IrrelevantColumn("glass_c", 22, 1.2, 0.03, 2, 7.0),
+        IrrelevantColumn("lamp_w", 40, 0.3, 0.05, 2),
+        IrrelevantColumn("baro_hpa", 1015, 2, 0.1, 1),
+    ),
+    n_runs=3,
+)
+
+
+def _ph_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    levels = np.linspace(4, 9, 8) if regime == 1 else np.linspace(2.5, 11, 8)
+    t = irregular_times(rng, n, 15.0)
+    warm = rng.uniform(18, 32) + (12 if regime > 1 else 0) + 1.5 * np.sin(t / rng.uniform(80, 300))
+    return t, {"buffer_ph": random_steps(rng, n, levels, 5) + 0.02 * rng.standard_normal(n), "probe_c": warm}
+
+
+PH = SystemKind(
+    name="pH probe",
+    reading="cell_mv",
+    unit="mV",
+    run="day",
+    text="""# A glass electrode in buffers (Nernst).
+reading, unit = "cell_mv", "mV"
+time, run = "t_s", "day"
+parameters = {"e0_mv": ("normal", 0, 30), "slope_mv": ("normal", 58, 3)}
+{noise}
+
+def simulate(p, data):
+    kelvin = data["probe_c"] + 273.15
+    return p["e0_mv"] - p["slope_mv"] * kelvin / 298.15 * (data["buffer_ph"] - 7)
+""",
+    priors={"e0_mv": Prior("normal", 0, 30), "slope_mv": Prior("normal", 58, 3)},
+    draw=lambda rng: {"e0_mv": float(rng.normal(0, 12)), "slope_mv": float(rng.uniform(56, 60))},
+    design=_ph_design,
+    decimals={"t_s": 1, "buffer_ph": 3, "probe_c": 2},
+    drives=("buffer_ph", "probe_c"),
+    sd=0.5,
+    formula=lambda p, u: p["e0_mv"] - p["slope_mv"] * (u["probe_c"] + 273.15) / 298.15 * (u["buffer_ph"] - 7),
+    logged=(IrrelevantColumn("salt_g_l", 3.0, 0.15, 0.02, 3), IrrelevantColumn("rh_pct", 48, 3, 0.3, 1)),
+    n_runs=4,
+    reading_decimals=3,
+)
+
+FORMULAS = (BATH, CUP, PHOTODIODE, FLOW, LENS, PH)
+
+
+def _tank_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 5.0), {
+        "valve_v": random_steps(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)
+    }
+
+
+TANK = SystemKind(
+    name="tank",
+    reading="level_cm",
+    unit="cm",
+    text="""# Water runs into a tank through a valve and out at the bottom, in proportion to the level.
+import math
+
+reading, unit = "level_cm", "cm"
+time, run = "t_s", "run"
+parameters = {"cm_per_v": ("log", 1, 50), "tau_s": ("log", 5, 500), "start_cm": (0, 40)}
+per_run = ["start_cm"]
+controls = ["valve_v"]
+{noise}
+
+def simulate(p, data):
+    t, valve, run = data["t_s"], data["valve_v"], data["run"]
+    out = []
+    for k in range(len(t)):
+        if k == 0 or run[k] != run[k - 1]:
+            level = p["start_cm"][k]
+        else:
+            stays = math.exp(-(t[k] - t[k - 1]) / p["tau_s"])
+            level = stays * level + (1 - stays) * p["cm_per_v"] * valve[k - 1]
+        out.append(level)
+    return out
+""",
+    priors={"cm_per_v": Prior("log", 1, 50), "tau_s": Prior("log", 5, 500), "start_cm": Prior("uniform", 0, 40)},
+    per_run=("start_cm",),
+    draw=lambda rng: {"cm_per_v": float(rng.uniform(5, 10)), "tau_s": float(rng.uniform(35, 90))},
+    draw_run=lambda rng: {"start_cm": float(rng.uniform(5, 30))},
+    design=_tank_design,
+    decimals={"t_s": 2, "valve_v": 2},
+    drives=("valve_v",),
+    sd=0.04,
+    law=Law(
+        {"level": "start_cm"},
+        lambda s, p, u: {"level": (p["cm_per_v"] * u["valve_v"] - s["level"]) / p["tau_s"]},
+        lambda s, p, u: s["level"],
+    ),
+    logged=(
+        IrrelevantColumn("water_c", 16, 1.0, 0.04, 2, 6.0),
+        IrrelevantColumn("hall_c", 20, 0.8, 0.04, 2),
+        IrrelevantColumn("supply_v", 12, 0.05, 0.01, 3),
+    ),
+    n_runs=4,
+    defines_states=False,
+)
+
+
+def _filter_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 0.002), {
+        "in_v": random_steps(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)
+    }
+
+
+FILTER = SystemKind(
+    name="RC filter of two stages",
+    reading="out_v",
+    unit="V",
+    run="burst",
+    text="""# Two RC stages behind each other, with a buffer between them.
+reading, unit = "out_v", "V"
+time, run = "t_s", "burst"
+parameters = {"gain": ("normal", 1.0, 0.1), "tau1_s": ("log", 0.0005, 0.008), "tau2_s": ("log", 0.008, 0.1)}
+{noise}
+states = {"first": 0.0, "second": 0.0}
+
+def rates(s, p, u):
+    charging = (p["gain"] * u["in_v"] - s["first"]) / p["tau1_s"]
+    return {"first": charging, "second": (s["first"] - s["second"]) / p["tau2_s"]}
+
+def observe(s, p, u):
+    return s["second"]
+""",
+    priors={
+        "gain": Prior("normal", 1.0, 0.1),
+        # Swapped, the two stages do the same: their owner knows which is the fast one.
+        "tau1_s": Prior("log", 0.0005, 0.008),
+        "tau2_s": Prior("log", 0.008, 0.1),
+    },
+    draw=lambda rng: {
+        "gain": float(rng.normal(1.0, 0.03)),
+        "tau1_s": float(rng.uniform(0.003, 0.006)),
+        "tau2_s": float(rng.uniform(0.010, 0.018)),
+    },
+    design=_filter_design,
+    decimals={"t_s": 6, "in_v": 3},
+    drives=("in_v",),
+    sd=0.004,
+    law=Law(
+        {"first": 0.0, "second": 0.0},
+        lambda s, p, u: {
+            "first": (p["gain"] * u["in_v"] - s["first"]) / p["tau1_s"],
+            "second": (s["first"] - s["second"]) / p["tau2_s"],
+        },
+        lambda s, p, u: s["second"],
+    ),
+    logged=(IrrelevantColumn("board_c", 30, 1.5, 0.04, 2, 8.0), IrrelevantColumn("rail_v", 12.0, 0.02, 0.004, 3)),
+    n_runs=4,
+    reading_decimals=5,
+)
+
+
+def _oscillator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    t = irregular_times(rng, n, 0.05)
+    return t, {"force_n": random_waves(rng, t, 0.8 * regime, 2.5)}
+
+
+OSCILLATOR = SystemKind(
+    name="mass on a spring",
+    reading="x_mm",
+    unit="mm",
+    text="""# A cart of 0.8 kg on a spring with a damper, pushed by a shaker.
+reading, unit = "x_mm", "mm"
+time, run = "t_s", "run"
+parameters = {"k_n_m": ("log", 5, 500), "c_kg_s": ("log", 0.05, 5), "x0_m": ("normal", 0, 0.03)}
+per_run = ["x0_m"]
+{noise}
+states = {"x": "x0_m", "v": 0.0}
+hold = "linear"
+
+def rates(s, p, u):
+    return {"x": s["v"], "v": (u["force_n"] - p["k_n_m"] * s["x"] - p["c_kg_s"] * s["v"]) / 0.8}
+
+def observe(s, p, u):
+    return 1000 * s["x"]
+""",
+    priors={"k_n_m": Prior("log", 5, 500), "c_kg_s": Prior("log", 0.05, 5), "x0_m": Prior("normal", 0, 0.03)},
+    per_run=("x0_m",),
+    draw=lambda rng: {"k_n_m": float(rng.uniform(25, 70)), "c_kg_s": float(rng.uniform(0.4, 1.2))},
+    draw_run=lambda rng: {"x0_m": float(rng.normal(0, 0.03))},
+    design=_oscillator_design,
+    decimals={"t_s": 4, "force_n": 4},
+    drives=("force_n",),
+    sd=0.15,
+    law=Law(
+        {"x": "x0_m", "v": 0.0},
+        lambda s, p, u: {"x": s["v"], "v": (u["force_n"] - p["k_n_m"] * s["x"] - p["c_kg_s"] * s["v"]) / 0.8},
+        lambda s, p, u: 1000 * s["x"],
+        linear=True,
+    ),
+    logged=(IrrelevantColumn("air_c", 22, 0.8, 0.03, 2, 5.0), IrrelevantColumn("mains_v", 230, 1.0, 0.3, 1)),
+    n_runs=4,
+    reading_decimals=3,
+)
+
+
+def _servo_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 0.03), {
+        "volts": random_steps(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)
+    }
+
+
+SERVO = SystemKind(
+    name="DC motor",
+    reading="angle_deg",
+    unit="deg",
+    text="""# A DC motor with an encoder.
+reading, unit = "angle_deg", "deg"
+time, run = "t_s", "run"
+parameters = {"deg_s_v": ("log", 5, 500), "tau_s": ("log", 0.01, 1)}
+controls = ["volts"]
+{noise}
+states = {"angle": 0.0, "speed": 0.0}
+
+def rates(s, p, u):
+    return {"angle": s["speed"], "speed": (p["deg_s_v"] * u["volts"] - s["speed"]) / p["tau_s"]}
+""",
+    priors={"deg_s_v": Prior("log", 5, 500), "tau_s": Prior("log", 0.01, 1)},
+    draw=lambda rng: {"deg_s_v": float(rng.uniform(30, 70)), "tau_s": float(rng.uniform(0.08, 0.2))},
+    design=_servo_design,
+    decimals={"t_s": 4, "volts": 2},
+    drives=("volts",),
+    sd=0.8,
+    law=Law(
+        {"angle": 0.0, "speed": 0.0},
+        lambda s, p, u: {"angle": s["speed"], "speed": (p["deg_s_v"] * u["volts"] - s["speed"]) / p["tau_s"]},
+        lambda s, p, u: s["angle"],
+    ),
+    logged=(
+        IrrelevantColumn("case_c", 33, 2.5, 0.05, 2, 10.0),
+        IrrelevantColumn("bus_v", 9.0, 0.05, 0.01, 3),
+        IrrelevantColumn("load_g", 120, 6, 0.5, 1),
+    ),
+    n_runs=5,
+    reading_decimals=3,
+)
+
+
+def _reactor_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 9.0 * (1.4 if regime > 1 else 1.0)), {}
+
+
+REACTOR = SystemKind(
+    name="two reactions in a row",
+    reading="absorbance",
+    unit="AU",
+    run="vial",
+    text="""# A turns into B, B into C; B is seen in the spectrometer.
+reading, unit = "absorbance", "AU"
+time, run = "t_s", "vial"
+parameters = {"k1_per_s": ("log", 0.0005, 0.5), "k2_per_s": ("log", 0.0005, 0.5), "dose": (0, 3)}
+per_run = ["dose"]
+{noise}
+states = {"a": "dose", "b": 0.0}
+
+def rates(s, p, u):
+    made = p["k1_per_s"] * s["a"]
+    return {"a": -made, "b": made - p["k2_per_s"] * s["b"]}
+
+def observe(s, p, u):
+    return s["b"]
+""",
+    priors={
+        "k1_per_s": Prior("log", 0.0005, 0.5),
+        "k2_per_s": Prior("log", 0.0005, 0.5),
+        "dose": Prior("uniform", 0, 3),
+    },
+    per_run=("dose",),
+    draw=lambda rng: {"k1_per_s": float(rng.uniform(0.018, 0.03)), "k2_per_s": float(rng.uniform(0.004, 0.008))},
+    draw_run=lambda rng: {"dose": float(rng.uniform(0.7, 2.0))},
+    design=_reactor_design,
+    decimals={"t_s": 1},
+    drives=(),
+    sd=0.003,
+    law=Law(
+        {"a": "dose", "b": 0.0},
+        lambda s, p, u: {"a": -p["k1_per_s"] * s["a"], "b": p["k1_per_s"] * s["a"] - p["k2_per_s"] * s["b"]},
+        lambda s, p, u: s["b"],
+    ),
+    restarts_time=True,
+    logged=(
+        IrrelevantColumn("jacket_c", 30, 0.7, 0.04, 2, 4.0),
+        IrrelevantColumn("stir_rpm", 500, 12, 4, 0),
+        IrrelevantColumn("lamp_a", 0.8, 0.01, 0.001, 4),
+    ),
+    n_runs=5,
+    reading_decimals=5,
+)
+
+
+def _predator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 0.5), {"feed": random_steps(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)}
+
+
+PREDATOR = SystemKind(
+    name="predator and prey",
+    reading="prey_per_ml",
+    unit="1/ml",
+    run="flask",
+    time="t_d",
+    time_unit="day",
+    text="""# Paramecia are fed, and eaten by didinia.
+reading, unit = "prey_per_ml", "1/ml"
+time, time_unit, run = "t_d", "day", "flask"
+parameters = {"grow_per_d": ("log", 0.05, 5), "eat": ("log", 0.005, 0.5), "die_per_d": ("log", 0.05, 5)}
+{noise}
+states = {"prey": 20.0, "hunters": 5.0}
+
+def rates(s, p, u):
+    caught = p["eat"] * s["prey"] * s["hunters"]
+    born = p["grow_per_d"] * u["feed"] * s["prey"]
+    return {"prey": born - caught, "hunters": 0.3 * caught - p["die_per_d"] * s["hunters"]}
+""",
+    priors={"grow_per_d": Prior("log", 0.05, 5), "eat": Prior("log", 0.005, 0.5), "die_per_d": Prior("log", 0.05, 5)},
+    draw=lambda rng: {
+        "grow_per_d": float(rng.uniform(0.5, 0.9)),
+        "eat": float(rng.uniform(0.06, 0.1)),
+        "die_per_d": float(rng.uniform(0.4, 0.7)),
+    },
+    design=_predator_design,
+    decimals={"t_d": 3, "feed": 2},
+    drives=("feed",),
+    sd=0.3,
+    law=Law(
+        {"prey": 20.0, "hunters": 5.0},
+        lambda s, p, u: {
+            "prey": p["grow_per_d"] * u["feed"] * s["prey"] - p["eat"] * s["prey"] * s["hunters"],
+            "hunters": 0.3 * p["eat"] * s["prey"] * s["hunters"] - p["die_per_d"] * s["hunters"],
+        },
+        lambda s, p, u: s["prey"],
+    ),
+    logged=(
+        IrrelevantColumn("room_c", 21, 0.8, 0.04, 2, 5.0),
+        IrrelevantColumn("oxygen_mg_l", 7.5, 0.3, 0.05, 2),
+        IrrelevantColumn("light_lx", 400, 15, 4, 0),
+    ),
+    n_runs=4,
+    reading_decimals=3,
+)
+
+LAWS = (TANK, FILTER, OSCILLATOR, SERVO, REACTOR, PREDATOR)

@@ -1,0 +1,214 @@
+"""One autonomous run of a study: the search for one circle in one configuration."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from probewise._arrays import FloatArray, own_arithmetic
+from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm
+from probewise.experiment import (
+    AdjustedMixture,
+    Experiment,
+    NestedSampling,
+    SensorChangeSds,
+    Step,
+    explore,
+    naive_levels_from_world,
+    probability_of_length_off,
+    student_t_likelihood,
+)
+from probewise.inference import GaussianKnown, Naive
+from probewise.inquiry import Grid, utility_named
+from probewise.nested import NESTED_STOP
+from probewise.priors import Normal, Product
+from probewise.proof.configurations import FIELD, POPULATIONS, SearchConfiguration, noise_of_run_in_sds
+from probewise.recordings import Disc
+from probewise.scene import HypothesisScene
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
+from probewise.world import Blob, Spot, World, gaussian_spot
+
+SEED = 2013
+WRONG_MM = 12.0
+"""Three times the 4 mm of the stopping rule: a run that ends with a larger error is sure and wrong."""
+# The study's sensor: one Gaussian, in mm and LEGO units; the world uses the same numbers, rasterised to pixels.
+DARK, BRIGHT = 10.0, 60.0
+_CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
+_ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
+_PIXEL_MM = 0.5
+_UNROUNDED = ReadingScale(-math.inf, math.inf, None)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A task of a study: the row, the number of the circle, from 0, and the limit of readings."""
+
+    row: SearchConfiguration
+    circle: int
+    max_readings: int = 100
+
+    @property
+    def key(self) -> str:
+        """Key of the run in the campaign's file."""
+        return f"{self.row.name} / {self.circle}"
+
+    @property
+    def truth(self) -> FloatArray:
+        """The true circle: x_mm, y_mm, radius_mm, (3,)."""
+        return np.asarray(POPULATIONS[self.row.population].circles(self.circle + 1)[self.circle])
+
+
+@lru_cache(maxsize=16)
+def experiment_of(row: SearchConfiguration) -> Experiment:
+    """Build the experiment of a row; cached per process."""
+    scene = HypothesisScene(POPULATIONS[row.population].shape)
+    common: dict[str, Any] = {
+        "noise_sd": row.noise_sd,
+        "grid": Grid(FIELD.width_mm, FIELD.height_mm),
+        "utility": utility_named(row.utility),
+        "batch": row.batch,
+        "method": NestedSampling(stop=NESTED_STOP[row.nested_stop]) if row.method == "paper" else None,
+    }
+    shape = POPULATIONS[row.population].shape
+    if row.model == "naive":
+        likelihood = Naive(DARK, row.noise_sd, BRIGHT, row.noise_sd)
+        model = NaiveSensor(FixedLevels(DARK, BRIGHT), scene)
+        # A reading on the edge fits neither level, and the naive model has no partial coverage.
+        return Experiment(shape, model, likelihood, **common, doubt_p=0.0)
+    sd_u, sd_v = (row.width * sd for sd in _SD)
+    covariance = np.array([[sd_u**2, _CORRELATION * sd_u * sd_v], [_CORRELATION * sd_u * sd_v, sd_v**2]])
+    mixture = FixedMixture(np.ones(1), np.array([_CENTRE]), covariance[None])
+    if not row.learn_sensor:
+        levels = FixedLevels(DARK, BRIGHT)
+        chain = Chain(mixture, levels, scene, n_nodes=FAST_NODES)
+        if row.method == "paper":
+            return Experiment(shape, chain, student_t_likelihood(levels, None), **common)
+        return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
+    free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
+    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_prior_of_sensor_changes())
+
+
+def experiment_of_trial(trial: Trial) -> Experiment:
+    """Build the experiment of a row over one circle; the paper's naive robot first reads black and white sheets."""
+    posed = experiment_of(trial.row)
+    if (trial.row.method, trial.row.model) != ("paper", "naive"):
+        return posed
+    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=trial.row.noise_sd)
+    naive = naive_levels_from_world(world, _UNROUNDED, rng=np.random.default_rng([SEED, trial.circle, 1]))
+    model = NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), HypothesisScene(posed.shape))
+    return replace(posed, model=model, likelihood=naive)
+
+
+@own_arithmetic
+def run_trial(trial: Trial) -> dict[str, Any]:
+    """Search for a circle.
+
+    Returns
+    -------
+    A dict for JSON. Search: whether the target precision was `reached`, number of `readings`, number of the first one
+    on white (`first_white`, or None), `bits` gained in all and up to that one (`bits_at_white`). Result: largest error
+    of a length (`error_mm`), its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 % interval
+    covers the truth (`held`), p-value of the fit (`p_value`, None: not tested), widest posterior sd after each reading
+    (`widest_mm`). Cost: arm time in seconds (`arm_s`), median processor time per decision in seconds (`cpu_s`).
+    """
+    experiment = experiment_of_trial(trial)
+    widest, cpu, first_white, bits_at_white = [], [], None, None
+    for step, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):
+        last = step
+        cpu.append(cpu_s)
+        widest.append(round(step.largest_sd_mm, 3))
+        if first_white is None and step.reading.value > _ON_WHITE:
+            first_white, bits_at_white = step.number, round(step.bits, 3)
+    return {
+        "reached": has_reached_target(last, experiment),
+        "readings": last.number,
+        "first_white": first_white,
+        "bits": round(last.bits, 3),
+        "bits_at_white": bits_at_white,
+        **accuracy_measures(last, experiment, trial.truth),
+        "arm_s": round(last.reading.time_s, 2),
+        "cpu_s": round(float(np.median(cpu)), 4),
+        "widest_mm": widest,
+        "p_value": last.p_value,
+    }
+
+
+def timed_steps(
+    arm: SimulatedArm, experiment: Experiment, *, circle: int, max_readings: int, seed: int = SEED
+) -> Iterator[tuple[Step, float]]:
+    """Yield each step of a run with its processor time in s; randomness depends on seed and circle only."""
+    rng = np.random.default_rng([seed, circle])
+    with arm:
+        steps = explore(arm, experiment, rng=rng, max_readings=max_readings)
+        while True:
+            before = time.process_time()
+            step = next(steps, None)
+            if step is None:
+                return
+            yield step, time.process_time() - before
+
+
+def has_reached_target(last: Step, experiment: Experiment) -> bool:
+    """Return whether a run reached the target precision with a posterior that fits its readings."""
+    known = experiment.may_stop(last.sd, last.shapes, last.chance_off)
+    return known and not experiment.fit_is_doubtful(last.p_value)
+
+
+def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
+    """Return `error_mm`, `chance_wrong` and `held` of `run_trial`, from the last posterior and the true shape, (3,)."""
+    columns = experiment.shape_columns
+    theta, weight = last.posterior.theta[:, columns], last.posterior.weight
+    held = []
+    for values, true in zip(theta.T, truth, strict=True):
+        below = float(weight[values < true].sum() + 0.5 * weight[values == true].sum())
+        held.append(bool(0.025 <= below <= 0.975))
+    return {
+        "error_mm": round(float(np.abs(last.mean - truth).max()), 3),
+        "chance_wrong": probability_of_length_off(experiment, last.posterior, WRONG_MM),
+        "held": held,
+    }
+
+
+def arm_of(trial: Trial) -> SimulatedArm:
+    """Return a simulated arm that reaches the whole grid over the circle, with the noise that all rows share."""
+    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
+    x_mm, y_mm, radius_mm = trial.truth.tolist()
+    disc = Disc((x_mm, y_mm), radius_mm)
+    noise, number = noise_of_run_in_sds(trial.circle, trial.max_readings), itertools.count()
+
+    def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
+        clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)
+        return clean + trial.row.noise_sd * float(noise[next(number)])
+
+    everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
+    return SimulatedArm(light_reading, reach=everywhere, scale=None)
+
+
+@lru_cache(maxsize=1)
+def footprint_pixels() -> Spot:
+    """Return the footprint of the study's simulated sensor as pixels."""
+    return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
+
+
+def _prior_of_sensor_changes() -> Product:
+    """Return the normal prior of changes of the SSF and of the levels, about the sensor's true values."""
+    change = SensorChangeSds()
+    level = change.level * (BRIGHT - DARK)
+    size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)
+    return Product(
+        {
+            "log_size_u": size,
+            "log_size_v": size,
+            "shift_u_mm": shift,
+            "shift_v_mm": shift,
+            "I_min": Normal(DARK, level),
+            "I_max": Normal(BRIGHT, level),
+        }
+    )

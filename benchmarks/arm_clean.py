@@ -20,8 +20,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of_readings, shipped_geometry_path
-from probewise.cli._bench import SimulatedBench
-from probewise.cli._plans import plan_for_lego_arm
+from probewise.cli._bench import SimulatedBench, plan_for_lego_arm
 from probewise.diagnosis import diagnose
 from probewise.recordings import Recording, paper_plan, read_recording, write_recording
 from probewise.world.shipped import true_world

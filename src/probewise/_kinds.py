@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import math
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TypeGuard
@@ -16,7 +15,7 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise.errors import ParameterError, UnitWarning
+from probewise.errors import ParameterError, UnitWarning, did_you_mean
 
 _FULL_TURN_RAD = math.tau * (1 + 1e-9)
 _MOST = 10_000_000  # of anything that is counted: more fill the memory
@@ -99,12 +98,6 @@ def warn_of_likely_degrees(name: str, values: float | NDArray[np.float64]) -> No
     if _FULL_TURN_RAD < widest < math.inf:
         said = f"{name} reaches {widest:.6g} rad, beyond a full turn (6.283 rad): convert degrees with numpy.radians"
         warnings.warn(said, UnitWarning, stacklevel=3)
-
-
-def did_you_mean(value: object, known: Iterable[str]) -> str:
-    """Return "; did you mean NAME?" with the known name nearest to a misspelt one, or "" if none is near."""
-    near = difflib.get_close_matches(value, list(known), n=1) if isinstance(value, str) else []
-    return f"; did you mean {near[0]}?" if near else ""
 
 
 def require_flag(name: str, value: object) -> None:

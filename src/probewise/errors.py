@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from functools import partial
 
 __all__ = [
@@ -18,6 +20,7 @@ __all__ = [
     "ShapeError",
     "SlowWarning",
     "UnitWarning",
+    "did_you_mean",
     "message_of",
     "shortened",
     "shown",
@@ -60,6 +63,12 @@ def message_of(error: BaseException, most: int = 200, *, kind: bool = True) -> s
             raise
         text = f"its message raises {type(failure).__name__}"
     return f"{type(error).__name__}: {text}".removesuffix(": ") if kind else text
+
+
+def did_you_mean(value: object, known: Iterable[str]) -> str:
+    """Return "; did you mean NAME?" with the known name nearest to a misspelt one, or "" if none is near."""
+    near = difflib.get_close_matches(value, list(known), n=1) if isinstance(value, str) else []
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 class ProbewiseError(Exception):

@@ -46,7 +46,7 @@ __all__ = [
 # Defaults of the command line and of the functions below.
 ORDERS = (1, 2, 3, 4)
 N_LIVE = 300
-CalibrationMethod: TypeAlias = Literal["quick", "full", "paper", "refined"]
+CalibrationMethod: TypeAlias = Literal["quick", "full", "paper"]
 CALIBRATION: CalibrationMethod = "quick"
 SHAPE = "circle"
 MODEL: Model = "ssf"
@@ -81,7 +81,7 @@ def calibrate(
         Carlo, from the peak of its likelihood or from the posterior of one Gaussian less. Nested sampling of the whole
         prior with few live points checks the chosen number; a number in doubt gets nested sampling with `n_live`.
         "full": the same priors; every number is fitted by nested sampling, and its evidence refined by importance
-        sampling. Takes two to ten times as long. "refined" is its former name.
+        sampling. Takes two to ten times as long.
         "paper": uniform priors, and the evidence of nested sampling alone. All have the Student-t likelihood.
     nested_stop
         Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or
@@ -125,7 +125,7 @@ def calibrate(
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
 
-    if method not in ("quick", "full", "paper", "refined"):
+    if method not in ("quick", "full", "paper"):
         raise ParameterError("method", method, "'quick', 'full' or 'paper'")
     paper = method == "paper"
     if nested_stop is not None and not (paper and nested_stop in NESTED_STOP):

@@ -7,10 +7,15 @@ import numpy as np
 import pytest
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.arm.fitting import MarksDisagreeError, fit_geometry
+from probewise.arm.fitting import (
+    MarksDisagreeError,
+    TouchedMark,
+    fit_geometry,
+    read_turns_and_places,
+    spread_mark_places,
+    write_marks,
+)
 from probewise.arm.geometry_file import text_with_fitted_values
-from probewise.arm.mark_file import TouchedMark, read_turns_and_places, write_marks
-from probewise.arm.marks import spread_mark_places
 from probewise.errors import FileError, ParameterError, ShapeError
 
 GEOMETRY = read_geometry(shipped_geometry_path())

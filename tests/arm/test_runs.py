@@ -11,8 +11,7 @@ import pytest
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.calibration import FittedSensor, write_sensor
-from probewise.cli import main
-from probewise.cli._arm_tasks import opening
+from probewise.cli import _arm_tasks, main
 from probewise.errors import LinkError
 from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan, write_recording
 from probewise.sensor import footprint_of, mean_ssf_field
@@ -45,8 +44,7 @@ def bricks(monkeypatch, make_paper_brick):
         machine = BrickMachine(Brick(Link(paper, clock=clock), clock=clock), geometry)
         return LegoArm(machine, geometry, clock=clock, start_s=start_s)
 
-    monkeypatch.setattr("probewise.cli._arm_tasks.opening.open_nxt_arm", open_nxt_arm)
-    monkeypatch.setattr("probewise.cli._explore_arm.open_nxt_arm", open_nxt_arm)
+    monkeypatch.setattr("probewise.cli._arm_tasks.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("probewise.cli._bench.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 100))
     deaths["opened"] = opened
@@ -121,7 +119,7 @@ def test_a_light_value_out_of_range_ends_the_recording_and_keeps_it(bricks, plan
     """It is a link error: exit 1, and --resume goes on."""
     out = tmp_path / "rec.csv"
     arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
-    monkeypatch.setattr("probewise.recordings.write_recording", then(write_recording, lambda: spoil(bricks)))
+    monkeypatch.setattr("probewise.cli._record.write_recording", then(write_recording, lambda: spoil(bricks)))
     status, said = run(capsys, *arguments)
     assert status == 1
     assert "input 1 says valid 1, calibrated 0, 2000 counts; allowed: 0 or 1, 0, 0 to 1023" in said
@@ -270,7 +268,7 @@ def test_a_stop_while_the_sensor_rises_keeps_the_reading_and_asks_for_nothing(
     """The motors are released before the reading is written. Two looks at the sheet come first."""
     at_rest = []
     spy = then(write_recording, lambda: at_rest.append(bricks["opened"][-1].at_rest))
-    monkeypatch.setattr("probewise.recordings.write_recording", spy)
+    monkeypatch.setattr("probewise.cli._record.write_recording", spy)
     stop_as_it_rises(2 + n_read)
     out = tmp_path / "rec.csv"
     arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
@@ -292,7 +290,7 @@ def test_a_stop_while_the_sensor_rises_is_raised_by_what_comes_next(n_poses, sto
     readings = []
 
     def measure():
-        with opening.open_nxt_arm("x", geometry) as arm:
+        with _arm_tasks.open_nxt_arm("x", geometry) as arm:
             readings.extend(arm.measure(pose) for _ in range(n_poses))
 
     stop_as_it_rises(1)

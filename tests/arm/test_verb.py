@@ -32,7 +32,7 @@ def test_check_names_what_is_wrong_with_a_file(tmp_path, capsys):
 @pytest.fixture
 def at_port(paper_brick, clock, monkeypatch):
     monkeypatch.setattr(
-        "probewise.cli._arm_tasks.check.open_brick", lambda port: Brick(Link(paper_brick, clock=clock), clock=clock)
+        "probewise.cli._arm_tasks.open_brick", lambda port: Brick(Link(paper_brick, clock=clock), clock=clock)
     )
     return paper_brick
 
@@ -129,7 +129,7 @@ def test_what_cannot_be_done_is_refused_in_one_line(arguments, says, tmp_path, m
 @pytest.mark.parametrize("dry", [["--dry-run"], ["--arm", "nxt:x"]], ids=["rehearsed", "on a brick"])
 def test_a_scan_that_leaves_the_reach_moves_nothing_and_prints_nothing(dry, monkeypatch, capsys):
     """The whole scan is checked first: the line to a brick is not even opened."""
-    monkeypatch.setattr("probewise.cli._arm.open_brick", lambda port: pytest.fail("the line was opened"))
+    monkeypatch.setattr("probewise.cli._bench.open_brick", lambda port: pytest.fail("the line was opened"))
     told = said(capsys, "arm", "scan", "300,200", "5,5", "--readings", "6", *dry, status=2)
     assert told.out == ""
     assert "the place of reading 6 of the scan (mm) is (5.0, 5.0); allowed: a place on the field" in told.err

@@ -12,8 +12,8 @@ import pytest
 from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main, parser
-from probewise.cli._arm import InstrumentWithCallbacks
-from probewise.cli._explore_inputs import read_checked_inputs
+from probewise.cli._bench import InstrumentWithCallbacks
+from probewise.cli._explore import read_checked_inputs
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
@@ -203,7 +203,7 @@ def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, mo
     def shown(*, quiet):
         yield lambda stage, done=0, total=0, note="": told.append(note)
 
-    monkeypatch.setattr("probewise._progress.progress_shown", shown)
+    monkeypatch.setattr("probewise.cli._explore.progress_shown", shown)
     arguments = ["explore", "--sensor", sensor_file, "--out", tmp_path / "out", "--max-readings", 2, "--quiet"]
     assert main([str(a) for a in arguments]) == 0
     moves = [note for note in told if "moving to (" in note]

@@ -11,10 +11,9 @@ import pytest
 from probewise.arm import DryRun, LegoArm, RequestToPerson, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
-from probewise.cli._arm import warn_if_place_sd_large
-from probewise.cli._marks import _place_after_moves, bring_to_mark
-from probewise.cli._person import PersonAtBench
-from probewise.cli._sheet_check import SheetCheck, uniform_shades_at_places
+from probewise.cli._bench import warn_if_place_sd_large
+from probewise.cli._fit_geometry import bring_to_mark, place_after_moves
+from probewise.cli._record import PersonAtBench, SheetCheck, uniform_shades_at_places
 from probewise.emulator import parse_scene
 from probewise.emulator.scenes import scene_text
 from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
@@ -122,7 +121,7 @@ def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     ],
 )
 def test_an_answer_is_a_move_or_nothing(answer, moved):
-    assert _place_after_moves((1, 2, 60), answer) == moved
+    assert place_after_moves((1, 2, 60), answer) == moved
 
 
 def test_shades_are_those_that_fill_the_sensors_view():

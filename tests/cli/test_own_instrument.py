@@ -152,7 +152,7 @@ def test_what_does_not_go_with_an_instrument_of_ones_own_is_refused_and_nothing_
 def test_a_plan_is_recorded_in_the_instruments_own_unit_and_goes_on_when_it_was_cut(
     arm_file, tmp_path, capsys, monkeypatch, closed
 ):
-    monkeypatch.setattr("probewise.cli._person.prompter_for_answer", lambda arm: lambda text: "")
+    monkeypatch.setattr("probewise.cli._record.prompter_for_answer", lambda arm: lambda text: "")
     plan = tmp_path / "plan.csv"
     write_plan(
         Plan.from_arrays(

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.cli import main
-from probewise.cli._arm import open_emulated_arm_and_bench
+from probewise.cli._bench import open_emulated_arm_and_bench
 from probewise.recordings import Disc
 from probewise.world.shipped import true_world
 

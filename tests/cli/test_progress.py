@@ -11,7 +11,7 @@ import pytest
 import probewise
 from probewise import _progress
 from probewise._progress import progress_or_bar, progress_shown
-from probewise.cli._arm import prompter_for_answer
+from probewise.cli._bench import prompter_for_answer
 from probewise.progress import silent
 from probewise.recordings import read_recording
 

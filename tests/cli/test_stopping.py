@@ -14,7 +14,7 @@ from probewise._signals import ENDING, SAME_S, defer_signals
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
-from probewise.cli._explore_pictures import _remove_earlier_results
+from probewise.cli._explore import remove_earlier_results
 from probewise.cli._stopping import Stopped, raise_if_stopped, reporting_what_is_kept, stoppable
 from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
@@ -261,7 +261,7 @@ def test_a_sensor_file_without_results_beside_it_is_no_earlier_result(sensor_fil
     out = tmp_path / "out"
     out.mkdir()
     (out / "sensor.json").write_text(sensor_file.read_text())
-    _remove_earlier_results(out, ())
+    remove_earlier_results(out, ())
     assert (out / "sensor.json").exists()
 
 
@@ -270,7 +270,7 @@ def test_a_sensor_file_without_results_beside_it_is_no_earlier_result(sensor_fil
 def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, quick_frames, monkeypatch, capsys):
     import resource
 
-    monkeypatch.setattr("probewise.cli._explore_pictures.animated_gif", lambda _: bytes(5_000_000))
+    monkeypatch.setattr("probewise.cli._explore.animated_gif", lambda _: bytes(5_000_000))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
     out = tmp_path / "out"

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
-from probewise.cli._arm import open_emulated_arm_and_bench
+from probewise.cli._bench import open_emulated_arm_and_bench
 from probewise.recordings import Uniform
 from probewise.world.shipped import true_world
 

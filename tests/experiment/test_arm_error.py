@@ -10,9 +10,8 @@ from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.arm.fitting import fit_geometry
+from probewise.arm.fitting import fit_geometry, spread_mark_places
 from probewise.arm.geometry import Accuracy
-from probewise.arm.marks import spread_mark_places
 from probewise.arm.uncertainty import (
     FITTED,
     RULER_SDS,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.arm import ReadingScale, read_geometry, shipped_geometry_path
-from probewise.cli._plans import plan_for_lego_arm
+from probewise.cli._bench import plan_for_lego_arm
 from probewise.errors import ParameterError
 from probewise.recordings import paper_plan, read_recording, shipped, two_way_plan
 from probewise.world import Blob, CorrelatedNoise, World, gaussian_spot

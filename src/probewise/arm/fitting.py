@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, floats
-from probewise.arm.geometry import Accuracy, Geometry
-from probewise.arm.marks import LEAST_MARKS
+from probewise.arm.geometry import JOINTS, Accuracy, Geometry
 from probewise.arm.uncertainty import (
     FITTED,
     RULER_SDS,
@@ -23,10 +23,76 @@ from probewise.arm.uncertainty import (
     place_jacobian,
     places_at_parameters,
 )
-from probewise.errors import ParameterError, ProbewiseError, ShapeError
+from probewise.errors import ParameterError, ProbewiseError, ReachError, ShapeError
+from probewise.recordings.atomic import write_text_atomically
+from probewise.recordings.table import csv_text, number_text, read_table
+
+LEAST_MARKS = 5
+"""Least number of marks, with place and height, that determine the nine parameters of the geometry."""
+
+_COLUMNS, _ROWS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.12, 0.45, 0.75)
+_STEP_MM = 10.0
+_TURNED = tuple(f"{joint}_turned_deg" for joint in JOINTS)
+_PLACE = ("x_mm", "y_mm", "height_mm")
+_LARGEST = 1e4
 
 LEAST_P = 1e-3  # p-value below which the marks disagree
 MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # largest sds of a geometry that counts as determined by the marks
+
+
+@dataclass(frozen=True)
+class TouchedMark:
+    """A mark: angles of base, shoulder, elbow from home; x, y, height of the sensor's face (NaN: not measured)."""
+
+    turned_rad: tuple[float, float, float]
+    place_mm: tuple[float, float, float]
+
+
+def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Read marks: joint angles from home in radians, and x, y, height in mm, both (n_marks, 3).
+
+    Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty, which gives NaN.
+    """
+    table = read_table(path, wanted=(*_TURNED, *_PLACE))
+    table.require_columns(*_TURNED, *_PLACE)
+    turned = [table.column_of_numbers(name, largest=_LARGEST) for name in _TURNED]
+    place = [table.column_of_numbers(name, missing=name == "height_mm", largest=_LARGEST) for name in _PLACE]
+    return np.radians(np.stack(turned, axis=-1)), np.stack(place, axis=-1)
+
+
+def write_marks(marks: Sequence[TouchedMark], path: Path) -> None:
+    """Write marks for `read_turns_and_places`, angles in degrees and places in mm, atomically."""
+    turned = np.degrees([mark.turned_rad for mark in marks]).reshape(-1, 3).round(4)
+    place = np.array([mark.place_mm for mark in marks]).reshape(-1, 3).round(4)
+    columns = dict(zip((*_TURNED, *_PLACE), np.concatenate([turned, place], axis=1).T.tolist(), strict=True))
+    write_text_atomically(path, csv_text({name: [number_text(v) for v in cells] for name, cells in columns.items()}))
+
+
+def spread_mark_places(geometry: Geometry) -> FloatArray:
+    """Choose places spread over the arm's reach on the field, in whole steps of 10 mm.
+
+    Returns
+    -------
+    Five to eight places, shape (n_marks, 2), in mm, in the order of use.
+
+    Raises
+    ------
+    ReachError
+        If fewer than five are within reach.
+    """
+    width, height = geometry.field_mm
+    # Every second place of a grid, as on a chessboard, so that no two rows have the same base angles.
+    grid = [
+        (x * width, y * height)
+        for row, y in enumerate(_ROWS)
+        for column, x in enumerate(_COLUMNS if row % 2 == 0 else _COLUMNS[::-1])
+        if (row + column) % 2 == 0
+    ]
+    marks = np.round(np.array(grid) / _STEP_MM) * _STEP_MM
+    marks = marks[geometry.contains(marks)]
+    if len(marks) < LEAST_MARKS:
+        raise ReachError("marks", f"{len(marks)} within reach", f"{LEAST_MARKS} or more on {geometry.sentence()}")
+    return marks
 
 
 class MarksDisagreeError(ProbewiseError, ValueError):

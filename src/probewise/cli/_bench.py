@@ -1,37 +1,222 @@
-"""A simulated bench for the tasks of `arm`: a table on which the program itself lays the patterns."""
+"""The bench of a command: its arm, real or simulated, its table, its plans, and the person at it."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
+import queue
+import sys
+import threading
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from tqdm import tqdm
 
-from probewise.arm import LegoArm, OwnInstrument, Reading, ReadingScale, RequestToPerson, SimulatedArm
-from probewise.cli._arm import SCENE, ArmName, open_emulated_arm_and_bench, open_nxt_arm, open_own_instrument
-from probewise.cli._common import DEFAULT_SEED
-from probewise.emulator import Tabletop, parse_scene
+from probewise.arm import (
+    Geometry,
+    Instrument,
+    LegoArm,
+    OwnInstrument,
+    Pose,
+    Reading,
+    ReadingScale,
+    RequestToPerson,
+    SimulatedArm,
+)
+from probewise.arm.nxt import Brick, BrickMachine, Link
+from probewise.cli._arm import SCENE, ArmName
+from probewise.cli._common import (
+    DEFAULT_SEED,
+    CommandError,
+    parse_numbers,
+    print_warning,
+    write_to_terminal,
+)
+from probewise.cli._stopping import raise_if_stopped
+from probewise.emulator import (
+    EmulatedBench,
+    SensorPose,
+    Tabletop,
+    VirtualClock,
+    VirtualLine,
+    parse_scene,
+    read_geometry,
+    set_up_bench,
+    shipped_geometry_path,
+)
 from probewise.errors import ParameterError
-from probewise.recordings import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
+from probewise.recordings import (
+    Disc,
+    HalfPlane,
+    Image,
+    Instrumentation,
+    Pattern,
+    Plan,
+    Polygon,
+    Quadrant,
+    Ramp,
+    Stripes,
+    Uniform,
+    paper_plan,
+    read_plan,
+    two_way_plan,
+)
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, Pose
-    from probewise.cli._marks import MarkQuestion
-    from probewise.emulator import SensorPose
-    from probewise.recordings import Instrumentation
+    from probewise.cli._fit_geometry import MarkQuestion
     from probewise.world import Surface, World
 
-_SEEN_MM = 0.5  # least offset of the sensor from a mark that a simulated person notices
-_TOUCHES_MM = 0.5  # least gap above the block that a simulated person notices
+_WAIT_S = 0.5  # longest wait for a person between checks of signals and keep-alives of the brick
+_SEEN_MM = 0.5  # least offset of the sensor from a mark, and gap above the block, that a simulated person notices
+
+
+# Opening an arm
+
+
+def open_brick(port: str) -> Brick:
+    """Connect to the LEGO brick at a port."""
+    return Brick.open(port)
+
+
+def open_nxt_arm(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+    """Connect to the LEGO brick at a port; return its arm."""
+    return LegoArm(BrickMachine(open_brick(port), geometry), geometry, start_s=start_s)
+
+
+def open_real_arm(chosen: ArmName, geometry: Geometry | None, *, start_s: float) -> LegoArm | OwnInstrument:
+    """Open a brick's arm, or a user's instrument, whose `connect()` is called when the instrument is entered."""
+    if chosen.kind == "file":
+        return OwnInstrument.from_file(chosen.where, start_s=start_s)
+    assert geometry is not None
+    return open_nxt_arm(chosen.where, geometry, start_s=start_s)
+
+
+def open_arm_and_bench(
+    chosen: ArmName,
+    geometry: Geometry,
+    geometry_file: Path | None,
+    *,
+    sensor: Path | None = None,
+    scene: str = SCENE,
+    seed: int = DEFAULT_SEED,
+    start_s: float = 0.0,
+    n_taken: int = 0,
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
+    """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
+
+    Parameters
+    ----------
+    chosen
+        The arm, from `parse_arm`.
+    geometry, geometry_file
+        Geometry of the LEGO arm, and its file if given; with a file, the simulated arm has its reach.
+    sensor, scene, seed
+        For a simulated or emulated arm: the file of its sensor, the initial target, the seed of the noise.
+    start_s, n_taken
+        Time at the start, and number of readings of an earlier session.
+
+    Raises
+    ------
+    ParameterError
+        If the brick cannot read in the sensor's unit.
+    """
+    if chosen.is_real:
+        return open_real_arm(chosen, geometry, start_s=start_s), None
+    from probewise.experiment import scale_of
+
+    world, instrumentation = world_and_instrumentation(sensor)
+    if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
+        raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
+    scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
+    bench = SimulatedBench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
+    if chosen.is_lego:
+        return bench.open_emulated_arm(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
+    return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
+
+
+def open_emulated_arm_and_bench(
+    geometry: Geometry,
+    geometry_file: Path | None,
+    world: World,
+    surface: Surface,
+    *,
+    seed: int,
+    start_s: float = 0.0,
+) -> tuple[LegoArm, EmulatedBench]:
+    """Open the LEGO arm on an emulated brick over a simulated table; return the arm and the bench.
+
+    The clock runs as fast as possible. The emulator reads its own true geometry: `geometry_file`, or the shipped one.
+    When the arm's `with` block ends, it warns if the sensor hit the table.
+    """
+    clock = VirtualClock()
+    numbers = read_geometry(geometry_file or shipped_geometry_path())
+    bench = set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
+    brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
+
+    class TableContactReporter(LegoArm):
+        def __exit__(
+            self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        ) -> None:
+            super().__exit__(kind, error, trace)
+            lowest = bench.arm.lowest
+            if lowest.height_mm < 0:
+                print_warning(
+                    f"the emulated arm's sensor went {-lowest.height_mm:.1f} mm through the table, at "
+                    f"({lowest.x_mm:.0f}, {lowest.y_mm:.0f}) mm"
+                )
+
+    return TableContactReporter(BrickMachine(brick, geometry), geometry, clock=clock, start_s=start_s), bench
+
+
+def world_and_instrumentation(sensor: Path | None) -> tuple[World, Instrumentation | None]:
+    """Return the world and instrumentation of a sensor.json; for None the shipped recordings' world, and None."""
+    if sensor is None:
+        from probewise.world.shipped import true_world
+
+        return true_world("paper"), None
+    from probewise.calibration import read_sensor
+    from probewise.experiment import world_like
+
+    fitted = read_sensor(sensor)
+    return world_like(fitted), fitted.instrumentation
+
+
+class InstrumentWithCallbacks:
+    """An instrument that calls `moving` with the pose before each move, and `read` with each reading."""
+
+    def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
+        self._instrument, self._moving, self._read = instrument, moving, read
+        self.reachable, self.orientation_rad = instrument.reachable, instrument.orientation_rad
+        self.travel_s = instrument.travel_s
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the instrument declares of itself: `turns`, `lifts`, `read_height_mm`."""
+        return getattr(self._instrument, name)
+
+    def __enter__(self) -> Self:
+        self._instrument.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._instrument.__exit__(kind, error, trace)
+
+    def measure(self, pose: Pose) -> Reading:
+        """Call `moving`, measure, call `read`, and return the reading."""
+        self._moving(pose)
+        reading = self._instrument.measure(pose)
+        self._read(reading)
+        return reading
 
 
 class SimulatedBench:
-    """A table under a simulated or an emulated arm.
+    """A table under a simulated or an emulated arm, on which the program itself lays the patterns.
 
     Parameters
     ----------
@@ -90,103 +275,198 @@ class SimulatedBench:
         words = [
             f"{axis} {round(2 * off) / 2:g}" for axis, off in zip("xy", across, strict=True) if abs(off) > _SEEN_MM
         ]
-        if not words and gap_mm <= _TOUCHES_MM:
+        if not words and gap_mm <= _SEEN_MM:
             return "ok"
-        if gap_mm < -_TOUCHES_MM:
-            words.append(f"up {round(-2 * gap_mm) / 2 + _TOUCHES_MM:g}")
+        if gap_mm < -_SEEN_MM:
+            words.append(f"up {round(-2 * gap_mm) / 2 + _SEEN_MM:g}")
         elif not words:
-            words.append(f"down {max(min(gap_mm - _TOUCHES_MM / 2, gap_mm / 2 if gap_mm > 8 else gap_mm), 0.2):.1f}")
+            words.append(f"down {max(min(gap_mm - _SEEN_MM / 2, gap_mm / 2 if gap_mm > 8 else gap_mm), 0.2):.1f}")
         return " ".join(words)
 
-    def carry_out_request(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
+    def carry_out_request(
+        self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: RequestToPerson
+    ) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
-        if isinstance(request, RequestToPerson) and request.pattern is not None:
+        if request.pattern is not None:
             self._table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
-        if isinstance(request, RequestToPerson) and request.turned_rad is not None:
+        if request.turned_rad is not None:
             self._table.turned_rad = request.turned_rad
-
-
-def open_arm_and_bench(
-    chosen: ArmName,
-    geometry: Geometry,
-    geometry_file: Path | None,
-    *,
-    sensor: Path | None = None,
-    scene: str = SCENE,
-    seed: int = DEFAULT_SEED,
-    start_s: float = 0.0,
-    n_taken: int = 0,
-) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
-    """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
-
-    Parameters
-    ----------
-    chosen
-        The arm, from `parse_arm`.
-    geometry, geometry_file
-        Geometry of the LEGO arm, and its file if given; with a file, the simulated arm has its reach.
-    sensor, scene, seed
-        For a simulated or emulated arm: the file of its sensor, the initial target, the seed of the noise.
-    start_s, n_taken
-        Time at the start, and number of readings of an earlier session.
-
-    Raises
-    ------
-    ParameterError
-        If the brick cannot read in the sensor's unit.
-    """
-    if chosen.kind == "nxt":
-        return open_nxt_arm(chosen.where, geometry, start_s=start_s), None
-    if chosen.kind == "file":
-        return open_own_instrument(chosen.where, start_s=start_s), None
-    from probewise.experiment import scale_of
-
-    world, instrumentation = world_and_instrumentation(sensor)
-    if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
-        raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
-    scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
-    bench = SimulatedBench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
-    if chosen.is_lego:
-        return bench.open_emulated_arm(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
-    return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
-
-
-def world_and_instrumentation(sensor: Path | None) -> tuple[World, Instrumentation | None]:
-    """Return the world and instrumentation of a sensor.json; for None the shipped recordings' world, and None."""
-    if sensor is None:
-        from probewise.world.shipped import true_world
-
-        return true_world("paper"), None
-    from probewise.calibration import read_sensor
-    from probewise.experiment import world_like
-
-    found = read_sensor(sensor)
-    return world_like(found), found.instrumentation
 
 
 def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
     """Return a pattern shifted by `by_mm`; raise ParameterError for a ramp, which cannot be shifted."""
-    x_mm, y_mm = by_mm
+
+    def moved(place_mm: tuple[float, float]) -> tuple[float, float]:
+        return place_mm[0] + by_mm[0], place_mm[1] + by_mm[1]
+
+    def along_mm(normal_rad: float) -> float:
+        return by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad)
+
     match pattern:
         case Uniform():
             return pattern
         case HalfPlane():
-            return replace(pattern, offset_mm=pattern.offset_mm + _shift_along_normal_mm(pattern.normal_rad, by_mm))
+            return dataclasses.replace(pattern, offset_mm=pattern.offset_mm + along_mm(pattern.normal_rad))
         case Quadrant():
-            return replace(pattern, corner_mm=(pattern.corner_mm[0] + x_mm, pattern.corner_mm[1] + y_mm))
+            return dataclasses.replace(pattern, corner_mm=moved(pattern.corner_mm))
         case Disc():
-            return replace(pattern, center_mm=(pattern.center_mm[0] + x_mm, pattern.center_mm[1] + y_mm))
+            return dataclasses.replace(pattern, center_mm=moved(pattern.center_mm))
         case Polygon():
-            return replace(pattern, vertices_mm=tuple((x + x_mm, y + y_mm) for x, y in pattern.vertices_mm))
+            return dataclasses.replace(pattern, vertices_mm=tuple(map(moved, pattern.vertices_mm)))
         case Stripes():
-            return replace(pattern, phase_mm=pattern.phase_mm + _shift_along_normal_mm(pattern.normal_rad, by_mm))
+            return dataclasses.replace(pattern, phase_mm=pattern.phase_mm + along_mm(pattern.normal_rad))
         case Image():
-            return replace(pattern, origin_mm=(pattern.origin_mm[0] + x_mm, pattern.origin_mm[1] + y_mm))
+            return dataclasses.replace(pattern, origin_mm=moved(pattern.origin_mm))
         case Ramp():
             if by_mm != (0.0, 0.0):
                 raise ParameterError("--origin-mm", by_mm, "0,0 with a ramp, which is given in field coordinates")
             return pattern
 
 
-def _shift_along_normal_mm(normal_rad: float, by_mm: tuple[float, float]) -> float:
-    return by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad)
+# Adapting a plan to an arm: unit, range and step of its readings, and the columns that can be commanded
+
+
+def read_or_shipped_plan(text: str) -> Plan:
+    """Return the shipped plan "paper" or "two_way", or read a plan from the file of that name."""
+    return paper_plan() if text == "paper" else two_way_plan() if text == "two_way" else read_plan(text)
+
+
+def plan_for_own_instrument(
+    plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
+) -> Plan:
+    """Return the plan for a user's instrument: a given unit, range ("LOW,HIGH") or step replaces the plan's own.
+
+    A new unit drops the plan's range, step and sensor. Measured covariates are left out.
+    """
+    declared: dict[str, object] = {}
+    if unit is not None:  # the values declared in the plan have another unit
+        declared = {"unit": unit, "min": None, "max": None, "step": None, "sensor": ""}
+    if range_ is not None:
+        declared["min"], declared["max"] = _parse_declared("--range", range_, 2, "LOW,HIGH such as 0,1023")
+    if step is not None:
+        (declared["step"],) = _parse_declared("--step", step, 1, "a number such as 1")
+    return without_measured_covariates(plan, dataclasses.replace(plan.instrumentation, **declared))  # type: ignore[arg-type]
+
+
+def _parse_declared(option: str, text: str, n: int, allowed: str) -> tuple[float, ...]:
+    numbers = parse_numbers(text)
+    if len(numbers) != n or not all(map(math.isfinite, numbers)):
+        raise ParameterError(option, text, allowed)
+    return numbers
+
+
+def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
+    """Return the plan for the LEGO arm: in LEGO units, 1 to 100, at its reading height; no measured covariates."""
+    instrumentation = dataclasses.replace(
+        plan.instrumentation,
+        unit="LEGO",
+        min=1.0,
+        max=100.0,
+        step=1.0 if geometry.whole_percent else None,
+        sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",
+        height_mm=geometry.read_height_mm,
+    )
+    return without_measured_covariates(plan, instrumentation)
+
+
+def without_measured_covariates(plan: Plan, instrumentation: Instrumentation) -> Plan:
+    """Return the plan by an instrumentation, with the covariates that can be commanded: controls, LED and height."""
+    plan = dataclasses.replace(plan, instrumentation=instrumentation)
+    can = {*plan.instrumentation.controls, "led", "height_mm"}
+    return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
+
+
+# The person at the bench
+
+
+def prompter(arm: Instrument) -> Callable[[str], None]:
+    """Return a function that prompts a person and waits for Enter, while keeping the arm awake."""
+    answer_to = prompter_for_answer(arm)
+
+    def ask(text: str) -> None:
+        answer_to(f"{text[0].upper()}{text[1:]}, then press Enter: ")
+
+    return ask
+
+
+def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
+    """Return a function that asks a person and returns the line typed, while keeping the arm awake.
+
+    It raises CommandError if standard input has ended.
+    """
+    keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
+
+    def ask(text: str) -> str:
+        raise_if_stopped()  # an arm may have held the stop back until its reading was kept
+        answers: queue.Queue[str] = queue.Queue()
+        with tqdm.external_write_mode(file=sys.stderr):  # a progress bar would overwrite the question
+            write_to_terminal(sys.stderr, text)
+            # Reading a line cannot be interrupted, so it runs in a daemon thread.
+            threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
+            while True:
+                try:
+                    answer = answers.get(timeout=_WAIT_S)
+                except queue.Empty:
+                    keep_awake()
+                else:
+                    break
+        if not answer:
+            raise CommandError("nobody is there to press Enter: standard input has ended; run it in a terminal")
+        return answer.strip()
+
+    return ask
+
+
+def _read_line() -> str:
+    """Read a line of standard input; "" if it has ended or cannot be read."""
+    try:
+        return "" if sys.stdin is None else sys.stdin.readline()
+    except (OSError, ValueError):
+        return ""
+
+
+def enable_confirmed_lowering(arm: LegoArm) -> None:
+    """Make the arm ask a person, at its first lowering, to confirm each step."""
+    ask = prompter(arm)
+
+    def confirm(height_mm: float) -> None:
+        ask(f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further")
+
+    arm.first_down = confirm
+
+
+def warn_and_confirm_lowering(chosen: ArmName, instrument: Instrument, geometry: Geometry | None) -> None:
+    """Warn if the sensor may hit the table; let a person who can watch confirm each step of the first lowering."""
+    if geometry is None or not chosen.may_differ_from_geometry or not isinstance(instrument, LegoArm):
+        return
+    warn_if_clearance_doubtful(geometry)
+    if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
+        enable_confirmed_lowering(instrument)
+
+
+def warn_if_clearance_doubtful(geometry: Geometry) -> None:
+    """Warn if the sensor may touch the table: if its height may be wrong by the reading height or more."""
+    doubt_mm = geometry.max_height_error_mm
+    if doubt_mm < geometry.read_height_mm:
+        return
+    known = (
+        "home angles of both links that are 2 degrees off cost up to"
+        if geometry.accuracy is None
+        else "by its [accuracy] the arm may hang lower by"
+    )
+    print_warning(
+        f"the sensor may touch the table: it reads {geometry.read_height_mm:g} mm above it, and {known} "
+        f"{doubt_mm:.0f} mm; fit the geometry (probewise arm fit-geometry), or look how it comes down "
+        "(probewise arm jog X,Y --down --steps)"
+    )
+
+
+def warn_if_place_sd_large(geometry: Geometry, stop_sd_mm: float) -> None:
+    """Warn if the sd of the arm's position, as fitted to marks, is no smaller than the sd at which a run stops."""
+    accuracy = geometry.accuracy
+    if accuracy is None or accuracy.place_sd_mm < stop_sd_mm:
+        return
+    print_warning(
+        f"lengths will not be known to {stop_sd_mm:g} mm: the arm knows its place to {accuracy.place_sd_mm:.1f} mm, "
+        "which no reading lowers; `probewise arm fit-geometry` does, with more marks or with marks met more closely"
+    )

@@ -16,8 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
-from probewise._kinds import did_you_mean
-from probewise.errors import ProbewiseError, printable, shortened, shown
+from probewise.errors import ProbewiseError, did_you_mean, printable, shortened, shown
 
 DEFAULT_SEED = 2013  # year of the paper; printed with every run
 MOST = 100_000
@@ -51,17 +50,15 @@ class OneLineParser(argparse.ArgumentParser):
     ) -> tuple[argparse.Namespace, list[str]]:
         words = sys.argv[1:] if args is None else list(args)
         if self._subparsers is None:  # otherwise words may be options of a verb
+            options = self._option_string_actions
             for word in itertools.takewhile(lambda word: word != "--", words):
-                self._require_known_option(word.partition("=")[0])
+                name = word.partition("=")[0]
+                if name.startswith("--") and not any(option.startswith(name) for option in options):
+                    self.error(f"no option {name}{did_you_mean(name, options)}")
         parsed, surplus = super().parse_known_args(words, namespace)
         if surplus and self._subparsers is None:
             self.error(f"unrecognized arguments: {' '.join(surplus)}")
         return parsed, surplus
-
-    def _require_known_option(self, name: str) -> None:
-        options = self._option_string_actions
-        if name.startswith("--") and not any(option.startswith(name) for option in options):
-            self.error(f"no option {name}{did_you_mean(name, options)}")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
@@ -115,7 +112,17 @@ def parse_path(text: str) -> Path:
     return Path(text)
 
 
-def _parse_whole_number(text: str, *, least: int, most: int, allowed: str) -> int:
+def parse_positive_int(text: str, *, most: int = MOST) -> int:
+    """Parse an integer from 1 to `most`, for argparse."""
+    return _parse_whole_number(text, 1, most, f"from 1 to {most:,}")
+
+
+def parse_seed(text: str) -> int:
+    """Parse an integer of 0 or more, for argparse."""
+    return _parse_whole_number(text, 0, 2**128 - 1, "of 0 or more, less than 2^128")
+
+
+def _parse_whole_number(text: str, least: int, most: int, allowed: str) -> int:
     try:
         value = int(text)
     except ValueError:
@@ -125,29 +132,24 @@ def _parse_whole_number(text: str, *, least: int, most: int, allowed: str) -> in
     return value
 
 
-def parse_positive_int(text: str, *, most: int = MOST) -> int:
-    """Parse an integer from 1 to `most`, for argparse."""
-    return _parse_whole_number(text, least=1, most=most, allowed=f"from 1 to {most:,}")
-
-
-def parse_seed(text: str) -> int:
-    """Parse an integer of 0 or more, for argparse."""
-    return _parse_whole_number(text, least=0, most=2**128 - 1, allowed="of 0 or more, less than 2^128")
-
-
 def positive_number_parser(unit: str) -> Callable[[str], float]:
     """Return a parser of finite numbers above 0, for argparse; its message names the unit."""
 
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not 0 < value < math.inf:
+    def parse(text: str) -> float:
+        numbers = parse_numbers(text)
+        if len(numbers) != 1 or not 0 < numbers[0] < math.inf:
             raise argparse.ArgumentTypeError(f"{shown(text)} is not a number of {unit} greater than 0")
-        return value
+        return numbers[0]
 
-    return read
+    return parse
+
+
+def parse_numbers(text: str) -> tuple[float, ...]:
+    """Parse "A,B,..."; () if a part is no number."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
 
 
 def write_to_terminal(stream: TextIO, text: str) -> None:

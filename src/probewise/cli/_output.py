@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from probewise._signals import defer_signals
+from probewise.cli._common import print_result
 from probewise.cli._stopping import raise_if_stopped, reporting_what_is_kept
 from probewise.errors import FileError, ParameterError, ProbewiseError, message_of
 from probewise.progress import Progress, silent
@@ -111,6 +112,32 @@ class Drawings:
                 if drawn[name]:
                     stage.write(name, drawn[name])
 
+    def write_results(
+        self,
+        files: Callable[[StagedFiles], None],
+        drawers: Mapping[str, Callable[[], bytes]],
+        page: Callable[[Mapping[str, bytes]], str],
+        *,
+        inputs: Sequence[Path] = (),
+        outdated: Sequence[str] = (),
+        progress: Progress = silent,
+    ) -> list[str]:
+        """Write the files of a run, all or none, by a function of the `StagedFiles`; then figures and page.
+
+        Files of an earlier run, of the patterns `outdated`, are removed. Return lines on inputs that got another name.
+        """
+        with staged_output(self.out, inputs=inputs, outdated=(*outdated, *drawers, PAGE)) as stage:
+            files(stage)
+        self.write_report(drawers, page, inputs=inputs, progress=progress)
+        return [f"note: {note}" for note in stage.notes_on_renamed_inputs]
+
+    def finish(self, *lines: str, quiet: bool) -> int:
+        """Print lines unless `quiet`; return the exit status, 0. Raises NotDrawnError if something was not drawn."""
+        for line in lines:
+            print_result(line, quiet=quiet)
+        self.raise_if_any_failed()
+        return 0
+
     def raise_if_any_failed(self) -> None:
         """Raise NotDrawnError, in one line, if something could not be drawn."""
         if self._failed:
@@ -161,6 +188,11 @@ def tables_and_descriptions(tables: Sequence[Path]) -> list[Path]:
     """Return each file of a table followed by its description, the JSON beside it."""
     named = [table for table in tables if table.name]  # not "." and "/"
     return [path for table in named for path in (table, table.with_suffix(".json"))]
+
+
+def inputs_and_filled_in_plan(inputs: Sequence[Path], plan: Path, column: str = "reading") -> list[Path]:
+    """List files that results must not replace: inputs, and an earlier advised plan with readings in a column."""
+    return tables_and_descriptions([*inputs, *([plan] if holds_readings(plan, column) else [])])
 
 
 def holds_readings(table: Path, column: str) -> bool:

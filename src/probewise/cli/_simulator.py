@@ -1,4 +1,4 @@
-"""Options and readers shared by the verbs that take a user's simulator."""
+"""The option --simulator, and tables of readings for a user's simulator."""
 
 from __future__ import annotations
 
@@ -25,13 +25,10 @@ def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead 
     )
 
 
-def refuse_sensor_options(arguments: argparse.Namespace, *names: str) -> None:
-    """Raise ParameterError if one of these options, which apply only to light sensors, is given."""
-    for name in names:
-        value = getattr(arguments, name)
-        if value is not None and value is not False:
-            option = f"--{name.replace('_', '-')}"
-            raise ParameterError(option, str(value), "none with --simulator, which replaces it")
+def refuse_sensor(sensor: Path | None) -> None:
+    """Raise ParameterError if --sensor is given beside --simulator."""
+    if sensor is not None:
+        raise ParameterError("--sensor", str(sensor), "none with --simulator, which replaces it")
 
 
 def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:

@@ -3,16 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-from probewise.cli._arm import ARMS, add_geometry, read_or_shipped_geometry
-from probewise.cli._arm_tasks.check import report_geometry_and_reach
-from probewise.cli._arm_tasks.fit_geometry import fit_geometry_to_marks
-from probewise.cli._arm_tasks.heights import compare_heights_by_light
-from probewise.cli._arm_tasks.move import bring_home, jog_joint_or_sensor
-from probewise.cli._arm_tasks.read import print_light_and_battery, scan_line
-from probewise.cli._arm_tasks.record import record_plan
+from probewise.cli._arm import ARMS, SHIPPED, add_geometry, read_or_shipped_geometry
 from probewise.cli._common import (
     DEFAULT_SEED,
     OneLineParser,
@@ -20,18 +12,10 @@ from probewise.cli._common import (
     add_count_option,
     add_path,
     add_quiet,
-    parse_path,
-    parse_positive_int,
     parse_seed,
     positive_number_parser,
 )
-from probewise.cli._plans import SHIPPED
 
-if TYPE_CHECKING:
-    from probewise.arm import Geometry
-
-BLOCK_MM = 32.0
-TOUCH_MM = 1.0
 _ALL_ARMS = f"where the readings come from: {ARMS}"
 _LEGO_ARMS = (
     "the LEGO arm: nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or emulator:TRUE.toml, in software, built "
@@ -45,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     check = _add_task(tasks, "check", "Check a geometry file, and a brick; report and draw the arm's reach.")
     _add_arm(check)
-    check.add_argument("--out", type=parse_path, metavar="REACH.png", help="file of the drawing (default: none)")
-    check.add_argument("--drawing", type=parse_path, metavar="ARM.png", help="file of a drawing with the arm's lengths")
+    add_path(check, "--out", "REACH.png", "file of the drawing (default: none)")
+    add_path(check, "--drawing", "ARM.png", "file of a drawing with the arm's lengths")
 
     jog = _add_task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
     jog.add_argument(
@@ -63,27 +47,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         moves=True,
         arms=_LEGO_ARMS,
     )
-    fit.add_argument("--out", type=parse_path, required=True, metavar="ARM.toml", help="where the fitted geometry goes")
+    add_path(fit, "--out", "ARM.toml", "where the fitted geometry goes", required=True)
     add_path(
         fit,
         "--marks",
         "MARKS.csv",
         "where marks are kept (default: beside --out); without --arm they are read from there and only fitted",
     )
-    fit.add_argument(
-        "--block-mm",
-        type=positive_number_parser("mm"),
-        default=BLOCK_MM,
-        metavar="MM",
-        help=f"height of the block on a mark (default {BLOCK_MM:g}: three LEGO bricks and a smooth tile)",
-    )
-    fit.add_argument(
-        "--touch-mm",
-        type=positive_number_parser("mm"),
-        default=TOUCH_MM,
-        metavar="MM",
-        help=f"accuracy of a mark, sd of place and height (default {TOUCH_MM:g})",
-    )
+    for name, default, about in (
+        ("--block-mm", 32.0, "height of the block on a mark (default 32: three LEGO bricks and a smooth tile)"),
+        ("--touch-mm", 1.0, "accuracy of a mark, sd of place and height (default 1)"),
+    ):
+        fit.add_argument(name, type=positive_number_parser("mm"), default=default, metavar="MM", help=about)
     fit.add_argument("--resume", action="store_true", help="continue after the marks in MARKS.csv")
 
     home = _add_task(
@@ -115,9 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     scan.add_argument("start", metavar="X,Y", help="first place of the line, mm")
     scan.add_argument("end", metavar="X,Y", help="last place of the line, mm")
-    scan.add_argument(
-        "--readings", type=parse_positive_int, default=21, metavar="N", help="number of readings (default 21)"
-    )
+    add_count_option(scan, "--readings", "number of readings (default 21)", default=21)
 
     record = _add_task(
         tasks,
@@ -131,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PLAN.csv",
         help=f"plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship",
     )
-    record.add_argument("--out", type=parse_path, required=True, metavar="REC.csv", help="where the recording goes")
+    add_path(record, "--out", "REC.csv", "where the recording goes", required=True)
     record.add_argument(
         "--origin-mm",
         metavar="X,Y",
@@ -147,7 +120,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         simulated.add_argument("--seed", type=parse_seed, metavar="N", help=f"seed of noise (default {DEFAULT_SEED})")
         if scene:
             simulated.add_argument("--scene", metavar="X,Y,R", help="target on the field, as for emulate-nxt")
-    record.set_defaults(scene=None)
     record.add_argument("--resume", action="store_true", help="continue after the readings in REC.csv")
 
 
@@ -171,27 +143,26 @@ def _add_task(
 
 def _add_arm(parser: argparse.ArgumentParser, arms: str | None = None) -> None:
     """Add --arm; `arms` is its help, by default that of a real brick."""
-    if arms is None:
-        parser.add_argument("--arm", metavar="nxt:PORT", help="the brick, such as nxt:/dev/rfcomm0 or nxt:COM5")
-    else:
-        parser.add_argument("--arm", metavar="ARM", help=arms)
+    metavar, usual = "nxt:PORT" if arms is None else "ARM", "the brick, such as nxt:/dev/rfcomm0 or nxt:COM5"
+    parser.add_argument("--arm", metavar=metavar, help=arms or usual)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run one task of `probewise arm`; return the exit status."""
-    TASKS[arguments.task](arguments, read_or_shipped_geometry(arguments))
+    from probewise.cli import _arm_tasks, _fit_geometry, _record
+
+    tasks = {
+        "check": _arm_tasks.report_geometry_and_reach,
+        "jog": _arm_tasks.jog_joint_or_sensor,
+        "fit-geometry": _fit_geometry.fit_geometry_to_marks,
+        "home": _arm_tasks.bring_home,
+        "heights": _arm_tasks.compare_heights_by_light,
+        "read": _arm_tasks.print_light_and_battery,
+        "scan": _arm_tasks.scan_line,
+        "record": _record.record_plan,
+    }
+    tasks[arguments.task](arguments, read_or_shipped_geometry(arguments))
     return 0
 
-
-TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
-    "check": report_geometry_and_reach,
-    "jog": jog_joint_or_sensor,
-    "fit-geometry": fit_geometry_to_marks,
-    "home": bring_home,
-    "heights": compare_heights_by_light,
-    "read": print_light_and_battery,
-    "scan": scan_line,
-    "record": record_plan,
-}
 
 VERB = Verb("arm", "Check, move and read the LEGO arm; record a plan with it or another arm.", add_arguments, run)

@@ -9,26 +9,19 @@ from probewise.cli._common import (
     Verb,
     add_count_option,
     add_out_directory,
+    add_path,
     add_seed_and_quiet,
-    parse_path,
     parse_positive_int,
-    print_result,
 )
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import (
-    PAGE,
-    Drawings,
-    checked_output_directory,
-    staged_output,
-    tables_and_descriptions,
-)
+from probewise.cli._output import Drawings, checked_output_directory, tables_and_descriptions
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise calibrate`."""
-    parser.add_argument("recording", type=parse_path, metavar="REC.csv", help="recording, its JSON beside it")
+    add_path(parser, "recording", "REC.csv", "recording, its JSON beside it")
     add_out_directory(parser)
     parser.add_argument(
         "--orders",
@@ -44,23 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"live points where a number of Gaussians is searched in full (default {N_LIVE})",
         default=N_LIVE,
     )
-    way = parser.add_mutually_exclusive_group()
-    way.add_argument(
-        "--full",
-        dest="method",
-        action="store_const",
-        const="full",
-        default=CALIBRATION,
-        help="search the whole prior of every number of Gaussians by nested sampling, and refine each evidence by "
-        "importance sampling; the same as --method full",
-    )
-    way.add_argument(
+    parser.add_argument(
         "--method",
-        choices=("quick", "full", "paper", "refined"),
+        choices=("quick", "full", "paper"),
         default=CALIBRATION,
         help="quick (default): sequential Monte Carlo from the peaks of the likelihood, vouched for by one search of "
-        "the prior; full: see --full (refined is its former name); paper: uniform priors, evidence by nested sampling "
-        "alone",
+        "the prior; full: the whole prior of every number of Gaussians is searched by nested sampling, and each "
+        "evidence refined by importance sampling; paper: uniform priors, evidence by nested sampling alone",
     )
     parser.add_argument(
         "--nested-stop",
@@ -84,50 +67,44 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.nested_stop is not None and arguments.method != "paper":
         raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
     refuse_journal(arguments.recording)
-    out = checked_output_directory(arguments.out)
+    drawings = Drawings(checked_output_directory(arguments.out))
+    orders = tuple(sorted(set(arguments.orders)))
     with progress_shown(quiet=arguments.quiet) as progress:
         recording = read_recording(arguments.recording, progress=progress)
-        orders = tuple(sorted(set(arguments.orders)))
-        n_live = _checked_n_live(arguments.live, orders)
-        rng = np.random.default_rng(arguments.seed)
+        _require_enough_live_points(arguments.live, orders)
         result = verbs.calibrate(
             recording,
             orders=orders,
-            n_live=n_live,
+            n_live=arguments.live,
             method=arguments.method,
             nested_stop=arguments.nested_stop,
-            rng=rng,
+            rng=np.random.default_rng(arguments.seed),
             progress=progress,
         )
         prediction = predict(result.sensor, recording, progress=progress)
-        figures, read = (
+        notes = drawings.write_results(
+            lambda stage: write_sensor(result.sensor, stage / "sensor.json"),
             report.figure_drawers(result, recording, prediction),
-            tables_and_descriptions([arguments.recording]),
-        )
-        with staged_output(out, inputs=read, outdated=(*figures, PAGE)) as stage:
-            write_sensor(result.sensor, stage / "sensor.json")
-        drawings = Drawings(out)
-        drawings.write_report(
-            figures,
             lambda drawn: report.page_html(result, recording, prediction, drawn, seed=arguments.seed),
-            inputs=read,
+            inputs=tables_and_descriptions([arguments.recording]),
             progress=progress,
         )
-    for note in (*recording.notes, *stage.notes_on_renamed_inputs):
-        print_result(f"note: {note}", quiet=arguments.quiet)
-    print_result(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
-    drawings.raise_if_any_failed()
-    return 0
+    return drawings.finish(
+        *(f"note: {note}" for note in recording.notes),
+        *notes,
+        f"{result.sensor.summary()}\nseed {arguments.seed}; written to {drawings.out}",
+        quiet=arguments.quiet,
+    )
 
 
-def _checked_n_live(n_live: int, orders: Sequence[int]) -> int:
-    """Return `n_live`; raise ParameterError if it is too small for the largest number of Gaussians."""
+def _require_enough_live_points(n_live: int, orders: Sequence[int]) -> None:
+    """Raise ParameterError if these are too few live points for the largest number of Gaussians."""
     from probewise.nested import LIVE_PER_PARAM, least_live
 
     n_params = 6 * max(orders) + 2
     least, most = least_live(n_params), (n_live // LIVE_PER_PARAM - 2) // 6
     if n_live >= least:
-        return n_live
+        return
     if max(orders) <= max(ORDERS):
         allowed = f"{least} or more for the {n_params} parameters of --orders {max(orders)}"
         raise ParameterError("--live", n_live, allowed)

@@ -118,7 +118,7 @@ def _run_demo(
         write_sensor(sensor, stage / "sensor.json")
         (stage / _DIAGNOSIS).mkdir()
         *_, rng = diagnose_verb.generators_of_diagnosis(seed)
-        diagnose_verb.write_results(diagnosis, StagedFiles(stage / _DIAGNOSIS), rng=rng)
+        diagnose_verb.write_files(diagnosis, StagedFiles(stage / _DIAGNOSIS), rng=rng)
         answers = report.main_findings_by_key(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
 

@@ -1,25 +1,16 @@
-"""`probewise diagnose`: which physics the sensor model leaves out."""
+"""`probewise diagnose`: which physics a sensor model, or a user's simulator, leaves out."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, cast
 
-from probewise.cli._common import Verb, add_out_directory, add_path, add_seed_and_quiet, parse_path, print_result
-from probewise.cli._diagnose_system import diagnose_simulator
+from probewise.cli._common import Verb, add_out_directory, add_path, add_seed_and_quiet, parse_path
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
-from probewise.cli._output import (
-    PAGE,
-    Drawings,
-    StagedFiles,
-    checked_output_directory,
-    holds_readings,
-    staged_output,
-    tables_and_descriptions,
-)
-from probewise.cli._simulator import add_simulator
+from probewise.cli._output import Drawings, StagedFiles, checked_output_directory, inputs_and_filled_in_plan
+from probewise.cli._simulator import add_simulator, read_joined_table, refuse_sensor
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -30,8 +21,10 @@ if TYPE_CHECKING:
     from probewise.progress import Progress
     from probewise.recordings import Recording
     from probewise.scene import Shape
+    from probewise.systems import RunTable
 
 OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
+_OF_ONE_RUN_OF_SIMULATOR = ("witness_*.svg", "gain.svg", "next.csv")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,15 +57,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
-    if arguments.simulator is not None:
-        return diagnose_simulator(arguments)
-    from functools import partial
-
     from probewise._progress import progress_shown
-    from probewise.diagnosis import SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
+
+    if arguments.simulator is not None:
+        return _diagnose_simulator(arguments)
+    from probewise.diagnosis import (
+        NEXT_PLAN,
+        SensorAndShape,
+        audit_plan_of_diagnosis,
+        diagnose,
+        join,
+        weigh_thoroughly,
+    )
     from probewise.report import diagnosis as report
 
-    out = checked_output_directory(arguments.out)
+    drawings = Drawings(checked_output_directory(arguments.out))
     with progress_shown(quiet=arguments.quiet) as progress:
         recordings, sensor, shape = _read_inputs(arguments, progress=progress)
         diagnosis_rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
@@ -93,21 +92,64 @@ def run(arguments: argparse.Namespace) -> int:
         if null is not None:
             diagnosis = null.with_shape_in_next_plan(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
-        read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
-        spared, figures, drawings = files_not_to_replace(read, out), report.figure_drawers(diagnosis), Drawings(out)
-        with staged_output(out, inputs=spared, outdated=(*OF_ONE_RUN, *figures, PAGE)) as stage:
-            write_results(diagnosis, stage, rng=files_rng)
 
         def page(drawn: Mapping[str, bytes]) -> str:
             audit = None if null is not None else audit_plan_of_diagnosis(diagnosis, sensor=sensor)
             return report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
 
-        drawings.write_report(figures, page, inputs=spared, progress=progress)
-    for note in (*joined.notes, *stage.notes_on_renamed_inputs):
-        print_result(f"note: {note}", quiet=arguments.quiet)
-    print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
-    drawings.raise_if_any_failed()
-    return 0
+        read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
+        renamed = drawings.write_results(
+            partial(write_files, diagnosis, rng=files_rng),
+            report.figure_drawers(diagnosis),
+            page,
+            inputs=inputs_and_filled_in_plan(read, drawings.out / NEXT_PLAN),
+            outdated=OF_ONE_RUN,
+            progress=progress,
+        )
+    return _finish(arguments, drawings, diagnosis, [f"note: {note}" for note in joined.notes] + renamed)
+
+
+def _diagnose_simulator(arguments: argparse.Namespace) -> int:
+    """Diagnose a user's simulator; write diagnosis.json, both models, next.csv and report; return the exit status."""
+    import numpy as np
+
+    from probewise._progress import progress_shown
+    from probewise.diagnosis import diagnose_system, notes_on_calls, weigh_thoroughly
+    from probewise.report import diagnosis as report
+    from probewise.systems import read_simulator
+
+    refuse_sensor(arguments.sensor)
+    drawings = Drawings(checked_output_directory(arguments.out))
+    simulator = read_simulator(arguments.simulator)
+    table, notes = read_joined_table(simulator, arguments.recordings)
+    diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
+    source = ", ".join(path.name for path in arguments.recordings)
+    with progress_shown(quiet=arguments.quiet) as progress:
+        diagnosis = diagnose_system(
+            simulator,
+            table,
+            source=source,
+            notes=notes,
+            thorough=partial(weigh_thoroughly, rng=nested_rng, progress=progress) if arguments.thorough else None,
+            rng=diagnosis_rng,
+            progress=progress,
+        )
+        read = [*arguments.recordings, arguments.simulator]
+        renamed = drawings.write_results(
+            partial(_write_files_of_simulator, diagnosis),
+            report.figure_drawers(diagnosis),
+            lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed),
+            inputs=inputs_and_filled_in_plan(read, drawings.out / "next.csv", simulator.reading),
+            outdated=_OF_ONE_RUN_OF_SIMULATOR,
+            progress=progress,
+        )
+    said = (*diagnosis.recording.notes, *notes_on_calls(diagnosis))
+    return _finish(arguments, drawings, diagnosis, [f"note: {note}" for note in said] + renamed)
+
+
+def _finish(arguments: argparse.Namespace, drawings: Drawings, diagnosis: Diagnosis, notes: Sequence[str]) -> int:
+    summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
+    return drawings.finish(*notes, summary, quiet=arguments.quiet)
 
 
 def _read_inputs(
@@ -123,13 +165,12 @@ def _read_inputs(
     journals = [path for path in arguments.recordings if is_journal(path)]
     if arguments.sensor is None and journals:
         arguments.sensor = find_journal_sensor_file(journals[0])
-    if arguments.sensor is None:
-        return [read_recording(path, progress=progress) for path in arguments.recordings], None, None
-    if len(journals) > 1:
+    if arguments.sensor is not None and len(journals) > 1:
         raise ParameterError("journals", len(journals), "one at a time: each run has its own unknown shape")
-    sensor, recordings, shape = read_sensor(arguments.sensor), [], None
+    sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
+    recordings, shape = [], None
     for path in arguments.recordings:
-        if path in journals:
+        if sensor is not None and path in journals:
             recording, shape = journal_recording_and_shape(path, sensor)
         else:
             recording = read_recording(path, progress=progress)
@@ -144,15 +185,7 @@ def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
     return np.random.default_rng(seed).spawn(3)
 
 
-def files_not_to_replace(read: Sequence[Path], out: Path) -> list[Path]:
-    """List files that results must not replace: inputs, and an earlier next plan with readings filled in."""
-    from probewise.diagnosis import NEXT_PLAN
-
-    filled_in = out / NEXT_PLAN
-    return tables_and_descriptions([*read, *([filled_in] if holds_readings(filled_in, "reading") else [])])
-
-
-def write_results(diagnosis: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
+def write_files(diagnosis: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
     """Write diagnosis.json, both sensor models and the next plan."""
     from probewise.calibration import write_sensor
     from probewise.diagnosis import NEXT_PLAN, diagnosis_json
@@ -163,6 +196,19 @@ def write_results(diagnosis: Diagnosis, stage: StagedFiles, *, rng: np.random.Ge
     write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), stage / "calibrated.json")
     if diagnosis.next_measurement is not None:
         write_plan(diagnosis.next_measurement.plan, stage / NEXT_PLAN)
+
+
+def _write_files_of_simulator(diagnosis: Diagnosis, stage: StagedFiles) -> None:
+    """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
+    from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
+    from probewise.systems import run_table_csv, write_fitted_system
+
+    stage.write_json("diagnosis.json", diagnosis_json(diagnosis))
+    write_fitted_system(repaired_of(diagnosis), stage / "repaired.json")
+    write_fitted_system(calibrated_of(diagnosis), stage / "calibrated.json")
+    if diagnosis.next_measurement is not None:
+        rows = cast("RunTable", diagnosis.next_measurement.plan)
+        stage.write(diagnosis.apparatus.words.next_plan, run_table_csv(rows))
 
 
 VERB = Verb(

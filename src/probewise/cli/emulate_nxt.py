@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import SCENE
-from probewise.cli._common import Verb, add_path, add_seed_and_quiet, parse_path, print_result
+from probewise.cli._arm import SCENE, add_geometry
+from probewise.cli._common import Verb, add_path, add_seed_and_quiet, print_result
 from probewise.cli._output import checked_output_file
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError, ParameterError
@@ -37,12 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "S.json",
         "the light sensor, as calibrate writes it (default: that of the shipped recordings)",
     )
-    add_path(
-        parser,
-        "--geometry",
-        "ARM.toml",
-        "the arm as built: lengths, gears, ports, limits (default: the file that ships)",
-    )
+    add_geometry(parser)
     parser.add_argument(
         "--fault",
         action="append",
@@ -61,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)",
     )
     add_path(parser, "--link", "PATH", "a symbolic link to keep on the device, also after a disconnection")
-    parser.add_argument("--log", type=parse_path, metavar="FILE", help="write every telegram and fault to a file")
+    add_path(parser, "--log", "FILE", "write every telegram and fault to a file")
     add_seed_and_quiet(parser)
 
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from probewise.cli._common import (
-    CommandError,
-    Verb,
-    add_out_directory,
-    add_seed_and_quiet,
-    parse_path,
-    print_result,
-)
-from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
+from probewise.cli._common import CommandError, Verb, add_out_directory, add_seed_and_quiet, parse_path
+from probewise.cli._output import Drawings, checked_output_directory
 from probewise.cli._simulator import add_simulator, read_joined_table
+
+if TYPE_CHECKING:
+    from probewise.cli._output import StagedFiles
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,26 +34,32 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.simulator is None:
         raise CommandError("--simulator FILE.py is missing; to fit a light sensor, use probewise calibrate")
-    out = checked_output_directory(arguments.out)
+    drawings = Drawings(checked_output_directory(arguments.out))
     simulator = read_simulator(arguments.simulator)
     table, notes = read_joined_table(simulator, arguments.tables)
     source = ", ".join(path.name for path in arguments.tables)
     with progress_shown(quiet=arguments.quiet) as progress:
         rng = np.random.default_rng(arguments.seed)
         fitted = fit_simulator(simulator, table, source=source, notes=notes, rng=rng, progress=progress)
-        figures, read, drawings = report.figure_drawers(fitted), [*arguments.tables, arguments.simulator], Drawings(out)
-        with staged_output(out, inputs=read, outdated=(*figures, PAGE)) as stage:
+
+        def write_files(stage: StagedFiles) -> None:
             stage.write_json("fit.json", fit_json(fitted))
             write_fitted_system(fitted.fitted, stage / "fitted.json")
             stage.write("samples.csv", samples_csv(fitted.fitted))
-        drawings.write_report(
-            figures, lambda drawn: report.page_html(fitted, drawn, seed=arguments.seed), inputs=read, progress=progress
+
+        renamed = drawings.write_results(
+            write_files,
+            report.figure_drawers(fitted),
+            lambda drawn: report.page_html(fitted, drawn, seed=arguments.seed),
+            inputs=[*arguments.tables, arguments.simulator],
+            progress=progress,
         )
-    for note in (*fitted.recording.notes, *stage.notes_on_renamed_inputs):
-        print_result(f"note: {note}", quiet=arguments.quiet)
-    print_result(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
-    drawings.raise_if_any_failed()
-    return 0
+    return drawings.finish(
+        *(f"note: {note}" for note in fitted.recording.notes),
+        *renamed,
+        f"{fitted.summary()}\nseed {arguments.seed}; written to {drawings.out}",
+        quiet=arguments.quiet,
+    )
 
 
 VERB = Verb(

@@ -10,16 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import (
-    ARMS,
-    ArmName,
-    add_geometry,
-    parse_arm,
-    parse_place,
-    prompter,
-    read_or_shipped_geometry,
-    warn_and_confirm_lowering,
-)
+from probewise.cli._arm import ARMS, SHIPPED, ArmName, add_geometry, parse_arm, parse_place, read_or_shipped_geometry
 from probewise.cli._common import (
     CommandError,
     Verb,
@@ -31,8 +22,7 @@ from probewise.cli._common import (
     positive_number_parser,
     print_result,
 )
-from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
-from probewise.cli._plans import SHIPPED, plan_for_lego_arm, plan_for_own_instrument, read_or_shipped_plan
+from probewise.cli._output import Drawings, checked_output_directory, inputs_and_filled_in_plan
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
@@ -40,6 +30,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from probewise.arm import Reading
+    from probewise.cli._output import StagedFiles
     from probewise.investigation import RoundsFolder, Take
     from probewise.recordings import Plan
     from probewise.world import World
@@ -102,8 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
-    from probewise.cli.diagnose import OF_ONE_RUN, files_not_to_replace, write_results
-    from probewise.diagnosis import join
+    from probewise.cli.diagnose import OF_ONE_RUN, write_files
+    from probewise.diagnosis import NEXT_PLAN, join
     from probewise.investigation import Budget, Investigation, RoundsFolder, SimulatedRecorder, investigate
     from probewise.recordings import Recording, fingerprint, write_recording
     from probewise.report import diagnosis as of_a_diagnosis
@@ -164,33 +155,33 @@ def run(arguments: argparse.Namespace) -> int:
     diagnosis = found.last.diagnosis
     read = [] if arguments.plan in SHIPPED else [Path(arguments.plan)]
     read += [] if arguments.sensor is None else [arguments.sensor]
-    spared, drawings = files_not_to_replace(read, out), Drawings(out)
+    drawings = Drawings(out)
     figures = of_a_diagnosis.figure_drawers(diagnosis) | {"by_round.png": partial(report.probabilities_png, found)}
     concealed = None if world is None else tuple(effect.name for effect in world.concealed)
+
+    def write_all_files(stage: StagedFiles) -> None:
+        write_files(diagnosis, stage, rng=np.random.default_rng(files_seed))
+        write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
+
     with reporting_what_is_kept(kept_message, results=True), progress_shown(quiet=arguments.quiet) as progress:
-        with staged_output(out, inputs=spared, outdated=(*OF_ONE_RUN, *figures, PAGE)) as stage:
-            write_results(diagnosis, stage, rng=np.random.default_rng(files_seed))
-            write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
-        drawings.write_report(
+        renamed = drawings.write_results(
+            write_all_files,
             figures,
             lambda drawn: report.page_html(
                 found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed
             ),
-            inputs=spared,
+            inputs=inputs_and_filled_in_plan(read, out / NEXT_PLAN),
+            outdated=OF_ONE_RUN,
             progress=progress,
         )
-    print_result(found.summary(), quiet=arguments.quiet)
-    if concealed is not None:
-        print_result(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
-    for note in stage.notes_on_renamed_inputs:
-        print_result(f"note: {note}", quiet=arguments.quiet)
-    print_result(f"written to {out}", quiet=arguments.quiet)
-    drawings.raise_if_any_failed()
-    return 0
+    known = [] if concealed is None else [f"concealed    {', '.join(concealed) or 'nothing'}"]
+    return drawings.finish(found.summary(), *known, *renamed, f"written to {out}", quiet=arguments.quiet)
 
 
 def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
     """Read the first plan and adapt it to the chosen arm; raise ParameterError if --no-hands cannot carry it out."""
+    from probewise.cli._bench import plan_for_lego_arm, plan_for_own_instrument, read_or_shipped_plan
+
     plan = read_or_shipped_plan(arguments.plan)
     if chosen.kind == "simulated":
         return plan
@@ -198,11 +189,9 @@ def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
         raise ParameterError(
             "--no-hands", True, f"a plan over one pattern; {arguments.plan} has several, which a person must exchange"
         )
-    return (
-        plan_for_own_instrument(plan)
-        if chosen.kind == "file"
-        else plan_for_lego_arm(plan, read_or_shipped_geometry(arguments))
-    )
+    if chosen.kind == "file":
+        return plan_for_own_instrument(plan)
+    return plan_for_lego_arm(plan, read_or_shipped_geometry(arguments))
 
 
 @contextlib.contextmanager
@@ -211,7 +200,7 @@ def _opened_plan_runner(
 ) -> Iterator[Take]:
     """Open an arm; yield the function that takes a plan's readings with it. A person or the bench lays the sheets."""
     from probewise.arm import RequestToPerson, carry_out
-    from probewise.cli._bench import open_arm_and_bench
+    from probewise.cli._bench import open_arm_and_bench, prompter, warn_and_confirm_lowering
 
     geometry = read_or_shipped_geometry(arguments)
     width, height = (0.0, 0.0) if chosen.kind == "file" else geometry.field_mm

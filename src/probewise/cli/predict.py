@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import Verb, add_path, add_seed_and_quiet, parse_path, print_result
+from probewise.cli._common import Verb, add_path, add_seed_and_quiet, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import checked_output_file, tables_and_descriptions
 from probewise.cli._simulator import add_simulator
@@ -20,54 +20,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "fitted.json",
     )
     add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
-    parser.add_argument("--out", type=parse_path, required=True, metavar="P.csv", help="where the prediction goes")
+    add_path(parser, "--out", "P.csv", "where the prediction goes", required=True)
     add_simulator(parser)
     add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict every row of a plan, score the prediction of readings, write a CSV file; return the exit status."""
-    refuse_journal(arguments.plan)
-    if arguments.simulator is not None:
-        return _predict_by_simulator(arguments)
-    from probewise._progress import progress_shown
-    from probewise.calibration import predict, read_sensor
-    from probewise.recordings import read_plan_and_readings, write_prediction
-
-    out = checked_output_file(arguments.out, arguments.sensor, *tables_and_descriptions([arguments.plan]))
-    with progress_shown(quiet=arguments.quiet) as progress:
-        sensor = read_sensor(arguments.sensor)
-        plan, readings = read_plan_and_readings(arguments.plan, progress=progress)
-        prediction = predict(sensor, plan, readings, progress=progress)
-        progress(f"writing {out.name}")
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_prediction(prediction, out)
-    print_result(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
-    return 0
-
-
-def _predict_by_simulator(arguments: argparse.Namespace) -> int:
-    """Predict every row of a table with a user's simulator, fitted or repaired; return the exit status."""
     import numpy as np
 
+    from probewise import calibration, recordings, systems
     from probewise._progress import progress_shown
-    from probewise.systems import (
-        predict_system,
-        read_fitted_system,
-        read_table_for,
-        write_system_prediction,
-    )
 
-    out = checked_output_file(arguments.out, arguments.sensor, arguments.plan, arguments.simulator)
-    fitted = read_fitted_system(arguments.sensor, arguments.simulator)  # a file that was changed is not run
-    table = read_table_for(fitted.simulator, arguments.plan)
+    refuse_journal(arguments.plan)
+    read = tables_and_descriptions([arguments.plan]) if arguments.simulator is None else [arguments.plan]
+    read += [] if arguments.simulator is None else [arguments.simulator]
+    out = checked_output_file(arguments.out, arguments.sensor, *read)
+    notes: tuple[str, ...] = ()
     with progress_shown(quiet=arguments.quiet) as progress:
-        prediction = predict_system(fitted, table, rng=np.random.default_rng(arguments.seed), progress=progress)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_system_prediction(prediction, out)
-    for note in table.notes:
+        if arguments.simulator is not None:
+            fitted = systems.read_fitted_system(arguments.sensor, arguments.simulator)  # a changed file is not run
+            table = systems.read_table_for(fitted.simulator, arguments.plan)
+            notes, rng = table.notes, np.random.default_rng(arguments.seed)
+            by_system = systems.predict_system(fitted, table, rng=rng, progress=progress)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            systems.write_system_prediction(by_system, out)
+            summary = by_system.summary()
+        else:
+            sensor = calibration.read_sensor(arguments.sensor)
+            plan, readings = recordings.read_plan_and_readings(arguments.plan, progress=progress)
+            prediction = calibration.predict(sensor, plan, readings, progress=progress)
+            progress(f"writing {out.name}")
+            out.parent.mkdir(parents=True, exist_ok=True)
+            recordings.write_prediction(prediction, out)
+            summary = prediction.summary()
+    for note in notes:
         print_result(f"note: {note}", quiet=arguments.quiet)
-    print_result(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
+    print_result(f"{summary}\nwritten to {out}", quiet=arguments.quiet)
     return 0
 
 

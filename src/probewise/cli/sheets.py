@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, read_or_shipped_geometry
-from probewise.cli._common import CommandError, Verb, add_quiet, parse_path, print_result
+from probewise.cli._common import CommandError, Verb, add_path, add_quiet, print_result
 from probewise.cli._output import checked_output_file
 from probewise.errors import ParameterError
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "black field; target, a white shape to cut out; marks, the crosses of `arm fit-geometry`; jig, the "
         "arm's links and base at their home angles, for `arm home --here`",
     )
-    parser.add_argument("--out", type=parse_path, required=True, metavar="SHEETS.pdf", help="where the pages go")
+    add_path(parser, "--out", "SHEETS.pdf", "where the pages go", required=True)
     parser.add_argument("--paper", type=str.lower, default="a4", metavar="PAPER", help="a4 (default) or letter")
     parser.add_argument(
         "--target",
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
-    from probewise.cli._plans import read_or_shipped_plan
+    from probewise.cli._bench import read_or_shipped_plan
     from probewise.recordings.description import read_description
     from probewise.report.sheets import arm_home_jig_sheets, field_sheet, marks_sheet, pattern_sheets, target_sheet
 
@@ -97,7 +97,7 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
 def _target_outline_mm(text: str, field_mm: tuple[float, float]):  # type: ignore[no-untyped-def]
     import numpy as np
 
-    from probewise.cli._geometry import parse_truth
+    from probewise.cli._explore import parse_truth
     from probewise.scene import Field, outlines
 
     try:

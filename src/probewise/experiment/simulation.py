@@ -14,12 +14,11 @@ from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise._kinds import did_you_mean
 from probewise.arm import Geometry, Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Estimated, Known
-from probewise.errors import ParameterError, printable
+from probewise.errors import ParameterError, did_you_mean, printable
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.digest import value_digest
 from probewise.experiment.pace import DescribedEffect, FromRest

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from probewise._kinds import did_you_mean
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, did_you_mean
 from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.labels import ParameterValue, WhichShape
 from probewise.inquiry.utility import InformationAbout, InformationGain, PerSecond, ReadingEntropy, Utility

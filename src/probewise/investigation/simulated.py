@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from probewise._kinds import did_you_mean
 from probewise.arm import Reading, readings_of_recording
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, did_you_mean
 from probewise.recordings.plan import Plan
 from probewise.world import World, concealed
 from probewise.world.concealed import Concealed

@@ -9,8 +9,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise._display import ShowsItself
-from probewise._kinds import checked_finite_number, checked_whole, did_you_mean, require_callable, require_rng
-from probewise.errors import ParameterError, ShapeError
+from probewise._kinds import checked_finite_number, checked_whole, require_callable, require_rng
+from probewise.errors import ParameterError, ShapeError, did_you_mean
 from probewise.inquiry.any_settings.acquisition import Predictive
 from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
 from probewise.inquiry.any_settings.posterior import InstrumentModel, ReadingsProblem, prior_samples, updated_posterior

@@ -1,0 +1,319 @@
+"""Tasks of `probewise arm`: check, move and read the arm at the bench."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from probewise.arm import (
+    DryRun,
+    Geometry,
+    Instrument,
+    LegoArm,
+    OwnInstrument,
+    Pose,
+    SimulatedArm,
+    percent_to_lego_units,
+    require_within_reach,
+)
+from probewise.arm.carry_out import reachable_places_of
+from probewise.arm.fitting import spread_mark_places
+from probewise.arm.geometry import JOINTS
+from probewise.arm.height_check import HeightReading, check_heights
+from probewise.cli._arm import SCENE, parse_arm, parse_place
+from probewise.cli._bench import (
+    SimulatedBench,
+    enable_confirmed_lowering,
+    open_arm_and_bench,
+    open_brick,
+    open_nxt_arm,
+    prompter,
+    warn_and_confirm_lowering,
+    warn_if_clearance_doubtful,
+)
+from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_result, print_warning
+from probewise.cli._output import checked_output_file
+from probewise.errors import LinkError, ParameterError
+from probewise.recordings import write_bytes_atomically
+
+_UNITS = "LEGO units (1 dark to 100 bright)"
+_COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
+_WHITE = "uniform:1"
+_HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of reading upwards
+_STEP_OF_LIGHT = 0.1  # of a reading in all its steps, 0 to 100
+
+
+# Opening the arm of a task
+
+
+def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+    """Open the arm of --arm, or for --dry-run one that only prints its moves."""
+    if arguments.dry_run:
+        return LegoArm(DryRun(geometry, print_result), geometry, start_s=start_s)
+    if arguments.arm is None:
+        raise CommandError(
+            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
+        )
+    return open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
+
+
+def open_instrument(
+    arguments: argparse.Namespace,
+    geometry: Geometry,
+    *,
+    start_s: float = 0.0,
+    n_taken: int = 0,
+    scene: str = SCENE,
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
+    """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm."""
+    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    if chosen is None or chosen.kind == "nxt":
+        refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
+        return open_lego_arm(arguments, geometry, start_s=start_s), None
+    if arguments.dry_run:
+        raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
+    if chosen.kind == "file":
+        refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
+    given = {name: getattr(arguments, name, None) for name in ("sensor", "scene", "seed")}
+    seed = DEFAULT_SEED if given["seed"] is None else given["seed"]
+    opened = open_arm_and_bench(
+        chosen,
+        geometry,
+        arguments.geometry,
+        sensor=given["sensor"],
+        scene=scene if given["scene"] is None else given["scene"],
+        seed=seed,
+        start_s=start_s,
+        n_taken=n_taken,
+    )
+    print_result(f"seed {seed}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
+    return opened
+
+
+def confirm_lowering(arguments: argparse.Namespace, instrument: Instrument, geometry: Geometry) -> None:
+    """Warn if the sensor may hit the table and let a person confirm its first lowering, unless nothing moves."""
+    if arguments.arm is not None and not arguments.dry_run:
+        warn_and_confirm_lowering(parse_arm(arguments.arm), instrument, geometry)
+
+
+def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
+    """Raise ParameterError if one of these options is given: there are none with `what`."""
+    for name in names:
+        if (value := getattr(arguments, name, None)) is not None:
+            raise ParameterError(f"--{name}", str(value), f"none with {what}")
+
+
+def nxt_port(name: str) -> str:
+    """Return the port of "nxt:PORT"; raise ParameterError for any other arm."""
+    chosen = parse_arm(name)
+    if chosen.kind == "file":
+        raise ParameterError("--arm", name, "nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`")
+    if chosen.kind != "nxt":
+        raise ParameterError("--arm", name, f"nxt:PORT; {name} has no bench, --dry-run prints the moves")
+    return chosen.where
+
+
+def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
+    """Return a function that prompts the person; in a dry run, it only prints the request."""
+    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else prompter(arm)
+
+
+# The tasks
+
+
+def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Check a geometry, and a brick: where the arm reaches, and what the brick says."""
+    from probewise.report.plots.apparatus import draw_arm_lengths, reach_map
+    from probewise.report.plots.canvas import png
+
+    def say(text: str) -> None:
+        print_result(text, quiet=arguments.quiet)
+
+    out = None if arguments.out is None else checked_output_file(arguments.out)
+    drawing = None if arguments.drawing is None else checked_output_file(arguments.drawing)
+    port = None if arguments.arm is None else nxt_port(arguments.arm)
+    x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
+    places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
+    reached = geometry.contains(places)
+    say(f"reach        {geometry.sentence()}")
+    say(f"field        {reached.mean():.1%} of it within reach")
+    for name, joint in zip(JOINTS, geometry.joints, strict=True):
+        count_mm = geometry.farthest_mm / abs(joint.counts_per_rad)
+        low, high = math.degrees(joint.low_rad), math.degrees(joint.high_rad)
+        say(
+            f"{name:<12} motor {'ABC'[joint.port]}, {low:g} to {high:g} degrees; "
+            f"at {geometry.farthest_mm:.0f} mm one count is {count_mm:.2f} mm, "
+            f"its play {joint.play_rad * geometry.farthest_mm:.1f} mm"
+        )
+    if geometry.accuracy is None:
+        known = "not fitted to marks: with home 2 degrees off on both links the sensor hangs up to"
+    else:
+        known = f"fitted to {geometry.accuracy.marks} marks; by 2 sds the sensor may hang"
+    say(f"height       reads {geometry.read_height_mm:g} mm up; {known} {geometry.max_height_error_mm:.1f} mm lower")
+    if not reached.any():
+        raise ParameterError("reach", "nowhere on the field", "links, heights and limits that reach the field")
+    if out is not None:
+        standing = np.where(reached, geometry.orientation_rad(places), np.nan).reshape(y_mm.size, x_mm.size)
+        write_bytes_atomically(out, png(reach_map(standing, x_mm, y_mm, axis_mm=geometry.axis_mm)))
+        say(f"drawn        {out}")
+    if drawing is not None:
+        write_bytes_atomically(drawing, png(draw_arm_lengths(geometry)))
+        say(f"drawn        {drawing}")
+    if port is None:
+        return
+    with open_brick(port) as brick:  # nothing moves
+        version = brick.version()
+        firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
+        battery_v = brick.battery_mv() / 1000
+        say(f"brick        {brick.name()}, firmware {firmware}, battery {battery_v:.2f} V")
+        light = brick.light_sensor(geometry.sensor_port).read()
+        value = percent_to_lego_units(light.fine_percent, geometry)
+        say(f"light        {value:g} {_UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts")
+        program = brick.running_program()
+        if program is not None:
+            raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
+
+
+def jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Turn a joint by some degrees, or bring the sensor over a place."""
+    match arguments.where:
+        case [place]:
+            x_mm, y_mm = parse_place("WHERE", place)
+            if arguments.steps and not arguments.down:
+                raise ParameterError("--steps", True, "with --down: the sensor is lowered in steps")
+            if arguments.down and not arguments.dry_run and not arguments.steps:
+                warn_if_clearance_doubtful(geometry)
+            with open_lego_arm(arguments, geometry) as arm:
+                if arguments.steps and not arguments.dry_run:
+                    enable_confirmed_lowering(arm)
+                (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
+                _print_position(arm, quiet=arguments.quiet)
+                if arguments.down:
+                    prompter_unless_dry_run(arguments, arm)("check the sensor's position; it will be raised again")
+        case [joint, text] if joint in JOINTS:
+            degrees = parse_numbers(text)
+            if len(degrees) != 1 or not math.isfinite(degrees[0]):
+                raise ParameterError("WHERE", text, "a number of degrees")
+            with open_lego_arm(arguments, geometry) as arm:
+                arm.turn_joint(JOINTS.index(joint), math.radians(degrees[0]))
+                _print_position(arm, quiet=arguments.quiet)
+        case _:
+            raise ParameterError("WHERE", " ".join(arguments.where), f"X,Y in mm; or {', '.join(JOINTS)}, and degrees")
+
+
+def bring_home(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Bring all joints home, by themselves or by hand."""
+    with open_lego_arm(arguments, geometry) as arm:
+        if arguments.here:
+            angles = [f"{name} {math.degrees(j.home_rad):g}" for name, j in zip(JOINTS, geometry.joints, strict=True)]
+            arm.release()
+            prompter_unless_dry_run(arguments, arm)(f"bring the arm home by hand, {', '.join(angles)} degrees")
+            arm.set_home()
+        else:
+            arm.home()
+        _print_position(arm, quiet=arguments.quiet)
+
+
+def _print_position(arm: LegoArm, *, quiet: bool) -> None:
+    (x_mm, y_mm, height_mm), angles = arm.position_mm, np.degrees(arm.angles_rad)
+    print_result(
+        f"sensor at ({x_mm:.1f}, {y_mm:.1f}) mm, {height_mm:.1f} mm above the surface; base {angles[0]:.1f}, "
+        f"shoulder {angles[1]:.1f}, elbow {angles[2]:.1f} degrees",
+        quiet=quiet,
+    )
+
+
+def print_light_and_battery(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Read the sensor where it stands, and the battery."""
+    with open_lego_arm(arguments, geometry) as arm:
+        value, battery_mv = arm.read_here(), arm.battery_mv()
+        if not arguments.dry_run:
+            print_result(f"{value:g} {_UNITS}, battery {battery_mv:.0f} mV")
+
+
+def scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Read along a line; the readings go to standard output as CSV."""
+    start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
+    places = np.linspace(start, end, arguments.readings)
+    if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before connecting to the brick
+        require_within_reach(geometry, places, "reading of the scan")
+    names: list[str] = ["battery_mv"]
+    instrument, _ = open_instrument(arguments, geometry)
+    confirm_lowering(arguments, instrument, geometry)
+    with instrument as arm:
+        require_within_reach(reachable_places_of(arm), places, "reading of the scan")
+        if isinstance(arm, LegoArm):
+            print_result(",".join((_COLUMNS, *names)))
+        for k, ((x_mm, y_mm), standing) in enumerate(zip(places, arm.orientation_rad(places), strict=True)):
+            reading = arm.measure(Pose(float(x_mm), float(y_mm), float(standing)))
+            if k == 0 and not isinstance(arm, LegoArm):
+                names = list(reading.covariates)
+                print_result(",".join((_COLUMNS, *names)))
+            at, more = reading.pose, (f",{reading.covariates.get(name, math.nan):.9g}" for name in names)
+            print_result(
+                f"{at.x_mm:.3f},{at.y_mm:.3f},{math.degrees(at.orientation_rad):.3f},{reading.time_s:.3f},"
+                f"{reading.value:.9g}{''.join(more)}"
+            )
+
+
+def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Compare by the light over white the sensor's height at each place with that at the first; print differences."""
+    if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
+        raise ParameterError("--arm", arguments.arm, "nxt:PORT, or emulator:TRUE.toml")
+    width, height = geometry.field_mm
+    places = [parse_place("X,Y", text) for text in arguments.places]
+    places = places or [(width / 2, height / 2), *((x, y) for x, y in spread_mark_places(geometry).tolist())]
+    if len(places) < 2:
+        raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
+    require_within_reach(geometry, np.array(places), "place")
+    instrument, bench = open_instrument(arguments, geometry, scene=_WHITE)
+    assert isinstance(instrument, LegoArm)
+    confirm_lowering(arguments, instrument, geometry)
+    with instrument as arm:
+        if bench is None:
+            prompter_unless_dry_run(arguments, arm)(
+                "lay white matt paper, the same everywhere, over the field, or under each place"
+            )
+
+        def height_reading_at(place: tuple[float, float], height_mm: float) -> HeightReading:
+            arm.go_down(*place, height_mm)
+            values = np.array([arm.brightness() for _ in range(arguments.readings)])
+            error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
+            return HeightReading(float(arm.position_mm[2]), float(values.mean()), error)
+
+        arm.go_over(*places[0])
+        lowest_mm = geometry.read_height_mm
+        curve = [height_reading_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
+        lights = []
+        for place in places[1:]:
+            lights.append(height_reading_at(place, lowest_mm))
+            if not arguments.dry_run:
+                check = check_heights(curve, lights)
+                print_result(_height_error_in_words(place, check.off_mm[-1], check.sd_mm[-1]), quiet=arguments.quiet)
+    if arguments.dry_run:
+        return
+    print_result(
+        f"light        falls by {check.per_mm:.1%} with each mm at {lowest_mm:g} mm (in [sensor] of the geometry: "
+        f"light_per_mm = {check.per_mm:.3f}); heights are relative to the first place, "
+        f"({places[0][0]:g}, {places[0][1]:g}) mm",
+        quiet=arguments.quiet,
+    )
+    if check.agrees:
+        print_result(f"heights      agree with the counters (p = {check.p_value:.2g})", quiet=arguments.quiet)
+    else:
+        worst = int(np.argmax(np.abs(check.off_mm / check.sd_mm)))
+        print_warning(
+            f"the light contradicts the heights (p = {check.p_value:.1g}), most at "
+            f"{_height_error_in_words(places[1 + worst], check.off_mm[worst], check.sd_mm[worst])}; is the paper the "
+            "same everywhere? Then bring the sensor to marks there and fit the geometry again "
+            "(probewise arm fit-geometry)"
+        )
+
+
+def _height_error_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
+    side = "higher" if off_mm > 0 else "lower"
+    x_mm, y_mm = place_mm
+    return f"({x_mm:g}, {y_mm:g}) mm: it hangs {abs(off_mm):.1f} ± {sd_mm:.1f} mm {side} than its counters say"

@@ -1,1 +1,0 @@
-"""Tasks of `probewise arm`, at the bench with the arm."""

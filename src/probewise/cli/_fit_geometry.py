@@ -1,0 +1,182 @@
+"""`probewise arm fit-geometry`: a person brings the sensor to marks, and the geometry is fitted to them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from probewise.arm import Geometry, LegoArm, read_geometry, shipped_geometry_path
+from probewise.arm.fitting import TouchedMark, fit_geometry, read_turns_and_places, spread_mark_places, write_marks
+from probewise.arm.geometry_file import text_with_fitted_values
+from probewise.cli._arm import parse_arm
+from probewise.cli._arm_tasks import open_instrument
+from probewise.cli._bench import prompter, prompter_for_answer
+from probewise.cli._common import CommandError, message_to_resume, print_result
+from probewise.cli._output import checked_output_file
+from probewise.cli._stopping import reporting_what_is_kept
+from probewise.errors import FileError, ParameterError, ReachError
+from probewise.recordings import write_text_atomically
+from probewise.recordings.atomic import is_device_or_pipe
+
+STEP_MM = 5.0
+_MOST_MM = 60.0  # largest step
+_HELP = (
+    "Enter: 5 mm down; 'down 2', 'up 2', 'x 4', 'y -2.5' or several of them: mm; 'ok': it is over the cross and just "
+    "touches; 'seen': it is over the cross, its height is not known; 'skip'"
+)
+_MOVES = {"x": (1, 0, 0), "y": (0, 1, 0), "up": (0, 0, 1), "down": (0, 0, -1)}
+
+
+def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Bring the sensor to marks, unless there is no --arm; fit the geometry to them, and write it."""
+    source = arguments.geometry or shipped_geometry_path()
+    out = checked_output_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
+    if arguments.dry_run:
+        raise ParameterError("--dry-run", True, "none with fit-geometry: a person directs its moves")
+    if arguments.arm is None and arguments.marks is None:
+        raise CommandError(
+            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or fit existing marks, --marks MARKS.csv"
+        )
+    if arguments.marks is None and is_device_or_pipe(out):
+        raise ParameterError("--out", str(out), "a file, beside which the marks are kept; or name them with --marks")
+    kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
+    if arguments.arm is not None:
+        _touch_and_save_marks(arguments, geometry, checked_output_file(kept))
+    turned, marks = read_turns_and_places(kept)
+    fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
+    print_result(fitted.summary(), quiet=arguments.quiet)
+    text = text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry)
+    write_text_atomically(out, text)
+    if not is_device_or_pipe(out):
+        read_geometry(out)  # check that edits by hand have not hidden a number
+    print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
+
+
+def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
+    """Bring the sensor to one mark after another as a person directs; save each at once to the file `kept`."""
+    if not parse_arm(arguments.arm).is_lego:
+        raise ParameterError("--arm", arguments.arm, "nxt:PORT or emulator:TRUE.toml: the arm whose geometry is fitted")
+    if kept.exists() and not arguments.resume:
+        raise FileError(kept, "the file exists already", "--resume to continue it, or another --marks")
+    taken: list[TouchedMark] = []
+    if kept.exists():
+        rows = zip(*(array.tolist() for array in read_turns_and_places(kept)), strict=True)
+        taken = [TouchedMark(tuple(turned), tuple(place)) for turned, place in rows]
+    done = {mark.place_mm[:2] for mark in taken}
+    marks = [(x, y) for x, y in spread_mark_places(geometry).tolist()]
+    instrument, bench = open_instrument(arguments, geometry)
+    assert isinstance(instrument, LegoArm)
+
+    def kept_message() -> str:
+        return (
+            message_to_resume(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
+        )
+
+    with reporting_what_is_kept(kept_message), instrument as arm:
+        answer = prompter_for_answer(arm)
+        ask = answer if bench is None else bench.answer_at_mark
+        tell = partial(print_result, quiet=bench is not None)
+        if bench is None:
+            prompter(arm)(
+                "lay the sheet of marks (probewise sheets marks) on the field, and on each cross in its turn a "
+                f"block {arguments.block_mm:g} mm high"
+            )
+        for number, mark in enumerate(marks, 1):
+            if mark in done:
+                continue
+            met = bring_to_mark(arm, mark, arguments.block_mm, ask, tell, named=f"mark {number} of {len(marks)}")
+            if met is not None:
+                taken.append(met)
+                write_marks(taken, kept)
+                print_result(f"mark {number} kept: {kept}", quiet=arguments.quiet)
+
+
+class MarkQuestion(str):
+    """A question to the person who watches the sensor: the sentence, with the mark's place and its block's height."""
+
+    __slots__ = ("block_mm", "mark_mm")
+
+    mark_mm: tuple[float, float]
+    block_mm: float
+
+    def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> MarkQuestion:
+        """Build a question from its sentence."""
+        question = super().__new__(cls, text)
+        question.mark_mm, question.block_mm = mark_mm, block_mm
+        return question
+
+
+def bring_to_mark(
+    arm: LegoArm,
+    mark_mm: tuple[float, float],
+    block_mm: float,
+    ask: Callable[[MarkQuestion], str],
+    tell: Callable[[str], None],
+    *,
+    named: str,
+) -> TouchedMark | None:
+    """Bring the sensor over a mark and down to the block on it, as a person directs; return the mark as touched.
+
+    None if the mark is skipped. Every move turns the base first and then lowers, as in a reading.
+
+    Parameters
+    ----------
+    arm
+        The arm, entered.
+    mark_mm, block_mm
+        Place of the mark on the field, and height of the block.
+    ask
+        Function that asks the person and returns "ok", "seen", "skip", or a move such as "x 5".
+    tell
+        Function that tells the person what can be answered, and why a move was refused.
+    named
+        Name of the mark.
+    """
+    at = (*mark_mm, arm.geometry.travel_height_mm)
+    arm.go_down(*at)
+    tell(_HELP)
+    while True:
+        answer = ask(MarkQuestion(f"{named} ({mark_mm[0]:g}, {mark_mm[1]:g}): ", mark_mm, block_mm)).lower()
+        if answer == "skip":
+            return None
+        if answer in ("ok", "seen"):
+            homes = np.array([joint.home_rad for joint in arm.geometry.joints])
+            base, shoulder, elbow = (arm.angles_rad - homes).tolist()
+            height_mm = block_mm if answer == "ok" else math.nan
+            return TouchedMark((base, shoulder, elbow), (*mark_mm, height_mm))
+        moved = place_after_moves(at, answer)
+        if moved is None:
+            tell(f"{answer!r} says nothing that can be done. {_HELP}")
+            continue
+        try:
+            arm.go_down(*moved)
+        except ReachError as error:
+            tell(str(error))
+            arm.go_down(*at)
+        else:
+            at = moved
+
+
+def place_after_moves(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
+    """Return the sensor's place (x, y, height in mm) after the moves in an answer; None if it is no list of moves.
+
+    An answer is pairs such as "x 5 down 2", of at most 60 mm each; an empty one means one step of 5 mm down.
+    """
+    words = answer.split() or ["down", str(STEP_MM)]
+    x, y, height = at_mm
+    if len(words) % 2:
+        return None
+    for way, text in zip(words[::2], words[1::2], strict=True):
+        try:
+            by_x, by_y, by_height = (float(text) * share for share in _MOVES[way])
+        except (KeyError, ValueError):
+            return None
+        if not abs(float(text)) <= _MOST_MM:
+            return None
+        x, y, height = x + by_x, y + by_y, height + by_height
+    return x, y, height

@@ -1,0 +1,412 @@
+"""`probewise arm record`: carry out a plan and write the recording, with a check of each sheet that is laid."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from probewise._progress import progress_shown
+from probewise.arm import (
+    Geometry,
+    LegoArm,
+    OwnInstrument,
+    Pose,
+    Reading,
+    RequestToPerson,
+    SimulatedArm,
+    carry_out,
+    readings_of_recording,
+    recording_of_readings,
+)
+from probewise.arm.carry_out import BY_HAND_S, duration_s, reachable_places_of
+from probewise.arm.geometry import wrapped_to_pi
+from probewise.cli._arm import SHIPPED, parse_arm, parse_place
+from probewise.cli._arm_tasks import (
+    confirm_lowering,
+    nxt_port,
+    open_instrument,
+    prompter_unless_dry_run,
+    refuse_options,
+)
+from probewise.cli._bench import (
+    plan_for_lego_arm,
+    plan_for_own_instrument,
+    prompter_for_answer,
+    read_or_shipped_plan,
+    shifted_pattern,
+    without_measured_covariates,
+)
+from probewise.cli._common import message_to_resume, print_result, print_warning
+from probewise.cli._output import checked_output_file
+from probewise.cli._stopping import reporting_what_is_kept
+from probewise.emulator.scenes import scene_text
+from probewise.errors import FileError, ParameterError, shown
+from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
+from probewise.recordings.atomic import is_device_or_pipe
+from probewise.recordings.patterns import have_same_albedo
+from probewise.scene import region_of
+
+if TYPE_CHECKING:
+    from probewise._arrays import BoolArray, FloatArray
+
+_OFF_PLAN_MM = 5.0  # tolerance, since a user's own instrument may report the true place
+_OFF_PLAN_RAD = math.radians(5.0)  # and the true orientation
+_LEGO_OFF_PLAN_RAD = math.radians(47.0)  # a LEGO mount turns by right angles, so that up to 45 degrees are left
+
+_SEES_MM = 14.0  # radius of the sensor's view
+_LOOK_MM = 25.0  # margin around the plan's places within which a sheet shows its pattern
+_SHARE = 0.05  # least contrast of white and black, as a share of the range of readings
+_OFF = 0.35  # largest deviation from a level, as a share of the contrast; beyond any noise
+_FEWEST = 3
+_SPREAD_SHARE = 0.15  # largest spread of readings of one shade, as a share of the range
+_AROUND_MM = np.stack(
+    [
+        radius * np.array([math.cos(turn), math.sin(turn)])
+        for radius in (0.0, _SEES_MM / 2, _SEES_MM)
+        for turn in np.arange(8) * math.pi / 4
+    ]
+)
+
+
+def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Take the plan's readings, each kept on disk at once; a person or the bench lays the sheets."""
+    out = checked_output_file(arguments.out, *([] if arguments.plan in SHIPPED else [Path(arguments.plan)]))
+    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    is_own = chosen is not None and chosen.kind == "file"
+    plan = _plan_for_arm(arguments, geometry, is_own=is_own)
+    width, height = (0.0, 0.0) if is_own else geometry.field_mm
+    origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
+    at_end = is_device_or_pipe(out)  # which takes the recording once
+    taken: list[Reading] = []
+    if not arguments.dry_run and not at_end:
+        taken = _earlier_readings(out, plan, resume=arguments.resume, is_lego=chosen is None or chosen.is_lego)
+
+    def kept_message() -> str:
+        if not out.exists():
+            return "nothing was read"
+        if at_end:
+            return f"nothing was kept: {out} takes whole recordings"
+        n_kept = len(_read_unfinished_recording(out))
+        return message_to_resume(out, n_kept, "reading", arguments, "--resume", of=len(plan))
+
+    start_s = taken[-1].time_s if taken else 0.0
+    instrument, bench = open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
+    confirm_lowering(arguments, instrument, geometry)
+    with reporting_what_is_kept(kept_message), instrument as arm:
+        check = SheetCheck(plan, white_is_bright=not is_own)
+        ask: Callable[[RequestToPerson], None]
+        if bench is not None:
+            ask = partial(bench.carry_out_request, plan.patterns, origin)
+        elif arguments.dry_run:
+            ask = prompter_unless_dry_run(arguments, arm)
+        else:
+            arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
+            emulated = not is_own and _is_pty(nxt_port(arguments.arm))
+            ask = PersonAtBench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
+            seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
+            print_result(
+                f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; including {BY_HAND_S:g} s for "
+                f"each step by hand",
+                quiet=arguments.quiet,
+            )
+        readings = carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
+        with progress_shown(quiet=arguments.quiet, beat=False) as progress:
+            progress("readings", len(taken), len(plan))
+            for reading in readings:
+                wrong = check.complaint_about_reading(len(taken), reading.value)
+                if wrong is not None and not arguments.dry_run:
+                    print_warning(f"{wrong}; is the right sheet there, the right way round?")
+                taken.append(reading)
+                progress("readings", len(taken), len(plan))
+                if not arguments.dry_run and not at_end:
+                    write_recording(recording_of_readings(plan, taken), out)
+    if not arguments.dry_run:
+        if at_end:
+            write_recording(recording_of_readings(plan, taken), out)
+        print_result(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
+
+
+def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: bool) -> Plan:
+    """Read the plan and adapt it to the arm, or to the sensor of --sensor."""
+    plan = read_or_shipped_plan(arguments.plan)
+    if is_own:
+        return plan_for_own_instrument(plan, unit=arguments.unit, range_=arguments.range, step=arguments.step)
+    if arguments.sensor is not None:
+        from probewise.calibration import read_sensor
+
+        return without_measured_covariates(plan, read_sensor(arguments.sensor).instrumentation)
+    refuse_options(arguments, "the LEGO arm: it is known", "unit", "range", "step")
+    return plan_for_lego_arm(plan, geometry)
+
+
+# Readings of an earlier session
+
+
+def _read_unfinished_recording(path: Path) -> Recording:
+    """Read the recording of an earlier session, all of whose readings may be missing; FileError if it is a plan."""
+    plan, readings = read_plan_and_readings(path)
+    if readings is None:
+        raise FileError(path, "no column of readings: this is a plan", "a recording, or another --out")
+    return Recording(plan, readings, str(path))
+
+
+def _earlier_readings(out: Path, plan: Plan, *, resume: bool, is_lego: bool) -> list[Reading]:
+    """List the readings of an earlier session, from `out`; none without `resume`.
+
+    Raises FileError if the file exists without `resume`, or it was begun with another plan or another description.
+    """
+    if not resume:
+        if out.exists():
+            raise FileError(out, "the file exists already", "--resume to continue it, or another --out")
+        return []
+    before = _read_unfinished_recording(out)
+    off_rad = _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD
+    difference = next(_differences(before.plan, plan, off_rad), None)
+    if difference is not None:
+        raise FileError(out, difference, "the plan and options of the session that began it; or another --out")
+    return readings_of_recording(before)
+
+
+def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
+    """Yield what differs between an earlier session's rows and this plan's first ones, one phrase each."""
+    if len(before) > len(plan):
+        yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
+        return
+    first = plan.take(np.arange(len(before)))
+    turned_rad = np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad))
+    rows = {
+        "x_mm": np.abs(before.x_mm - first.x_mm) > _OFF_PLAN_MM,
+        "y_mm": np.abs(before.y_mm - first.y_mm) > _OFF_PLAN_MM,
+        "orientation": turned_rad > off_rad,
+        "scan": before.scan != first.scan,
+        "pattern": np.array(_pattern_names_by_row(before)) != np.array(_pattern_names_by_row(first)),
+    }
+    for name, differs in rows.items():
+        if differs.any():
+            yield f"readings of another plan: the {name} of reading {1 + int(differs.argmax())} differs"
+    for name in dict.fromkeys(_pattern_names_by_row(before)):
+        there, here = before.patterns[name], plan.patterns[name]
+        if not have_same_albedo(there, here):
+            yield f"readings of another plan: pattern {name!r} is {shown(there)} there, {shown(here)} here"
+    for field in dataclasses.fields(plan.instrumentation):
+        values = [getattr(each.instrumentation, field.name) for each in (before, plan)]
+        if values[0] != values[1] and field.name != "description":
+            yield f"{field.name} is {values[0]!r} there, {values[1]!r} here"
+
+
+def _pattern_names_by_row(plan: Plan) -> list[str]:
+    return [plan.pattern_names[code] for code in plan.pattern]
+
+
+# Sheets that a person lays
+
+
+class PersonAtBench:
+    """A function that prompts a person to carry out a request of `carry_out`, and then checks the sheet that was laid.
+
+    Parameters
+    ----------
+    arm
+        The arm, entered.
+    plan, origin_mm
+        The plan, and the place of its origin.
+    sheet_check
+        The check of readings against the patterns.
+    check_sheets
+        Whether a sheet is checked before it is scanned; a user's own instrument takes only the plan's readings.
+    emulated
+        Whether the bench is an emulator, so that requests are carried out by typing in its terminal.
+    """
+
+    def __init__(
+        self,
+        arm: LegoArm | OwnInstrument | SimulatedArm,
+        plan: Plan,
+        origin_mm: tuple[float, float],
+        sheet_check: SheetCheck,
+        *,
+        check_sheets: bool,
+        emulated: bool,
+    ) -> None:
+        self._arm, self._plan, self._origin, self._sheet_check = arm, plan, origin_mm, sheet_check
+        self._emulated, self._check_sheets = emulated, check_sheets
+        self._answer = prompter_for_answer(arm)
+
+    def __call__(self, request: RequestToPerson) -> None:
+        """Prompt, and check the sheet until it is right or the person overrides the check."""
+        text = f"{request[0].upper()}{request[1:]}{self._hint_for_emulator_terminal(request)}"
+        self._answer(f"{text}, then press Enter: ")
+        if request.pattern is None or not self._check_sheets:
+            return
+        while (wrong := self._complaint_after_reading_sheet(request.pattern)) is not None:
+            if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
+                print_warning(f"{wrong}; is the right sheet there, the right way round?")
+                break
+            said = self._answer(f"{wrong}. Correct it and press Enter, or type go to continue anyway:  ")
+            if said.lower() == "go":
+                break
+
+    def _hint_for_emulator_terminal(self, request: RequestToPerson) -> str:
+        """Return a hint on what to type in the emulator's terminal to carry out the request; "" without an emulator."""
+        if not self._emulated:
+            return ""
+        if request.turned_rad is not None:
+            return f" (in the emulator's terminal: turn {np.degrees(request.turned_rad):g})"
+        if request.pattern is None:
+            return ""
+        try:
+            scene = scene_text(shifted_pattern(self._plan.patterns[request.pattern], self._origin))
+        except ParameterError:
+            return " (the emulator's terminal knows no such pattern; --arm emulator lays it by itself)"
+        return f" (in the emulator's terminal: {scene})"
+
+    def _complaint_after_reading_sheet(self, name: str) -> str | None:
+        """Read over a sheet's white and over its black; return a complaint if a reading is wrong, else None."""
+        bounds, origin = reachable_places_of(self._arm), np.array(self._origin)
+        values = {}
+        for is_white, place in self._sheet_check.white_and_black_places(
+            name, lambda places: bounds.contains(places + origin)
+        ).items():
+            x_mm, y_mm = (np.array(place) + origin).tolist()
+            standing = float(self._arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
+            values[is_white] = self._arm.measure(Pose(x_mm, y_mm, standing)).value
+        return self._sheet_check.complaint_about_levels(name, values)
+
+
+def _is_pty(port: str) -> bool:
+    """Return whether a port is a pseudo-terminal, and hence an emulator."""
+    return os.path.realpath(port).startswith(("/dev/pts/", "/dev/ttys"))
+
+
+class SheetCheck:
+    """A check of each sheet against its pattern, by the readings over its uniform white and black.
+
+    Parameters
+    ----------
+    plan
+        The plan, with its patterns and the range of readings.
+    white_is_bright
+        Whether white is known to read higher than black, as with the LEGO light sensor.
+    """
+
+    def __init__(self, plan: Plan, *, white_is_bright: bool) -> None:
+        self._plan, self._bright = plan, white_is_bright
+        ends = plan.instrumentation.declared_ends
+        self._range = ends[1] - ends[0] if len(ends) == 2 else math.nan
+        self._read: dict[bool, list[float]] = {True: [], False: []}
+        self._reported: set[tuple[str, bool]] = set()
+        places = np.stack([plan.x_mm, plan.y_mm], axis=-1)
+        self._shades = np.full(len(plan), math.nan)
+        for name, rows in plan.rows_by_pattern():
+            self._shades[rows] = uniform_shades_at_places(plan.patterns[name], places[rows])
+
+    def complaint_about_reading(self, row: int, value: float) -> str | None:
+        """Return a complaint if the reading of a plan's row contradicts its sheet's pattern, else None.
+
+        There is at most one complaint for each sheet and shade, white or black.
+        """
+        shade = self._shades[row]
+        if math.isnan(shade) or math.isnan(value):
+            return None
+        name, is_white = self._plan.pattern_names[int(self._plan.pattern[row])], bool(shade)
+        wrong = self._complaint_against_earlier(is_white, value)
+        if wrong is None:
+            self._read[is_white].append(value)
+            return None
+        if (name, is_white) in self._reported:
+            return None
+        self._reported.add((name, is_white))
+        place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
+        return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour_in_words(is_white)}, and {wrong}"
+
+    def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
+        """Check a sheet by a reading over its white (True) and one over its black (False); return a complaint or None.
+
+        Readings that are right are kept as levels for later checks.
+        """
+        wrong = None
+        if len(values) == 2:
+            contrast = values[True] - values[False]
+            if self._bright and contrast < self._least_contrast(*values.values()):
+                wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
+        for is_white, value in values.items():
+            told = self._complaint_against_earlier(is_white, value)
+            wrong = wrong or (None if told is None else f"where it should be {_colour_in_words(is_white)} {told}")
+        if wrong is not None:
+            return f"sheet {name!r} contradicts its pattern: {wrong}"
+        for is_white, value in values.items():
+            self._read[is_white].append(value)
+        return None
+
+    def white_and_black_places(
+        self, name: str, allowed: Callable[[FloatArray], BoolArray]
+    ) -> dict[bool, tuple[float, float]]:
+        """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
+
+        Return (x, y) in mm in the plan's frame, by these keys; a key is missing if there is no such place.
+
+        Parameters
+        ----------
+        name
+            The pattern.
+        allowed
+            Function that returns the mask, (n,), of reachable places, (n, 2), in the plan's frame.
+        """
+        rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
+        there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)
+        beside = there.mean(axis=0) + _LOOK_MM * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+        candidates = np.concatenate([there, beside])
+        candidates = candidates[allowed(candidates)]
+        if not len(candidates):
+            return {}
+        found = uniform_shades_at_places(self._plan.patterns[name], candidates)
+        middle = there.mean(axis=0)
+        out = {}
+        for is_white in (True, False):
+            fitting = candidates[found == float(is_white)]
+            if len(fitting):
+                x, y = fitting[np.argmin(((fitting - middle) ** 2).sum(axis=-1))].tolist()
+                out[is_white] = (x, y)
+        return out
+
+    def _complaint_against_earlier(self, is_white: bool, value: float) -> str | None:
+        """Return a complaint if a reading over white or black contradicts earlier readings of the sheets, else None."""
+        own, other = self._read[is_white], self._read[not is_white]
+        if own and other:
+            level, opposite = float(np.median(own)), float(np.median(other))
+            if abs(value - level) > max(_OFF * abs(opposite - level), self._least_contrast(level, opposite)):
+                colour, other_colour = _colour_in_words(is_white), _colour_in_words(not is_white)
+                return f"reads {value:g}; {colour} read {level:g} so far, {other_colour} {opposite:g}"
+        elif len(own) >= _FEWEST:
+            level = float(np.median(own))
+            if abs(value - level) > _SPREAD_SHARE * (self._range if math.isfinite(self._range) else abs(level)):
+                return f"reads {value:g}; {_colour_in_words(is_white)} read {level:g} so far"
+        elif other and self._bright:
+            opposite = float(np.median(other))
+            if (value - opposite) * (1 if is_white else -1) < self._least_contrast(value, opposite):
+                return f"reads {value:g}, where {_colour_in_words(not is_white)} read {opposite:g}"
+        return None
+
+    def _least_contrast(self, *levels: float) -> float:
+        return _SHARE * (self._range if math.isfinite(self._range) else max(abs(level) for level in levels))
+
+
+def uniform_shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
+    """Return the shade that the sensor sees at each place, (n, 2), as (n,): 1 all white, 0 all black, else NaN."""
+    seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
+    albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
+    low, high = albedo.min(axis=1), albedo.max(axis=1)
+    return np.where((low == high) & ((low >= 1) | (high <= 0)), np.clip(low, 0.0, 1.0), math.nan)
+
+
+def _colour_in_words(is_white: bool) -> str:
+    return "white" if is_white else "black"

@@ -68,7 +68,6 @@ from probewise.recordings import (
 )
 
 if TYPE_CHECKING:
-    from probewise.cli._fit_geometry import MarkQuestion
     from probewise.world import Surface, World
 
 _WAIT_S = 0.5  # longest wait for a person between checks of signals and keep-alives of the brick
@@ -213,6 +212,21 @@ class InstrumentWithCallbacks:
         reading = self._instrument.measure(pose)
         self._read(reading)
         return reading
+
+
+class MarkQuestion(str):
+    """A question to the person who watches the sensor: the sentence, with the mark's place and its block's height."""
+
+    __slots__ = ("block_mm", "mark_mm")
+
+    mark_mm: tuple[float, float]
+    block_mm: float
+
+    def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> MarkQuestion:
+        """Build a question from its sentence."""
+        question = super().__new__(cls, text)
+        question.mark_mm, question.block_mm = mark_mm, block_mm
+        return question
 
 
 class SimulatedBench:

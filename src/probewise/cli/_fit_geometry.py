@@ -15,7 +15,7 @@ from probewise.arm.fitting import TouchedMark, fit_geometry, read_turns_and_plac
 from probewise.arm.geometry_file import text_with_fitted_values
 from probewise.cli._arm import parse_arm
 from probewise.cli._arm_tasks import open_instrument
-from probewise.cli._bench import prompter, prompter_for_answer
+from probewise.cli._bench import MarkQuestion, prompter, prompter_for_answer
 from probewise.cli._common import CommandError, message_to_resume, print_result
 from probewise.cli._output import checked_output_file
 from probewise.cli._stopping import reporting_what_is_kept
@@ -94,21 +94,6 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
                 taken.append(met)
                 write_marks(taken, kept)
                 print_result(f"mark {number} kept: {kept}", quiet=arguments.quiet)
-
-
-class MarkQuestion(str):
-    """A question to the person who watches the sensor: the sentence, with the mark's place and its block's height."""
-
-    __slots__ = ("block_mm", "mark_mm")
-
-    mark_mm: tuple[float, float]
-    block_mm: float
-
-    def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> MarkQuestion:
-        """Build a question from its sentence."""
-        question = super().__new__(cls, text)
-        question.mark_mm, question.block_mm = mark_mm, block_mm
-        return question
 
 
 def bring_to_mark(

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeAlias, TypeVar
 
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, shown
 from probewise.progress import Progress, silent
@@ -26,6 +26,7 @@ __all__ = ["FORMAT", "CampaignContents", "read_campaign", "run_campaign"]
 FORMAT = "campaign/1"
 T = TypeVar("T")
 Result = Mapping[str, Any]
+Misfit: TypeAlias = Callable[[Result], tuple[str, str] | None]
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ def run_campaign(
     executor: Executor | None = None,
     progress: Progress = silent,
     noun: str = "tasks",
+    misfit: Misfit = lambda result: None,
 ) -> dict[str, Result]:
     """Run the tasks whose results are not yet in the file; return the results of all.
 
@@ -64,6 +66,8 @@ def run_campaign(
         Called with the number of finished tasks, earlier runs included, and the key of the last.
     noun
         Name of the tasks in progress messages.
+    misfit
+        Function of a result in the file: what of it cannot be, and what is allowed; None if it can.
 
     Returns
     -------
@@ -72,7 +76,8 @@ def run_campaign(
     Raises
     ------
     FileError
-        If the file belongs to another campaign, is damaged before its last line, or is being written to.
+        If the file belongs to another campaign, is damaged before its last line, or is being written to, or if a
+        result in it is a misfit.
     NotConvergedError
         If a worker dies; finished results are kept.
     LinkError
@@ -85,7 +90,7 @@ def run_campaign(
     path = Path(path)
     wanted = json.loads(json.dumps(dict(settings)))
     with hold_lock(path):
-        before = read_campaign(path) if path.exists() else None
+        before = read_campaign(path, misfit=misfit) if path.exists() else None
         if before is not None and before.settings != wanted:
             raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
         done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
@@ -102,13 +107,14 @@ def run_campaign(
     return {key: done[key] for key in tasks}
 
 
-def read_campaign(path: str | os.PathLike[str]) -> CampaignContents:
+def read_campaign(path: str | os.PathLike[str], *, misfit: Misfit = lambda result: None) -> CampaignContents:
     """Read a campaign's file; an incomplete last line is ignored.
 
     Raises
     ------
     FileError
-        If it is missing, not a campaign's, or damaged before its last line.
+        If it is missing, not a campaign's, or damaged before its last line, or if `misfit` (see `run_campaign`) finds
+        a result that cannot be.
     """
     # After the last line end there is nothing, or an incomplete line.
     *lines, _ = read_bytes(Path(path), "a campaign's file").split(b"\n")
@@ -122,6 +128,8 @@ def read_campaign(path: str | os.PathLike[str]) -> CampaignContents:
             raise FileError(path, "not a finished task", '"key" and "result"', row=number)
         if key in results:
             raise FileError(path, f"task {shown(key)} a second time", "every task once", row=number)
+        if (wrong := misfit(result)) is not None:
+            raise FileError(path, *wrong, row=number)
         results[key] = result
     return CampaignContents(rows[0]["settings"], results)
 

@@ -27,6 +27,7 @@ from probewise.investigation import investigate
 from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
 from probewise.proof.null_refit import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
+from probewise.proof.results import RoundsResult, SensorResult, SystemResult, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup
 from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer
@@ -37,6 +38,7 @@ from probewise.world.world import World
 
 __all__ = ["RunCaseInRounds", "Task", "run_case", "run_cases", "run_challenge"]
 
+_RESULTS = {"": SensorResult, "systems": SystemResult}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 
@@ -391,5 +393,6 @@ def run_cases(
         executor=executor,
         progress=progress,
         noun="cases",
+        misfit=partial(misfit_of_case, kind=_RESULTS.get(of, RoundsResult)),
     )
     return tuple(results[task.key] for task in tasks)

@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,6 +26,7 @@ from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
 from probewise.proof.configurations import FIELD, MOST_CIRCLES, POPULATIONS, REFERENCE
 from probewise.proof.estimates import Estimate, estimated_share
+from probewise.proof.results import ConcealedResult, misfit
 from probewise.proof.trial import (
     BRIGHT,
     DARK,
@@ -157,15 +159,7 @@ class ConcealedTrial:
 
 @own_arithmetic
 def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
-    """Search for a circle with a sensor that has a concealed effect.
-
-    Returns
-    -------
-    A dict for JSON: whether the target precision was reached (`known`), number of `readings`; `error_mm`, `held` and
-    `chance_wrong` as in `run_trial`. Then the probability of the right answer (`p_truth`), the names in the `credible`
-    set, whether the run reports a fault (`noticed`). And processor time per decision in seconds (`cpu_s`): median and
-    95 % quantile.
-    """
+    """Search for a circle with a sensor that has a concealed effect; return a `ConcealedResult`."""
     experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
     cpu = []
     steps = timed_steps(
@@ -265,6 +259,7 @@ def run_concealed(
         executor=executor,
         progress=progress,
         noun="runs",
+        misfit=partial(misfit, kind=ConcealedResult),
     )
     return {trial: dict(results[trial.key]) for trial in trials}
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,13 @@ from probewise.progress import Progress, silent
 from probewise.proof.campaign import read_campaign, run_campaign
 from probewise.proof.configurations import MOST_CIRCLES, SearchConfiguration
 from probewise.proof.estimates import Estimate, estimated_share, mean_with_error, median_with_interval
+from probewise.proof.results import TrialResult, misfit
 from probewise.proof.trial import WRONG_MM, Trial, run_trial
 
 __all__ = ["Study", "Summary", "read_study", "run_study", "summarise"]
 
 _CHANCE = 0.01
+_MISFIT = partial(misfit, kind=TrialResult)
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,7 @@ def run_study(
         executor=executor,
         progress=progress,
         noun="runs",
+        misfit=_MISFIT,
     )
     own = {row: tuple(results[Trial(row, k).key] for k in range(n)) for row, n in wanted.items()}
     return Study(own, max_readings)
@@ -177,8 +181,8 @@ def read_study(path: str | os.PathLike[str], rows: Sequence[SearchConfiguration]
 
     Raises FileError if the file does not belong to a study.
     """
-    found = read_campaign(path)
-    if "study" not in found.settings:
+    found = read_campaign(path, misfit=_MISFIT)
+    if "study" not in found.settings or not isinstance(found.settings.get("max_readings"), int):
         raise FileError(Path(path), "no study's campaign", "a file that `probewise study` wrote")
     numbers = range(1 + max((int(key.rpartition(" / ")[2]) for key in found.results), default=-1))
     keys = {row: [Trial(row, k).key for k in numbers] for row in rows}

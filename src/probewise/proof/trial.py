@@ -108,16 +108,7 @@ def experiment_of_trial(trial: Trial) -> Experiment:
 
 @own_arithmetic
 def run_trial(trial: Trial) -> dict[str, Any]:
-    """Search for a circle.
-
-    Returns
-    -------
-    A dict for JSON. Search: whether the target precision was `reached`, number of `readings`, number of the first one
-    on white (`first_white`, or None), `bits` gained in all and up to that one (`bits_at_white`). Result: largest error
-    of a length (`error_mm`), its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 % interval
-    covers the truth (`held`), p-value of the fit (`p_value`, None: not tested), widest posterior sd after each reading
-    (`widest_mm`). Cost: arm time in seconds (`arm_s`), median processor time per decision in seconds (`cpu_s`).
-    """
+    """Search for a circle; return a `TrialResult`."""
     experiment = experiment_of_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
     for step, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):

@@ -1,0 +1,80 @@
+"""Results in a campaign's file that somebody changed by hand: one line says which, and nothing is counted."""
+
+import copy
+import json
+
+import pytest
+
+from probewise import __version__
+from probewise.cli import main
+from probewise.proof.challenge import Task
+from probewise.proof.concealed_study import ConcealedTrial
+from probewise.proof.configurations import REFERENCE
+from probewise.proof.results import ConcealedResult, SensorResult, TrialResult, misfit, misfit_of_case
+from probewise.proof.trial import Trial
+
+RUN = {"readings": 3, "error_mm": 1.0, "chance_wrong": 0.01, "held": [True, True, False]}
+TRIAL = RUN | {"reached": True, "first_white": 2, "bits": 9.0, "bits_at_white": 4.0, "arm_s": 30.0, "cpu_s": 0.1}
+TRIAL |= {"widest_mm": [50.0, 20.0, 3.0], "p_value": None}
+HIDDEN = RUN | {"known": True, "p_truth": 0.9, "credible": ["clean"], "noticed": False, "cpu_s": [0.1, 0.2]}
+
+
+def damaged(value, path="result"):
+    """Yield (path, copy of a JSON value with one part gone or of another type)."""
+    if value is not None:
+        yield path, [] if not isinstance(value, list) else "text"
+    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        below = f"{path}.{key}" if isinstance(value, dict) else f"{path}[{key}]"
+        for where, instead in damaged(value[key], below):
+            other = copy.copy(value)
+            other[key] = instead
+            yield where, other
+
+
+@pytest.mark.parametrize("kind", [TrialResult, ConcealedResult, SensorResult])
+def test_every_part_that_is_of_another_type_or_missing_is_named(kind, make):
+    whole = {TrialResult: TRIAL, ConcealedResult: HIDDEN, SensorResult: make.single(cosine=0.2)}[kind]
+    assert misfit(whole, kind) is None
+    for path, result in damaged(whole):
+        found = misfit(result, kind)
+        assert found is not None
+        assert found[0].startswith(f"{path} is ")
+    for key in kind.__required_keys__:
+        less = {name: value for name, value in whole.items() if name != key}
+        assert misfit(less, kind)[0] == f"result.{key} is missing"
+
+
+def test_a_case_conceals_as_many_effects_as_its_kind_says(make):
+    assert misfit_of_case(make.single(), SensorResult) is None
+    assert (
+        misfit_of_case(make.case("pair", hides=[make.hidden("lag")]), SensorResult)[0] == "result.hidden has 1 of them"
+    )
+    assert "cosine" in misfit_of_case(make.case("alias", hides=[make.hidden("lag")]), SensorResult)[0]
+
+
+FILES = {
+    "study --circles 2 --model ssf": ("trials.jsonl", "study", [Trial(REFERENCE, k).key for k in (0, 1)], TRIAL),
+    "study --concealed --circles 1 --size small": (
+        "concealed.jsonl",
+        "concealed",
+        [ConcealedTrial("", 0, 0, trust).key for trust in (0.9, 1.0)],
+        HIDDEN,
+    ),
+    "challenge --cases 2 --seed 5": ("cases.jsonl", "challenge", [Task(5, k).key for k in (0, 1)], None),
+}
+
+
+@pytest.mark.parametrize("command", FILES)
+def test_a_damaged_result_ends_the_verb_in_one_line(command, make, tmp_path, capsys):
+    name, key, tasks, result = FILES[command]
+    result = make.single() if result is None else result
+    settings = {key: __version__} | ({"seed": 5} if key == "challenge" else {"max_readings": 100})
+    lines = [{"format": "campaign/1", "settings": settings | ({"seed": 2013} if key == "concealed" else {})}]
+    lines += [{"key": task, "result": result} for task in tasks]
+    lines[-1]["result"] = {**result, "readings": "many"}
+    (tmp_path / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert main([*command.split(), "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert f"{name}, line 3: result.readings is 'many'; allowed: a whole number" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "table.csv").exists()

@@ -127,7 +127,7 @@ def test_what_an_instrument_does_not_say_is_taken_for_the_usual():
     assert arm.orientation_rad(PLACES).tolist() == [0.0, 0.0]
     there, farther = arm.travel_s(Pose(0.0, 0.0), PLACES)
     assert farther - there == pytest.approx(50.0 / SimulatedArm(lambda *_: 0.0).speed.move_mm_s)
-    assert (arm.can_turn, arm.can_lift) == (False, False)
+    assert (arm.turns, arm.lifts) == (False, False)
 
 
 def test_where_it_cannot_go_it_need_not_say_how_long_it_takes():

@@ -15,7 +15,7 @@ from probewise.cli._bench import warn_if_place_sd_large
 from probewise.cli._fit_geometry import bring_to_mark, place_after_moves
 from probewise.cli._record import PersonAtBench, SheetCheck, uniform_shades_at_places
 from probewise.emulator import parse_scene
-from probewise.emulator.scenes import scene_text
+from probewise.emulator.bench import scene_text
 from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
 
 OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}

@@ -47,7 +47,7 @@ def lost(clock: VirtualClock, **turned_deg: float) -> EmulatedBench:
     clock.sleep(0.01)
     bench.radio.brick.advance()
     for port in bench.radio.brick.outputs.ports:
-        port.reset_counter(block=False)
+        port.rotation_count = 0
     return bench
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from probewise.emulator import Battery, Brick, Motor, MotorParameters, VirtualClock
-from probewise.emulator.output import OutputPort, RunState
+from probewise.emulator.motors import OutputPort, RunState
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from probewise.emulator import Brick, EmptyPort, VirtualClock
-from probewise.emulator.output import OutputSetting
+from probewise.emulator.motors import OutputSetting
 from probewise.emulator.protocol import COMMANDS, FrameAssembler, framed
 
 

@@ -11,10 +11,10 @@ from scipy.special import ndtr
 
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.fitting import fit_geometry, spread_mark_places
-from probewise.arm.geometry import Accuracy
-from probewise.arm.uncertainty import (
+from probewise.arm.geometry import (
     FITTED,
     RULER_SDS,
+    Accuracy,
     fitted_parameter_values,
     place_jacobian,
     places_at_parameters,

@@ -13,8 +13,7 @@ from scipy.stats import norm
 
 from probewise import scene
 from probewise.arm import Pose, Reading, read_geometry, shipped_geometry_path
-from probewise.arm.geometry import Accuracy
-from probewise.arm.uncertainty import FITTED
+from probewise.arm.geometry import FITTED, Accuracy
 from probewise.calibration import FittedSensor, posterior_mean_ssf_field, predict
 from probewise.effects import Origin
 from probewise.errors import ParameterError

@@ -3,13 +3,19 @@
 from probewise.arm.carry_out import RequestToPerson, carry_out, readings_of_recording, recording_of_readings
 from probewise.arm.geometry import Geometry, Joint
 from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
-from probewise.arm.instrument import Instrument, Pose, Reading
+from probewise.arm.instrument import (
+    FIELD_MM,
+    Instrument,
+    Pose,
+    Reach,
+    Reading,
+    ReadingScale,
+    Workspace,
+    require_within_reach,
+)
 from probewise.arm.lego import LegoArm, percent_to_lego_units
-from probewise.arm.limits import SoftLimits
-from probewise.arm.machine import DryRun, Machine
-from probewise.arm.own_instrument import Measures, OwnInstrument, as_instrument
-from probewise.arm.reach import FIELD_MM, Reach, Workspace, require_within_reach
-from probewise.arm.scale import ReadingScale
+from probewise.arm.machine import DryRun, Machine, SoftLimits
+from probewise.arm.own import Measures, OwnInstrument, as_instrument
 from probewise.arm.simulated import Light, SimulatedArm, Speed
 
 __all__ = [

@@ -9,10 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm.instrument import Instrument, Pose, Reading
+from probewise.arm.instrument import Instrument, Pose, ReachablePlaces, Reading, require_within_reach
 from probewise.arm.lego import LegoArm
-from probewise.arm.own_instrument import Measures, OwnInstrument, as_instrument
-from probewise.arm.reach import ReachablePlaces, require_within_reach
+from probewise.arm.own import Measures, OwnInstrument, as_instrument
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Uniform

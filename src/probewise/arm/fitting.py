@@ -15,10 +15,12 @@ from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, floats
-from probewise.arm.geometry import JOINTS, Accuracy, Geometry
-from probewise.arm.uncertainty import (
+from probewise.arm.geometry import (
     FITTED,
+    JOINTS,
     RULER_SDS,
+    Accuracy,
+    Geometry,
     fitted_parameter_values,
     place_jacobian,
     places_at_parameters,

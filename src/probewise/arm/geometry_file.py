@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from probewise._kinds import checked_path
-from probewise.arm.geometry import JOINTS, Accuracy, Geometry, Joint
-from probewise.arm.uncertainty import FITTED
+from probewise.arm.geometry import FITTED, JOINTS, Accuracy, Geometry, Joint
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.text import read_text
 

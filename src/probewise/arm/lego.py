@@ -15,12 +15,9 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_finite_number
 from probewise._signals import defer_signals
-from probewise.arm.basics import Clock, Side
 from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped_to_pi
-from probewise.arm.instrument import Pose, Reading
+from probewise.arm.instrument import Clock, Pose, Reading, ReadingScale, Side, require_within_reach
 from probewise.arm.machine import Machine
-from probewise.arm.reach import require_within_reach
-from probewise.arm.scale import ReadingScale
 from probewise.errors import LinkError, ReachError
 
 BASE, SHOULDER, ELBOW = range(3)

@@ -48,7 +48,7 @@ from probewise.cli._bench import (
 from probewise.cli._common import message_to_resume, print_result, print_warning
 from probewise.cli._output import checked_output_file
 from probewise.cli._stopping import reporting_what_is_kept
-from probewise.emulator.scenes import scene_text
+from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
 from probewise.recordings.atomic import is_device_or_pipe

@@ -4,19 +4,21 @@ The emulator answers LEGO's Bluetooth protocol byte for byte, simulates motors t
 over a `world`. It shares no code with the driver in `arm`, so each tests the other.
 """
 
-from probewise.emulator.arm import EmulatedArm, Joint, SensorPose
-from probewise.emulator.bench import EmulatedBench, set_up_bench
+from probewise.emulator.arm import (
+    EmulatedArm,
+    Geometry,
+    Joint,
+    JointParameters,
+    SensorPose,
+    read_geometry,
+    shipped_geometry_path,
+)
+from probewise.emulator.bench import EmulatedBench, LightModel, Tabletop, parse_scene, set_up_bench
 from probewise.emulator.brick import Battery, Brick
-from probewise.emulator.clock import Clock, VirtualClock
-from probewise.emulator.faults import Faults
-from probewise.emulator.geometry import Geometry, JointParameters, read_geometry, shipped_geometry_path
-from probewise.emulator.light_model import LightModel
-from probewise.emulator.line import VirtualLine
-from probewise.emulator.motor import Motor, MotorParameters
-from probewise.emulator.radio import Radio, Trace
-from probewise.emulator.scenes import parse_scene
-from probewise.emulator.sensors import AnalogSensor, DigitalSensor, EmptyPort, LightSensor, ultrasonic_sensor
-from probewise.emulator.table import Tabletop
+from probewise.emulator.inputs import AnalogSensor, DigitalSensor, EmptyPort, LightSensor, ultrasonic_sensor
+from probewise.emulator.motors import Motor, MotorParameters
+from probewise.emulator.protocol import Clock, VirtualClock
+from probewise.emulator.radio import Faults, Radio, Trace, VirtualLine
 
 __all__ = [
     "AnalogSensor",

@@ -1,13 +1,124 @@
-"""Forward kinematics of the arm: from motors through gears with backlash to joints and the sensor's pose."""
+"""The arm as built, read from its TOML file: motors turn joints through gears with backlash, joints place the sensor.
+
+The emulator has its own reader, so that driver and emulator cannot share a mistake.
+"""
 
 from __future__ import annotations
 
 import math
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from importlib import resources
+from pathlib import Path
+from typing import Any, Self
 
-from probewise.emulator.geometry import Geometry, JointParameters
-from probewise.emulator.motor import Motor, MotorParameters
+from probewise.emulator.motors import Motor, MotorParameters
+from probewise.errors import FileError, shown
+from probewise.recordings import read_text
+
+LARGEST = 1e6
+
+
+@dataclass(frozen=True)
+class JointParameters:
+    """One joint: motor port, gear ratio (motor turns per joint turn), angle at count 0, limits, backlash, stop."""
+
+    port: str
+    gear_ratio: float
+    home_deg: float
+    low_deg: float
+    high_deg: float
+    play_deg: float
+    stop_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Dimensions of the arm, in mm and degrees; the shipped TOML file explains each."""
+
+    base_mm: tuple[float, float]
+    shoulder_mm: tuple[float, float]  # forward of the base's axis, above the surface
+    links_mm: tuple[float, float]
+    elbow_is_absolute: bool
+    sensor_port: int
+    sensor_mm: tuple[float, float]  # forward of the wrist, below it
+    mounting_deg: float
+    read_height_mm: float
+    joints: tuple[JointParameters, JointParameters, JointParameters]  # base, shoulder, elbow
+
+
+def shipped_geometry_path() -> Path:
+    """Return the path of the arm file shipped with the package."""
+    return Path(str(resources.files("probewise"))) / "data" / "lego_arm.toml"
+
+
+def read_geometry(path: Path) -> Geometry:
+    """Read an arm's dimensions from a TOML file of format "arm/1".
+
+    Raises
+    ------
+    FileError
+        If the file is missing or not TOML, or an entry is missing or not allowed.
+    """
+    text = read_text(path, "an arm's file of format arm/1")
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # not TOML, a number of thousands of digits, or nested too deep
+        raise FileError(path, f"not TOML: {error}", "an arm's file of format arm/1") from error
+
+    def number(*keys: str) -> float:
+        value = _value_in_file(path, table, keys)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            raise FileError(path, f"{'.'.join(keys)} is {shown(value)}", f"a number of magnitude up to {LARGEST:g}")
+        return float(value)
+
+    def joint(name: str) -> JointParameters:
+        port = _value_in_file(path, table, ("joints", name, "port"))
+        if port not in ("A", "B", "C"):
+            raise FileError(path, f"joints.{name}.port is {shown(port)}", "A, B or C")
+        ratio = number("joints", name, "gear_ratio")
+        if ratio == 0:
+            raise FileError(path, f"joints.{name}.gear_ratio is 0", "any other number")
+        home, low, high, play = (number("joints", name, f"{key}_deg") for key in ("home", "low", "high", "play"))
+        if not low <= home <= high:
+            raise FileError(path, f"joints.{name}.home_deg is {home:g}", f"within its limits, {low:g} to {high:g}")
+        stop = number("joints", name, "stop_deg") if "stop_deg" in table["joints"][name] else None
+        if stop is not None and low < stop < high:
+            allowed = f"at or beyond a limit, {low:g} or {high:g}"
+            raise FileError(path, f"joints.{name}.stop_deg is {stop:g}", allowed)
+        return JointParameters(port, ratio, home_deg=home, low_deg=low, high_deg=high, play_deg=play, stop_deg=stop)
+
+    elbow = _value_in_file(path, table, ("links", "elbow"))
+    if elbow not in ("absolute", "relative"):
+        raise FileError(path, f"links.elbow is {shown(elbow)}", '"absolute" or "relative"')
+    joints = (joint("base"), joint("shoulder"), joint("elbow"))
+    if len({j.port for j in joints}) < len(joints):
+        raise FileError(path, f"the joints' ports are {', '.join(j.port for j in joints)}", "three different ports")
+    sensor_port = number("sensor", "port")
+    if sensor_port not in (1, 2, 3, 4):
+        raise FileError(path, f"sensor.port is {sensor_port:g}", "1, 2, 3 or 4")
+    return Geometry(
+        base_mm=(number("base", "x_mm"), number("base", "y_mm")),
+        shoulder_mm=(number("base", "shoulder_forward_mm"), number("base", "shoulder_height_mm")),
+        links_mm=(number("links", "upper_mm"), number("links", "lower_mm")),
+        elbow_is_absolute=elbow == "absolute",
+        sensor_port=int(sensor_port),
+        sensor_mm=(number("sensor", "forward_mm"), number("sensor", "drop_mm")),
+        mounting_deg=number("sensor", "mounting_deg"),
+        read_height_mm=number("sensor", "read_height_mm"),
+        joints=joints,
+    )
+
+
+def _value_in_file(path: Path, table: Mapping[str, Any], keys: tuple[str, ...]) -> object:
+    found: Any = table
+    for key in keys:
+        if not isinstance(found, Mapping) or key not in found:
+            raise FileError(path, f"{'.'.join(keys)} is missing", "every number of format arm/1")
+        found = found[key]
+    return found
+
 
 _BEYOND_LIMITS_DEG = 3.0  # a mechanical stop that the file does not give lies this far outside the limit
 

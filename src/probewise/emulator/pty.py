@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from probewise.emulator.clock import Clock
+from probewise.emulator.protocol import Clock
 from probewise.emulator.radio import Radio
 from probewise.errors import FileError
 
@@ -20,15 +20,8 @@ _LONGEST_WAIT_S = 0.05
 class Terminal:
     """A raw pseudo-terminal; clients may come and go.
 
-    Parameters
-    ----------
-    link
-        Path of a symbolic link to the terminal that survives disconnections, as /dev/rfcomm0 does; None: no link.
-
-    Raises
-    ------
-    FileError
-        If the path exists and is not a symbolic link.
+    `link` is the path of a symbolic link to it that survives disconnections, as /dev/rfcomm0 does; FileError if
+    something else is at that path.
     """
 
     def __init__(self, link: Path | None = None) -> None:
@@ -89,18 +82,9 @@ def serve(
     on_move: Callable[[str], None],
     meanwhile: Callable[[], None],
 ) -> None:
-    """Pass bytes between client and brick until the brick goes to sleep.
+    """Pass bytes between client and brick until the brick goes to sleep; its clock must run in real time.
 
-    Parameters
-    ----------
-    terminal, radio
-        The terminal and the link to connect.
-    clock
-        The brick's clock, which must run in real time.
-    on_move
-        Function called with the terminal's new path if a disconnection has changed that path.
-    meanwhile
-        Function called repeatedly, at least every 50 ms.
+    `on_move` is called with the terminal's new path if a disconnection changed it, `meanwhile` at least every 50 ms.
     """
     while not radio.brick.is_off:
         due_s = radio.next_arrival_s

@@ -7,16 +7,93 @@ a virtual clock, delivers the bytes at that time.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import Literal, TypeAlias
+from typing import Literal, Self, TypeAlias
 
 import numpy as np
 
 from probewise.emulator.brick import Brick
-from probewise.emulator.clock import Clock
-from probewise.emulator.faults import Faults
-from probewise.emulator.protocol import COMMANDS, FrameAssembler, Status, build_reply, framed, parse_request
+from probewise.emulator.protocol import (
+    COMMANDS,
+    Clock,
+    FrameAssembler,
+    Status,
+    VirtualClock,
+    build_reply,
+    framed,
+    parse_request,
+)
+from probewise.errors import LinkError, ParameterError
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Rates of faults, 0 to 1; by default a link without faults."""
+
+    fragment: float = 0.0  # a reply comes in pieces, up to 30 ms apart
+    merge: float = 0.0  # a reply is delayed and delivered together with the next one
+    double: float = 0.0  # a reply comes twice, the second time up to 0.1 s later
+    corrupt: float = 0.0  # one byte of a reply, its length included, is changed
+    late: float = 0.0  # a reply is late
+    late_s: float = 3.0  # by so many seconds
+    drop: float = 0.0  # a byte of a reply is lost, per byte
+    half: float = 0.0  # the end of a telegram is lost, equally likely of a request or of a reply
+    error: float = 0.0  # a request is refused with an error status and not executed
+    silence: float = 0.0  # a request is executed but never answered
+    deaf: float = 0.0  # a request is lost on the way to the brick
+    unasked: float = 0.0  # the brick sends a message of its own before a reply
+    disconnect: float = 0.0  # the link ends when a request arrives; the request is executed and motors run on
+    sag: float = 0.0  # millivolts that the battery loses per minute
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name in ("late_s", "sag"):
+                if not 0 <= value < float("inf"):
+                    raise ParameterError(item.name, value, "0 or more")
+            elif not 0 <= value <= 1:
+                raise ParameterError(item.name, value, "a probability, 0 to 1")
+
+    @classmethod
+    def parse(cls, texts: Iterable[str]) -> Self:
+        """Parse texts NAME, NAME=RATE or late=RATE,SECONDS, one fault each.
+
+        NAME alone means: every reply fragmented, one byte in 200 dropped, disconnection at one request in 500, a
+        battery loss of 60 mV per minute, any other fault at one request in 20. ParameterError for any other text.
+        """
+        faults = cls()
+        for text in texts:
+            name, equals, value = text.partition("=")
+            if name not in _USUAL:
+                raise ParameterError("--fault", text, f"one of {', '.join(_USUAL)}, optionally followed by =RATE")
+            names = ("late", "late_s") if name == "late" else (name,)
+            try:
+                numbers = [float(part) for part in value.split(",")] if equals else [_USUAL[name]]
+                faults = replace(faults, **dict(zip(names[: len(numbers)], numbers, strict=True)))
+            except ParameterError as error:
+                raise ParameterError("--fault", text, f"{error.name} {error.allowed}") from error
+            except ValueError as error:
+                raise ParameterError("--fault", text, f"{name}=RATE, such as {name}={_USUAL[name]:g}") from error
+        return faults
+
+
+_USUAL = {
+    "fragment": 1.0,
+    "merge": 0.05,
+    "double": 0.05,
+    "corrupt": 0.05,
+    "late": 0.05,
+    "drop": 0.005,
+    "half": 0.05,
+    "error": 0.05,
+    "silence": 0.05,
+    "deaf": 0.05,
+    "unasked": 0.05,
+    "disconnect": 0.002,
+    "sag": 60.0,
+}
 
 Event: TypeAlias = Literal[">", "<", "!"]
 Trace: TypeAlias = Callable[[float, Event, str], None]
@@ -34,29 +111,9 @@ def ignore_trace(now_s: float, event: Event, text: str) -> None:
 
 
 class Radio:
-    """A Bluetooth link to a brick, as its host sees it.
+    """A Bluetooth link to a brick, as its host sees it; `rng` draws the faults, `mishaps` counts each.
 
-    Parameters
-    ----------
-    brick
-        The brick.
-    clock
-        The brick's clock.
-    rng
-        Source of randomness for the faults.
-    faults
-        Rates of the faults.
-    turnaround_s
-        Time from the end of a request to its reply.
-    trace
-        Function that is called with every telegram and fault, see `Trace`.
-
-    Attributes
-    ----------
-    faults
-        Rates of the faults; may be replaced at any time.
-    mishaps
-        Number of occurrences of each fault.
+    `faults` may be replaced at any time. `turnaround_s` is the time from the end of a request to its reply.
     """
 
     def __init__(
@@ -177,3 +234,43 @@ class Radio:
         command = COMMANDS.get(telegram[1]) if len(telegram) > 1 else None
         name = "unknown" if command is None else command.name
         self._trace(self._clock(), event, f"{telegram.hex(' ')}  {name}")
+
+
+class VirtualLine:
+    """A new connection to the brick within this process, on a virtual clock, which it advances instead of waiting."""
+
+    name = "the emulator"
+
+    def __init__(self, radio: Radio, clock: VirtualClock) -> None:
+        self._radio, self._clock = radio, clock
+        self._received = bytearray()
+        self._closed = False
+        radio.reconnect()
+
+    def read(self, size: int, timeout_s: float) -> bytes:
+        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`; LinkError if the line is cut."""
+        deadline_s = self._clock() + timeout_s
+        while True:
+            self._received += self._radio.receive()
+            if len(self._received) >= size or self._clock() >= deadline_s:
+                break
+            self._require_open()
+            next_arrival_s = self._radio.next_arrival_s
+            until_s = deadline_s if next_arrival_s is None else min(next_arrival_s, deadline_s)
+            self._clock.sleep(max(until_s - self._clock(), 0.0))
+        data = bytes(self._received[:size])
+        del self._received[:size]
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes; LinkError if the line is cut."""
+        self._require_open()
+        self._radio.send(data)
+
+    def close(self) -> None:
+        """Close the line; the state of the brick does not change."""
+        self._closed = True
+
+    def _require_open(self) -> None:
+        if self._closed or not self._radio.is_open:
+            raise LinkError("the line to the emulated brick is cut; open a new one")

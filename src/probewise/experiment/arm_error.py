@@ -17,9 +17,8 @@ from dataclasses import replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.arm.geometry import Accuracy, Geometry
+from probewise.arm.geometry import FITTED, Accuracy, Geometry, place_jacobian
 from probewise.arm.instrument import Reading
-from probewise.arm.uncertainty import FITTED, place_jacobian
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.fitted_arm import FittedArm

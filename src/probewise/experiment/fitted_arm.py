@@ -8,8 +8,7 @@ from typing import Self
 import numpy as np
 
 from probewise._kinds import require_kind
-from probewise.arm.geometry import Geometry
-from probewise.arm.uncertainty import place_jacobian
+from probewise.arm.geometry import Geometry, place_jacobian
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.errors import ParameterError
 

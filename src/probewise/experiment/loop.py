@@ -19,7 +19,7 @@ import numpy as np
 from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_path, checked_whole, require_callable, require_kind, require_rng
 from probewise.arm.instrument import Instrument, Reading
-from probewise.arm.own_instrument import Measures, as_instrument, require_measures
+from probewise.arm.own import Measures, as_instrument, require_measures
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
 from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_readings_and_utilities
 from probewise.experiment.aligned_angles import with_aligned_angles

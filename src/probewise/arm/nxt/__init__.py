@@ -4,15 +4,11 @@ Telegrams are pure values and bytes; the link sends and receives them; motor, li
 interface. Each layer can be used and tested without those above it.
 """
 
-from probewise.arm.nxt.brick import Brick
+from probewise.arm.nxt.brick import Brick, BrickMachine
 from probewise.arm.nxt.light import LightReading, LightSensor, SensorError, normalized_from_counts
-from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, Timing
-from probewise.arm.nxt.machine import BrickMachine
+from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, SerialPort, Timing
 from probewise.arm.nxt.motor import DriveParameters, Guard, Motor, MotorError
-from probewise.arm.nxt.serial_port import SerialPort
-from probewise.arm.nxt.status import BrickError
-from probewise.arm.nxt.telegram import Reply, Request, decode, encode, framed
-from probewise.arm.nxt.wire import TelegramError
+from probewise.arm.nxt.telegram import BrickError, Reply, Request, TelegramError, decode, encode, framed
 
 __all__ = [
     "Brick",

@@ -7,10 +7,9 @@ import itertools
 import time
 from dataclasses import dataclass
 
-from probewise.arm.basics import Clock
+from probewise.arm.instrument import Clock
 from probewise.arm.nxt.link import Link
-from probewise.arm.nxt.telegram import GetInputValues, InputValues, SensorMode, SensorType, SetInputMode
-from probewise.arm.nxt.wire import TelegramError
+from probewise.arm.nxt.telegram import GetInputValues, InputValues, SensorMode, SensorType, SetInputMode, TelegramError
 from probewise.errors import LinkError, ParameterError
 
 AD_MAX = 1023
@@ -57,18 +56,9 @@ class LightReading:
 
 
 class LightSensor:
-    """A light sensor at one of the brick's inputs, read in RAW mode.
+    """A light sensor at one of the brick's inputs, 0 to 3 for 1 to 4, read in RAW mode.
 
-    Parameters
-    ----------
-    link
-        The connection to the brick.
-    port
-        0 to 3, for inputs 1 to 4.
-    clock
-        Clock used for waiting.
-    valid_s
-        Seconds for which a read is repeated while the brick marks the reading as invalid; at least three attempts.
+    While the brick marks a reading as invalid, the read is repeated for `valid_s`, three times at least.
     """
 
     def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:

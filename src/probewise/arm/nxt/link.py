@@ -8,30 +8,38 @@ The same is done if data are waiting before a question is sent, such as a duplic
 
 from __future__ import annotations
 
+import os
+import shlex
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, Self, TypeVar
 
-from probewise.arm.basics import Clock
-from probewise.arm.nxt.status import BrickError
+from probewise.arm.instrument import Clock
 from probewise.arm.nxt.telegram import (
     LONGEST,
+    Body,
+    BrickError,
     GetBatteryLevel,
     GetFirmwareVersion,
     KeepAlive,
     Reply,
     Request,
+    TelegramError,
     decode,
     encode,
     framed,
 )
-from probewise.arm.nxt.wire import Answer, TelegramError
 from probewise.errors import LinkError, ParameterError
 
-A = TypeVar("A", bound=Answer)
+if TYPE_CHECKING:
+    import serial
 
-FENCES: tuple[Request[Answer], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
+
+A = TypeVar("A", bound=Body)
+
+FENCES: tuple[Request[Body], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
 UNKNOWN = -1  # a question sent by another program before this one began
 
 
@@ -44,23 +52,11 @@ class ByteStream(Protocol):
         ...
 
     def read(self, size: int, timeout_s: float) -> bytes:
-        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`.
-
-        Raises
-        ------
-        LinkError
-            If the connection is lost.
-        """
+        """Return up to `size` bytes, fewer if no more come in `timeout_s`; LinkError if the connection is lost."""
         ...
 
     def write(self, data: bytes) -> None:
-        """Send all bytes.
-
-        Raises
-        ------
-        LinkError
-            If the connection is lost.
-        """
+        """Send all bytes; LinkError if the connection is lost."""
         ...
 
     def close(self) -> None:
@@ -70,30 +66,14 @@ class ByteStream(Protocol):
 
 @dataclass(frozen=True)
 class Timing:
-    """Timeouts and delays of the connection, in seconds.
+    """Timeouts and delays of the connection."""
 
-    Parameters
-    ----------
-    answer_s
-        Timeout of an answer.
-    turn_s
-        Time in which the radio changes between sending and receiving; a question with its answer takes two.
-    gap_s
-        Pause after a telegram without an answer.
-    silence_s
-        Silence after which the stream counts as drained.
-    keep_awake_s
-        Interval between keep-alive commands; a third of the brick's sleep limit if that is shorter.
-    n_repeats
-        Number of repeats of a question without a valid answer, if repeating it is harmless.
-    """
-
-    answer_s: float = 2.0
-    turn_s: float = 0.03
-    gap_s: float = 0.015
-    silence_s: float = 0.2
-    keep_awake_s: float = 60.0
-    n_repeats: int = 2
+    answer_s: float = 2.0  # timeout of an answer
+    turn_s: float = 0.03  # the radio changes between sending and receiving; a question with its answer takes two
+    gap_s: float = 0.015  # pause after a telegram without an answer
+    silence_s: float = 0.2  # after which the stream counts as drained
+    keep_awake_s: float = 60.0  # between keep-alive commands; a third of the brick's sleep limit if that is shorter
+    n_repeats: int = 2  # of a question without a valid answer, if repeating it is harmless
 
     def __post_init__(self) -> None:
         for name in ("answer_s", "silence_s", "keep_awake_s"):
@@ -116,21 +96,9 @@ class NoAnswerError(LinkError):
 
 
 class Link:
-    """A connection to a brick, one question at a time.
+    """A connection to a brick over an open stream, one question at a time.
 
-    Parameters
-    ----------
-    stream
-        The open connection.
-    clock
-        Clock used for waiting; a fake clock in tests.
-    timing
-        Timeouts and pauses.
-
-    Attributes
-    ----------
-    n_asked, n_told
-        Number of questions sent, and of commands sent without requesting an answer.
+    `n_asked` and `n_told` count the questions, and the commands sent without requesting an answer.
     """
 
     def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:
@@ -283,3 +251,67 @@ class Link:
                 )
             got += self._stream.read(size - len(got), left_s)
         return got
+
+
+WRITE_S = 2.0
+
+
+class SerialPort:
+    """A serial port in raw mode: /dev/rfcomm0, COM5, /dev/tty.NXT-DevB, a pseudo-terminal."""
+
+    def __init__(self, port: serial.Serial) -> None:
+        self._port = port
+
+    @classmethod
+    def open(cls, path: str) -> Self:
+        """Open a port exclusively; LinkError if that fails, or pyserial is not installed."""
+        try:
+            import serial
+        except ImportError as error:
+            raise LinkError(
+                "the NXT needs pyserial, which is not installed; install it with: "
+                f"{shlex.quote(sys.executable or 'python')} -m pip install pyserial"
+            ) from error
+        # A radio serial port has no baud rate; a pseudo-terminal on some systems refuses exclusive locks.
+        try:
+            return cls(serial.Serial(path, timeout=0, write_timeout=WRITE_S, exclusive=True))
+        except (OSError, ValueError) as error:
+            raise LinkError(
+                f"{path} cannot be opened ({_system_message(error)}); is the brick on, paired and bound to that port, "
+                "and does no other program use it?"
+            ) from error
+
+    @property
+    def name(self) -> str:
+        """The port's path."""
+        return str(self._port.name)
+
+    def read(self, size: int, timeout_s: float) -> bytes:
+        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`; LinkError if the line is cut."""
+        try:
+            self._port.timeout = timeout_s
+            return bytes(self._port.read(size))
+        except OSError as error:
+            raise self._link_cut_error(error) from error
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes; LinkError if the line is cut."""
+        try:
+            self._port.write(data)
+        except OSError as error:
+            raise self._link_cut_error(error) from error
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+    def _link_cut_error(self, error: OSError) -> LinkError:
+        return LinkError(
+            f"the line to the NXT on {self.name} is cut ({_system_message(error)}); is the brick on and near?"
+        )
+
+
+def _system_message(error: Exception) -> str:
+    """Return the system's message, without pyserial's additions."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number else str(error)

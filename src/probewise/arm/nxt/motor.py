@@ -14,10 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from probewise.arm.basics import Clock, Side
+from probewise.arm.instrument import Clock, Side
 from probewise.arm.nxt.link import Link, NoAnswerError
-from probewise.arm.nxt.status import BrickError
 from probewise.arm.nxt.telegram import (
+    BrickError,
     GetOutputState,
     OutputMode,
     OutputState,
@@ -25,8 +25,8 @@ from probewise.arm.nxt.telegram import (
     ResetMotorPosition,
     RunState,
     SetOutputState,
+    TelegramError,
 )
-from probewise.arm.nxt.wire import TelegramError
 from probewise.errors import LinkError, ParameterError
 
 Guard: TypeAlias = Callable[[int, int], None]
@@ -47,40 +47,18 @@ class MotorError(LinkError):
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """Parameters of driving a motor; counts are degrees of its shaft.
-
-    Parameters
-    ----------
-    fast_power, slow_power
-        Power of fast moves, and of the final approach, 1 to 100; each unit is about 10 counts/s.
-    seek_power
-        Unregulated power towards a mechanical stop, low enough to limit the force on the stop.
-    coast_counts
-        First estimate of the coast after a fast move; for slow moves in proportion to the power.
-    tolerance_counts
-        Largest distance from the goal that counts as reached.
-    lead_counts
-        Least distance to back off, to approach from the right side; more than the play.
-    runaway_counts
-        Overrun at which a motor is stopped.
-    settle_s
-        Waiting time after stopping until the count is read.
-    stuck_s
-        Time without a change of count after which a running motor is stuck.
-    n_moves
-        Largest number of moves for one goal.
-    """
+    """Parameters of driving a motor; counts are degrees of its shaft, a unit of power is about 10 counts/s."""
 
     fast_power: int = 60
-    slow_power: int = 15
-    seek_power: int = 30
-    coast_counts: int = 60
-    tolerance_counts: int = 1
-    lead_counts: int = 30
-    runaway_counts: int = 100
-    settle_s: float = 0.2
-    stuck_s: float = 1.5
-    n_moves: int = 12
+    slow_power: int = 15  # of the final approach
+    seek_power: int = 30  # towards a mechanical stop, unregulated: low enough to limit the force on it
+    coast_counts: int = 60  # first estimate after a fast move; for slow moves in proportion to the power
+    tolerance_counts: int = 1  # largest distance from the goal that counts as reached
+    lead_counts: int = 30  # least distance to back off, to approach from the right side; more than the play
+    runaway_counts: int = 100  # overrun at which a motor is stopped
+    settle_s: float = 0.2  # from stopping until the count is read
+    stuck_s: float = 1.5  # without a change of count after which a running motor is stuck
+    n_moves: int = 12  # for one goal
 
     def __post_init__(self) -> None:
         if not 1 <= self.slow_power <= self.fast_power <= 100:
@@ -100,26 +78,10 @@ class DriveParameters:
 
 
 class Motor:
-    """One motor of a brick.
+    """One motor of a brick, at port 0 to 2 for A to C.
 
-    Parameters
-    ----------
-    link
-        The connection to the brick.
-    port
-        0 to 2, for A to C.
-    guard
-        Function of the counts at the start and at the end of a move; it raises ReachError to refuse the move. None: no
-        limits.
-    drive
-        Driving parameters; None: those of a lightly loaded motor.
-    clock
-        Clock used for waiting.
-
-    Attributes
-    ----------
-    last_counts
-        Last value read of the rotation counter; 0 at first.
+    `guard` refuses moves by raising ReachError; None: no limits. `drive` None is for a lightly loaded motor.
+    `last_counts` is the last value read of the rotation counter; 0 at first.
     """
 
     def __init__(
@@ -175,16 +137,8 @@ class Motor:
     def move_to(self, goal: int, side: Side) -> int:
         """Turn to a count, approaching with the count rising (side 1) or falling (-1), and hold the motor there.
 
-        Returns
-        -------
-        The count at rest, within the tolerance of the goal.
-
-        Raises
-        ------
-        ReachError
-            If the guard refuses a move, which is then not made.
-        MotorError
-            If the motor does not reach the goal.
+        Return the count at rest, within the tolerance of the goal. ReachError if the guard refuses a move, which is
+        then not made; MotorError if the motor does not reach the goal.
         """
         here = self.counts()
         for _ in range(self.drive.n_moves):
@@ -215,23 +169,9 @@ class Motor:
         return here
 
     def find_stop(self, side: Side, farthest: int) -> int:
-        """Turn gently in a direction until a stop is met, and hold; limits are not checked.
+        """Turn gently, count rising (side 1) or falling (-1), until a stop is met, and hold; return the count there.
 
-        Parameters
-        ----------
-        side
-            Direction of turning: 1 with the count rising, -1 falling.
-        farthest
-            Largest distance to the stop, in counts.
-
-        Returns
-        -------
-        The count at the stop.
-
-        Raises
-        ------
-        MotorError
-            If the motor meets no stop within `farthest`.
+        Limits are not checked. MotorError if the motor meets no stop within `farthest` counts.
         """
         start = self._find_firmware_target()
         power = side * self.drive.seek_power
@@ -261,9 +201,8 @@ class Motor:
         fast, slow = self.drive.fast_power, self.drive.slow_power
         target = goal - side * self._coast_counts(slow, side)
         if side * self._checked_target >= side * target:
-            here = (
-                self._find_firmware_target()
-            )  # a target left by a move in the other direction would lead beyond the goal
+            # A target left by a move in the other direction would lead beyond the goal.
+            here = self._find_firmware_target()
         least = max(side * here, side * self._checked_target) + 1  # a target behind this position causes no motion
         short = goal - side * (2 * self.drive.lead_counts + self._coast_counts(fast, side))
         if side * short > least + self.drive.lead_counts:

@@ -8,22 +8,87 @@ that the arm needs are here.
 
 from __future__ import annotations
 
+import dataclasses
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import ClassVar, Generic, TypeVar, cast
+from typing import ClassVar, Generic, Self, TypeVar, cast
 
-from probewise.arm.nxt.status import OK, BrickError
-from probewise.arm.nxt.wire import Answer, CommandFields, IntegerField, TelegramError, in_hex, packed_field
+from probewise.errors import LinkError
 
-A_co = TypeVar("A_co", bound=Answer, covariant=True)
+
+class TelegramError(LinkError):
+    """Raised for bytes that are not the expected telegram; the message shows the bytes and the expectation."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """Body of a command or an answer: successive fields, their little-endian `LAYOUT` as in Python's module struct."""
+
+    LAYOUT: ClassVar[str] = ""
+
+    def pack(self) -> bytes:
+        """Encode the fields, whole numbers."""
+        return struct.pack("<" + self.LAYOUT, *(getattr(self, field.name) for field in dataclasses.fields(self)))
+
+    @classmethod
+    def unpack(cls, raw: bytes) -> Self:
+        """Decode the fields; a text ends at its first NUL and is Latin-1. TelegramError for a wrong number of bytes."""
+        try:
+            values = struct.unpack("<" + cls.LAYOUT, raw)
+        except struct.error as error:
+            size = struct.calcsize("<" + cls.LAYOUT)
+            raise TelegramError(f"{cls.__name__} has {size} bytes; there are {len(raw)}: {in_hex(raw)}") from error
+        return cls(*(v.partition(b"\0")[0].decode("latin-1") if isinstance(v, bytes) else v for v in values))
+
+
+def in_hex(raw: bytes) -> str:
+    """Format bytes in hexadecimal."""
+    return raw.hex(" ").upper() or "no bytes"
+
+
+OK = 0x00
+
+MEANINGS: Mapping[int, str] = {
+    0x8A: "undefined error",
+    0xBD: "the request failed; is there a file of that name on the brick?",
+    0xBE: "the brick does not know this command",
+    0xBF: "the brick finds the telegram malformed",
+    0xC0: "a value is out of range: a port that is none, or a file that is not there",
+    0xDD: "I2C bus error; is the sensor plugged in?",
+    0xDE: "no room in the communication buffer",
+    0xDF: "the connection is not valid",
+    0xE0: "the port is busy, or not set up for such a sensor",
+    0xEC: "no program is running on the brick",
+    0xED: "illegal size",
+    0xEF: "invalid structure field",
+    0xF0: "no such port",
+    0xFB: "the brick is out of memory",
+    0xFF: "bad arguments",
+}
+"""Meanings of the status bytes that these commands get; 00 is success."""
+
+
+class BrickError(LinkError):
+    """Raised if the brick refused a command; `status` is its status byte."""
+
+    def __init__(self, command: str, status: int) -> None:
+        self.command, self.status = command, status
+        meaning = MEANINGS.get(status, "a status that has no known meaning")
+        super().__init__(f"the brick answered {command} with status {status:02X}: {meaning}")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (self.command, self.status)
+
+
+A_co = TypeVar("A_co", bound=Body, covariant=True)
 
 SYSTEM, REPLY, NO_REPLY = 0x01, 0x02, 0x80
 FIRST_SYSTEM_OPCODE = 0x80
 LONGEST = 128
 """Bytes of the longest telegram that a brick sends or takes over Bluetooth."""
 
-_OUTPUT, _INPUT, _PERCENT = IntegerField("B", 0, 2), IntegerField("B", 0, 3), IntegerField("b", -100, 100)
 
 ALL_OUTPUTS = 0xFF
 
@@ -66,16 +131,16 @@ class RunState(IntEnum):
 
 
 @dataclass(frozen=True)
-class Done(Answer):
+class Done(Body):
     """Confirmation of a command, without content."""
 
 
 @dataclass(frozen=True)
-class Request(CommandFields, Generic[A_co]):
+class Request(Body, Generic[A_co]):
     """A command, generic in the type of a successful answer, `REPLY`."""
 
     OPCODE: ClassVar[int]
-    REPLY: ClassVar[type[Answer]] = Done
+    REPLY: ClassVar[type[Body]] = Done
 
     @property
     def is_repeatable(self) -> bool:
@@ -113,13 +178,14 @@ class SetOutputState(Request[Done]):
     """Drive a motor, or all with port 255; `limit_counts` 0 is no limit. The defaults release the motor."""
 
     OPCODE = 0x04
-    port: int = packed_field(IntegerField("B", 0, 2, (ALL_OUTPUTS,)))
-    power: int = packed_field(_PERCENT, 0)
-    mode: int = packed_field(IntegerField("B", 0, 7), OutputMode.IDLE)
-    regulation: int = packed_field(IntegerField("B", 0, 2), Regulation.IDLE)
-    turn_ratio: int = packed_field(_PERCENT, 0)
-    run_state: int = packed_field(IntegerField("B", 0, 0, (0x10, 0x20, 0x40)), RunState.IDLE)
-    limit_counts: int = packed_field(IntegerField("I", 0, 0xFFFFFFFF), 0)
+    LAYOUT = "BbBBbBI"
+    port: int
+    power: int = 0
+    mode: int = OutputMode.IDLE
+    regulation: int = Regulation.IDLE
+    turn_ratio: int = 0
+    run_state: int = RunState.IDLE
+    limit_counts: int = 0
 
     @property
     def is_repeatable(self) -> bool:
@@ -132,13 +198,14 @@ class SetInputMode(Request[Done]):
     """Set the sensor type and the reading mode of an input."""
 
     OPCODE = 0x05
-    port: int = packed_field(_INPUT)
-    type: int = packed_field(IntegerField("B", 0, 0x12))
-    mode: int = packed_field(IntegerField("B", 0, 0xFF))
+    LAYOUT = "BBB"
+    port: int
+    type: int
+    mode: int
 
 
 @dataclass(frozen=True)
-class OutputState(Answer):
+class OutputState(Body):
     """State of a motor, and its three counters in counts (degrees of its shaft)."""
 
     LAYOUT = "BbBBbBIiii"
@@ -160,11 +227,12 @@ class GetOutputState(Request[OutputState]):
 
     OPCODE = 0x06
     REPLY = OutputState
-    port: int = packed_field(_OUTPUT)
+    LAYOUT = "B"
+    port: int
 
 
 @dataclass(frozen=True)
-class InputValues(Answer):
+class InputValues(Body):
     """Values of an input, raw and converted; out of date while `valid` is 0."""
 
     LAYOUT = "BBBBBHHhh"
@@ -185,7 +253,8 @@ class GetInputValues(Request[InputValues]):
 
     OPCODE = 0x07
     REPLY = InputValues
-    port: int = packed_field(_INPUT)
+    LAYOUT = "B"
+    port: int
 
 
 @dataclass(frozen=True)
@@ -193,12 +262,13 @@ class ResetMotorPosition(Request[Done]):
     """Set the block counter (`relative` 1) or the rotation counter (0) of a motor to 0."""
 
     OPCODE = 0x0A
-    port: int = packed_field(_OUTPUT)
-    relative: int = packed_field(IntegerField("B", 0, 1))
+    LAYOUT = "BB"
+    port: int
+    relative: int
 
 
 @dataclass(frozen=True)
-class BatteryLevel(Answer):
+class BatteryLevel(Body):
     """The battery's voltage, in mV."""
 
     LAYOUT = "H"
@@ -214,7 +284,7 @@ class GetBatteryLevel(Request[BatteryLevel]):
 
 
 @dataclass(frozen=True)
-class SleepLimit(Answer):
+class SleepLimit(Body):
     """Time in ms without keys or keep-alives after which the brick switches itself off; 0: never."""
 
     LAYOUT = "I"
@@ -230,7 +300,7 @@ class KeepAlive(Request[SleepLimit]):
 
 
 @dataclass(frozen=True)
-class ProgramName(Answer):
+class ProgramName(Body):
     """File name of the running program."""
 
     LAYOUT = "20s"
@@ -246,7 +316,7 @@ class GetCurrentProgramName(Request[ProgramName]):
 
 
 @dataclass(frozen=True)
-class FirmwareVersion(Answer):
+class FirmwareVersion(Body):
     """Versions of protocol and firmware."""
 
     LAYOUT = "4B"
@@ -265,7 +335,7 @@ class GetFirmwareVersion(Request[FirmwareVersion]):
 
 
 @dataclass(frozen=True)
-class DeviceInfo(Answer):
+class DeviceInfo(Body):
     """Name of the brick."""
 
     LAYOUT = "15s15x"
@@ -289,20 +359,14 @@ class Reply:
     body: bytes
 
 
-def encode(request: Request[Answer], *, wants_reply: bool = True) -> bytes:
+def encode(request: Request[Body], *, wants_reply: bool = True) -> bytes:
     """Encode a command as a telegram, without its length."""
     first = SYSTEM if request.OPCODE >= FIRST_SYSTEM_OPCODE else 0
     return bytes([first if wants_reply else first | NO_REPLY, request.OPCODE]) + request.pack()
 
 
 def decode(telegram: bytes) -> Reply:
-    """Decode a reply, without its length.
-
-    Raises
-    ------
-    TelegramError
-        If the bytes are not a reply.
-    """
+    """Decode a reply, without its length; TelegramError if the bytes are none."""
     if len(telegram) < 3 or telegram[0] != REPLY:
         raise TelegramError(f"a reply has the type 02, an opcode and a status; there is {in_hex(telegram)}")
     return Reply(telegram[1], telegram[2], telegram[3:])

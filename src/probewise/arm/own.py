@@ -20,8 +20,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_finite_number, require_callable, require_like
 from probewise._signals import defer_signals
-from probewise.arm.basics import Clock
-from probewise.arm.instrument import Instrument, Pose, Reading
+from probewise.arm.instrument import Clock, Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
 from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of
@@ -128,20 +127,16 @@ class OwnInstrument:
             )
 
     @property
-    def can_turn(self) -> bool:
+    def turns(self) -> bool:
         """Whether the object turns its sensor to `pose.orientation_rad`: its attribute `turns`, by default False."""
         with self._errors_located("turns"):
             return bool(getattr(self._own, "turns", False))
 
-    turns = can_turn  # as every instrument declares it
-
     @property
-    def can_lift(self) -> bool:
+    def lifts(self) -> bool:
         """Whether the object reads at a given `pose.height_mm`: its attribute `lifts`, by default False."""
         with self._errors_located("lifts"):
             return bool(getattr(self._own, "lifts", False))
-
-    lifts = can_lift  # as every instrument declares it
 
     @property
     def read_height_mm(self) -> float | None:
@@ -173,7 +168,8 @@ class OwnInstrument:
         own = getattr(self._own, "orientation_rad", 0.0)
         with self._errors_located("orientation_rad"):
             angles = own(places_mm) if callable(own) else own
-            return _finite_array_per_place("orientation_rad", angles, len(places_mm), "a finite number of radians")
+            allowed = "a finite number of radians"
+            return _floats_per_place("orientation_rad", angles, len(places_mm), allowed, finite=True)
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Return the seconds to move from `start` to each place and read, (n_places,); default: 100 mm/s plus 1.2 s."""
@@ -183,7 +179,7 @@ class OwnInstrument:
             return np.asarray(away / self._speed.move_mm_s + self._speed.read_s)
         with self._errors_located("travel_s"):
             allowed = "seconds, finite, 0 or more; nan out of reach"
-            seconds = _float_array_per_place("travel_s", own(start, places_mm), len(places_mm), allowed)
+            seconds = _floats_per_place("travel_s", own(start, places_mm), len(places_mm), allowed, finite=False)
             wrong = ~((seconds >= 0) & (seconds < math.inf))
             if wrong.any() and (wrong[self.reachable(places_mm)].any() or (seconds[wrong] < math.inf).any()):
                 raise ParameterError("what travel_s returned", float(seconds[wrong][0]), allowed)
@@ -340,15 +336,8 @@ def _array_per_place(name: str, found: object, n_places: int, allowed: str) -> A
     return array
 
 
-def _float_array_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+def _floats_per_place(name: str, found: object, n_places: int, allowed: str, *, finite: bool) -> FloatArray:
     array = _array_per_place(name, found, n_places, allowed)
-    if array.dtype.kind not in "biuf":
+    if array.dtype.kind not in "biuf" or (finite and not np.isfinite(array).all()):
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
     return np.asarray(array, dtype=np.float64)
-
-
-def _finite_array_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
-    array = _float_array_per_place(name, found, n_places, allowed)
-    if not np.isfinite(array).all():
-        raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
-    return array

@@ -50,10 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise._progress import progress_shown
     from probewise.proof import challenge_page as report
     from probewise.proof.challenge import RunCaseInRounds, run_case, run_challenge
-    from probewise.proof.rounds import score_rounds
     from probewise.proof.system_challenge import run_system_case
-    from probewise.proof.system_tables import score_systems
-    from probewise.proof.tables import score
+    from probewise.proof.tables import score, score_rounds, score_systems
 
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")

@@ -10,8 +10,7 @@ from probewise._words import count_with_noun
 from probewise.proof.estimates import Estimate
 from probewise.proof.plots import confusion_matrix, reliability_diagram
 from probewise.proof.scoring import NOISE, are_names_right, confusion_counts, leading_hypothesis, reliability_bins
-from probewise.proof.system_tables import gains_on_held_out_runs, name_without_target
-from probewise.proof.tables import ScoreRow, detected_and_named_by_effect
+from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, gains_on_held_out_runs, name_without_target
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots.canvas import png

@@ -187,6 +187,24 @@ def leading_probability_and_correctness(result: Result) -> tuple[float, bool]:
     return probability, names_match(names, right_names_of_each_effect(result, merged=False))
 
 
+def names_effect_on_mean(result: Result) -> bool:
+    """Return whether the diagnosis names an effect on the mean ("unknown" is none)."""
+    return bool(set(result["combination"]) - NOISE - {"unknown"})
+
+
+def is_confidently_wrong(result: Result) -> bool:
+    """Return whether a wrong effect, or an alias, has a probability above 0.9; "clean" and "unknown" do not count."""
+    probability, right = leading_probability_and_correctness(result)
+    names = leading_hypothesis(result, clean=True)[0]
+    return probability > 0.9 and not right and names not in ((), ("unknown",))
+
+
+def credible_set_size_with_aliases_merged(result: Result) -> float:
+    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
+    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
+    return float(len(result["credible_set"]) - max(right - 1, 0))
+
+
 def names_in_label(label: str) -> Names:
     """Split a label of a credible set, such as "lag+backlash", into names; "clean" has none."""
     return () if label == "clean" else tuple(label.split("+"))

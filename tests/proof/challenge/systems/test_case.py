@@ -6,7 +6,7 @@ import pytest
 
 from probewise.proof.challenge import Task, run_challenge
 from probewise.proof.system_challenge import run_system_case
-from probewise.proof.system_tables import score_systems
+from probewise.proof.tables import score_systems
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import pytest
 
 from probewise.proof.challenge_page import _case_cells, page_html
-from probewise.proof.system_tables import gains_on_held_out_runs, name_without_target, score_systems
+from probewise.proof.tables import gains_on_held_out_runs, name_without_target, score_systems
 
 
 def _hidden(name, size=12.0, *, rivals=None, on_the_list=True, shows_in=("time",)):

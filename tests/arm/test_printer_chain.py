@@ -31,6 +31,8 @@ WORLD = World(SPOT, black=140.0, white=840.0, noise_sd=8.0)
 class Person:
     """Reads what is asked, lays the sheet or turns the sensor, presses Enter."""
 
+    encoding = "utf-8"
+
     def __init__(self, say):
         self.surface, self.turned_rad, self.asked = CIRCLE, 0.0, []
         self._say, self._heard = say, ""

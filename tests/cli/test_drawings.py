@@ -15,7 +15,7 @@ from probewise.report.html import figure
 from probewise.systems import run_table_csv
 
 HEATER = ("--simulator", "heater.py")
-DIAGNOSIS = ("diagnosis.json", "sensor.json", "calibrated.json", "next_plan.csv", "next_plan.json", "report.html")
+DIAGNOSIS = ("diagnosis.json", "sensor.json", "calibrated.json", "report.html")
 # Of each command, the files that it leaves where no figure can be drawn.
 COMMANDS = {
     "audit small.csv": ("audit.json", "cure_plan.csv", "cure_plan.json", "report.html"),
@@ -33,7 +33,7 @@ COMMANDS = {
     "calibrate small.csv --orders 1 --live 16": ("sensor.json", "report.html"),
     "diagnose small.csv": DIAGNOSIS,
     "diagnose data.csv --simulator heater.py": (
-        *("diagnosis.json", "repaired.json", "calibrated.json", "next.csv", "report.html"),
+        *("diagnosis.json", "repaired.json", "calibrated.json", "report.html"),
     ),
     "investigate --plan small.csv --truth nothing --rounds 1": (
         *(*DIAGNOSIS, "recording.csv", "recording.json", "rounds/settings.json"),
@@ -56,7 +56,7 @@ class InThisProcess(Executor):
 def short_demo(monkeypatch):
     """A demo of few readings."""
     monkeypatch.setattr("probewise.cli._workers.worker_pool", lambda n: InThisProcess())
-    for name, n in (("N_LIVE", 40), ("N_LIVE_ROBOT", 40), ("MAX_READINGS", 3), ("MAX_READINGS_DOUBT", 2)):
+    for name, n in (("N_LIVE", 80), ("N_LIVE_ROBOT", 40), ("MAX_READINGS", 3), ("MAX_READINGS_DOUBT", 2)):
         monkeypatch.setattr(demo, name, n)
 
 

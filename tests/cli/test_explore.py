@@ -207,7 +207,7 @@ def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, mo
     arguments = ["explore", "--sensor", sensor_file, "--out", tmp_path / "out", "--max-readings", 2, "--quiet"]
     assert main([str(a) for a in arguments]) == 0
     moves = [note for note in told if "moving to (" in note]
-    assert [note.partition(",")[0] for note in moves] == ["reading 1", "reading 2"]
+    assert [note.partition(",")[0] for note in moves] == ["reading 1 of at most 2", "reading 2 of at most 2"]
     assert "; widest sd" in moves[1]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from probewise.calibration import FittedSensor, OrderEvidence, PriorRow, ScanNoise, read_sensor, write_sensor
-from probewise.effects import EdgeShadow
+from probewise.effects.optics import EdgeShadow
 from probewise.errors import FileError, ParameterError, ShapeError
 
 

@@ -30,7 +30,9 @@ from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.sensors import FreeFormSensor, default_sensor, sensor_from_posterior, theta_to_natural
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
-from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
+from probewise.effects import VOCABULARY, Extent
+from probewise.effects.noise import CorrelatedNoise
+from probewise.effects.pose import Backlash
 from probewise.effects.reference import candidate_scan_groups, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import (

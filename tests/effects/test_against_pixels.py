@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from probewise.effects import VOCABULARY, HeightGradient, HeightOffset, SensorTilt, SlowSinking
+from probewise.effects import VOCABULARY
+from probewise.effects.optics import HeightGradient, HeightOffset, SlowSinking
+from probewise.effects.pose import SensorTilt
 from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Quadrant, Uniform
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, Stage

@@ -11,42 +11,34 @@ import pytest
 
 from probewise._words import value_with_sd
 from probewise.diagnosis.findings import parameters_found
-from probewise.effects import (
-    RARE_EFFECTS,
-    VOCABULARY,
+from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
+from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
+from probewise.effects.noise import CorrelatedNoise, Dropouts
+from probewise.effects.optics import (
     AlbedoGradient,
-    AmbientGradient,
-    AmbientStep,
-    ArmKnock,
-    Backlash,
-    CorrelatedNoise,
-    Dropouts,
     EdgeMisplacement,
     EdgeShadow,
-    Extent,
+    Glint,
+    Halo,
+    HeightOffset,
+    Reflection,
+    ScanMisplacement,
+    distinct_scan_lines,
+)
+from probewise.effects.pose import ArmKnock, Backlash, MissingTooth, PeriodicPositionError, ScanAngleError, StickSlip
+from probewise.effects.reading import (
+    AmbientGradient,
+    AmbientStep,
     Flicker,
     GainDrift,
     GainStep,
-    Glint,
-    Halo,
-    HeavyTailedPrior,
-    HeightOffset,
     Hysteresis,
     Lag,
-    LogHeavyTailedPrior,
-    MissingTooth,
     Nonlinearity,
     Overshoot,
-    PeriodicPositionError,
     Polarisation,
-    Reflection,
     Saturation,
-    ScanAngleError,
-    ScanMisplacement,
-    StickSlip,
 )
-from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
-from probewise.effects.optics import distinct_scan_lines
 from probewise.effects.reference import CountsFromOrigin, Origin, orientation_deg, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uniform, paper_plan, two_way_plan

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from probewise.effects import AmbientGradient, Known, Nonlinearity
+from probewise.effects import Known
+from probewise.effects.reading import AmbientGradient, Nonlinearity
 from probewise.errors import ParameterError
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene

@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from probewise.effects import (
+from probewise.effects import Extent
+from probewise.effects.noise import (
     CorrelatedNoise,
     Dropouts,
-    Extent,
     Outliers,
-    PredictiveMixture,
     Quantisation,
     RandomWalk,
     SignalDependentNoise,
     lattice_step,
-    log_density,
     sd_of_estimated_lattice_step,
 )
+from probewise.effects.noise_distribution import PredictiveMixture, log_density
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseParameters

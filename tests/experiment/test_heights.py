@@ -10,7 +10,7 @@ import pytest
 from probewise.arm import LegoArm, Pose, Reading, as_instrument, read_geometry, shipped_geometry_path
 from probewise.calibration import FittedSensor
 from probewise.cli._bench import InstrumentWithCallbacks
-from probewise.effects import HeightGradient
+from probewise.effects.optics import HeightGradient
 from probewise.errors import DoubtfulResultWarning, ParameterError, ReachError
 from probewise.experiment import (
     arm_over,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.effects import GainDrift
+from probewise.effects.reading import GainDrift
 from probewise.inquiry import Grid
 from probewise.inquiry.culling import CullingBounds
 from probewise.inquiry.forecast import predict_where_visible

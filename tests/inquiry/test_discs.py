@@ -6,7 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.effects import VOCABULARY, AlbedoGradient, Backlash, EdgeBlur, Hysteresis, Known, Saturation
+from probewise.effects import VOCABULARY, Known
+from probewise.effects.optics import AlbedoGradient, EdgeBlur
+from probewise.effects.pose import Backlash
+from probewise.effects.reading import Hysteresis, Saturation
 from probewise.inquiry import (
     Designs,
     DirectForecast,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from probewise.effects import GainDrift
+from probewise.effects.reading import GainDrift
 from probewise.inquiry import (
     Designs,
     DirectForecast,

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from mixtures import fixed_mixture
 from scipy.special import ndtr
 
-from probewise.effects import HeightGradient, PositionScale
+from probewise.effects.optics import HeightGradient
+from probewise.effects.pose import PositionScale
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds

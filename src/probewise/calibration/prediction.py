@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
-from probewise.effects import PredictiveMixture
+from probewise.effects.noise_distribution import PredictiveMixture
 from probewise.effects.reference import CountsTimeFromOrigin
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.progress import Progress, silent

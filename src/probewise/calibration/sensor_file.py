@@ -26,7 +26,9 @@ from probewise.calibration.fields import posterior_mean_ssf_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
-from probewise.effects import EFFECTS, CountsFromOrigin, EdgeShadow, Origin
+from probewise.effects import EFFECTS, Origin
+from probewise.effects.optics import EdgeShadow
+from probewise.effects.reference import CountsFromOrigin
 from probewise.errors import FileError, ParameterError, ProbewiseError, printable, shown
 from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene

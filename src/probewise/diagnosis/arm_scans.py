@@ -17,8 +17,7 @@ from scipy.special import ndtr
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_READINGS
 from probewise.diagnosis.joining import join_plans, last_known_value
-from probewise.effects import orientation_deg
-from probewise.effects.reference import median_gap_s
+from probewise.effects.reference import median_gap_s, orientation_deg
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED

@@ -22,8 +22,9 @@ from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocab
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.verdict import Hypothesis, Judged
 from probewise.diagnosis.words import p_in_words, substitute_reading_unit
-from probewise.effects import Dropouts, NamedEffect, NoiseEffect, is_out_of_vocabulary
+from probewise.effects import NamedEffect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
+from probewise.effects.noise import Dropouts
 from probewise.recordings.plan import Plan
 
 _LEAST_PROBABILITY = 1e-3

@@ -31,16 +31,8 @@ from probewise.diagnosis.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.sensors import CalibratedSensor, SsfForms
-from probewise.effects import (
-    EFFECTS,
-    NUISANCES,
-    RARE_EFFECTS,
-    VOCABULARY,
-    Extent,
-    NamedEffect,
-    orientation_deg,
-    sign_of_motion,
-)
+from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Extent, NamedEffect
+from probewise.effects.reference import orientation_deg, sign_of_motion
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene import edge_distance, region_of
 from probewise.sensor import FAST_NODES, FreeMixture

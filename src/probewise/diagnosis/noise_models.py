@@ -18,7 +18,9 @@ from probewise.diagnosis.noise_law import (
     previous_usable,
 )
 from probewise.diagnosis.noise_memory import with_known_wide_readings
-from probewise.effects import FittedReadings, NoiseEffect, lattice_step
+from probewise.effects import NoiseEffect
+from probewise.effects.noise import lattice_step
+from probewise.effects.noise_distribution import FittedReadings
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseParameters, effects_with_columns

@@ -20,8 +20,7 @@ from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
 from probewise.diagnosis.noise_law import NoiseLaw, Tail, white_noise_of_recording
 from probewise.diagnosis.templates import log_mean_exp
-from probewise.effects import Dropouts
-from probewise.effects.noise import LARGEST_SIZE, MOST_OUTLYING
+from probewise.effects.noise import LARGEST_SIZE, MOST_OUTLYING, Dropouts
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 

@@ -19,15 +19,9 @@ from probewise.diagnosis.fit import FARTHEST, Fit, Predictor, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.posterior import posterior_draws
 from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_by_label, templates_of_effect
-from probewise.effects import (
-    NUISANCES,
-    Extent,
-    NamedEffect,
-    NoiseEffect,
-    Quantisation,
-    origins_of,
-    sd_of_estimated_lattice_step,
-)
+from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect
+from probewise.effects.noise import Quantisation, sd_of_estimated_lattice_step
+from probewise.effects.reference import origins_of
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.progress import Progress, silent
 from probewise.recordings import fingerprint

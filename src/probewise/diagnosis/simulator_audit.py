@@ -12,7 +12,8 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise.diagnosis.audit import LAMBDA, EffectAudit, ExpectedSensor, PlanAudit, PlanTemplates, audits_and_cosines
 from probewise.diagnosis.simulator_rows import ON_NOISE, SimulatorApparatus
-from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, name_of_first_copy
+from probewise.effects import NUISANCES, NamedEffect, name_of_first_copy
+from probewise.effects.noise import NoisePerRun
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for

@@ -15,12 +15,11 @@ from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.effects import (
+from probewise.effects import Extent, NamedEffect
+from probewise.effects.noise import (
     CorrelatedNoise,
     DriftingNoise,
     Dropouts,
-    Extent,
-    NamedEffect,
     NoisePerRun,
     Outliers,
     Quantisation,

@@ -28,7 +28,8 @@ from probewise.diagnosis.evidence import (
 from probewise.diagnosis.fit import Fit, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.prior_odds import Names
-from probewise.effects import NamedEffect, scan_indicator
+from probewise.effects import NamedEffect
+from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
 _ABSENT = 1e-9  # share of a template's sum of squares below which its projection is rounding error

@@ -7,15 +7,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-from probewise.effects import (
-    EFFECTS,
-    NUISANCES,
-    PROPOSAL,
-    NoisePerRun,
-    RandomWalk,
-    name_without_copy_suffix,
-    spoken_name,
-)
+from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, name_without_copy_suffix, spoken_name
+from probewise.effects.noise import NoisePerRun, RandomWalk
 from probewise.systems.forms import WORDS
 
 _LEAST_P = 1e-300  # smallest p-value that floating point represents reliably

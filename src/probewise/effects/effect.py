@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, ClassVar, Protocol, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,15 +18,14 @@ from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reference import Extent
 from probewise.errors import ParameterError
-from probewise.priors import Product, Uniform
+from probewise.priors import Prior, Product, Uniform
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import Effect, NoiseParameters
+from probewise.sensor.stages import NoiseParameters, Stage
 
 _BOTH_SIGNS = 0.05  # least share of samples of either sign
 _NEAR_ZERO, _FEW_NEAR_ZERO = 0.1, 0.01  # in medians of their sizes; of a normal distribution about 0, .054 are so near
 _OWN = ("name", "stage", "units", "covariates", "prior", "apply", "bank", "sentence")
-_MOST_TIMES = 512
-_FEW = 48  # intervals, enough to detect that something changed in one of them
+_MOST_CHANGE_POINTS, _FEW = 512, 48  # intervals of a change point; so many that are enough to detect one
 
 
 V = TypeVar("V")
@@ -44,7 +43,7 @@ class VariantMasks:
     opened: BoolArray
 
 
-class NamedEffect(Effect[V], Protocol[V]):
+class NamedEffect(Generic[V]):
     """An effect as the diagnosis needs it: formula, prior, template bank, and a sentence for the verdict.
 
     A new effect is one class of this kind, passed as ``effects={**VOCABULARY, name: class}``. What its methods return
@@ -54,15 +53,33 @@ class NamedEffect(Effect[V], Protocol[V]):
     words: ClassVar[str] = ""
     """A noun phrase that follows "the model leaves out"; without one the name itself is written."""
 
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Unit of each parameter, in the order of `prior.names`."""
-        ...
+    if TYPE_CHECKING:  # each effect has these, besides `name`, `stage`, `prior` and `apply` of `sensor.stages.Effect`
 
-    @property
-    def covariates(self) -> tuple[str, ...]:
-        """Names of covariates against which the residuals show a trend where the effect is left out."""
-        ...
+        @property
+        def name(self) -> str: ...
+        @property
+        def stage(self) -> Stage: ...
+        @property
+        def prior(self) -> Prior: ...
+        def apply(self, value: V, theta: FloatArray, plan: Plan) -> V: ...
+
+        @property
+        def units(self) -> tuple[str, ...]:
+            """Unit of each parameter, in the order of `prior.names`."""
+
+        @property
+        def covariates(self) -> tuple[str, ...]:
+            """Names of covariates against which the residuals show a trend where the effect is left out."""
+
+        def bank(self) -> FloatArray:
+            """Return the template bank, parameter vectors of shape (n_bank, n_columns, n_params).
+
+            The columns of an entry span the change of the readings to first order; entries differ in
+            the nonlinear parameters. Effects on the noise: equally weighted nodes of the prior.
+            """
+
+        def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+            """Describe the effect in plain words; posterior mean and sd of the parameters, (n_params,) each."""
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -105,18 +122,6 @@ class NamedEffect(Effect[V], Protocol[V]):
     def is_absorbed_by_ssf(self, plan: Plan) -> bool:
         """Return whether a free SSF absorbs the effect under this plan, which hides it; by default False."""
         return False
-
-    def bank(self) -> FloatArray:
-        """Return the template bank, parameter vectors of shape (n_bank, n_columns, n_params).
-
-        The columns of an entry span the change of the readings to first order; entries differ in
-        the nonlinear parameters. Effects on the noise: equally weighted nodes of the prior.
-        """
-        ...
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the effect in plain words; posterior mean and sd of the parameters, (n_params,) each."""
-        ...
 
     @property
     def n_peaks(self) -> int:
@@ -196,7 +201,7 @@ def require_effect_classes(effects: object) -> None:
             raise ParameterError("effects", name, f"{own!r}, the name of the class {kind.__name__}")
 
 
-class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
+class NoiseEffect(NamedEffect[NoiseParameters]):
     """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True."""
 
     n_nodes: ClassVar[int] = 10
@@ -332,6 +337,52 @@ def scans_in_words(scans: tuple[str, ...]) -> str:
     return f"scan{'s' if len(scans) > 1 else ''} {', '.join(scans)}"
 
 
+def thinned(values: FloatArray, most: int) -> tuple[float, ...]:
+    """Return rising values, (n_values,), thinned to at most `most` intervals, with the first and the last."""
+    stride = -(-(len(values) - 1) // most)
+    return tuple(np.append(values[:-1:stride], values[-1]).tolist())
+
+
+@dataclass(frozen=True)
+class ChangePoints:
+    """Candidate positions of a change point, rising: times, row numbers (`by_row`) or values of a column.
+
+    Between which two of them it lies is a discrete choice; its position in that interval does not affect any reading.
+    """
+
+    at: tuple[float, ...]
+    by_row: bool = False
+    column: str = ""
+
+    @classmethod
+    def of(cls, values: FloatArray, by_row: bool = False) -> Self:
+        """Return the distinct values, thinned to at most 512 intervals."""
+        return cls(thinned(distinct_values(values), _MOST_CHANGE_POINTS), by_row)
+
+    def fewer(self) -> Self:
+        """Return at most 48 intervals, enough to detect that something changed in one of them."""
+        return replace(self, at=thinned(np.array(self.at), _FEW))
+
+    def variable_at_rows(self, plan: Any) -> FloatArray:
+        """Return the column, row number or time that is compared with the change point, (n_points,)."""
+        if self.column:
+            return np.asarray(plan.covariates[self.column])
+        return np.asarray(plan.row_number if self.by_row else plan.time_s)
+
+    def masks(self, entry: FloatArray, plan: Any) -> VariantMasks:
+        """Return the masks of the rows after the middle of each interval, and a bank entry that acts on all rows."""
+        always, along = entry.copy(), self.variable_at_rows(plan)
+        always[:, -1] = -np.inf
+        return VariantMasks(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.at)]))
+
+    def redrawn(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw theta's last column: for each sample an interval by `weights`, (n_intervals,), uniform within it."""
+        at = np.array(self.at)
+        chosen = rng.choice(len(weights), len(theta), p=weights)
+        drawn = at[chosen] + np.diff(at)[chosen] * rng.random(len(theta))
+        return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
+
+
 @dataclass(frozen=True)
 class ChangePointEffect(NamedEffect[V]):
     """Base of effects that act on the readings taken after `at_s`, the last parameter.
@@ -376,7 +427,6 @@ class ChangePointEffect(NamedEffect[V]):
 
     @property
     def has_change_point(self) -> bool:
-        """True."""
         return True
 
     def variants(self) -> tuple[Self, ...]:
@@ -384,38 +434,19 @@ class ChangePointEffect(NamedEffect[V]):
         return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
 
     def with_fewer_variants(self) -> Self:
-        """Return the effect with neighbouring intervals joined, so that at most 48 remain."""
-        stride = -(-(len(self.times_s) - 1) // _FEW)
-        return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
+        return replace(self, times_s=ChangePoints(self.times_s).fewer().at)
 
     def variant_masks(self, plan: Plan) -> VariantMasks:
-        """Return the masks of readings after each candidate change point, (n_intervals, n_points).
-
-        A candidate is the middle of its interval. The bank entry beside the masks acts on all readings.
-        """
-        always = self.bank()[0]
-        always[:, -1] = -np.inf
-        middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]
-        return VariantMasks(always, np.array([plan.time_s > at for at in middles]))
+        return ChangePoints(self.times_s).masks(self.bank()[0], plan)
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the time of change: for each sample an interval with probability `weights`, then a time within it.
-
-        `theta` is (n_samples, n_params), in and out; `weights` is (n_intervals,).
-        """
-        times = np.array(self.times_s)
-        chosen = rng.choice(len(weights), len(theta), p=weights)
-        at_s = times[chosen] + np.diff(times)[chosen] * rng.random(len(theta))
-        return np.concatenate([theta[:, :-1], at_s[:, None]], axis=1)
+        return ChangePoints(self.times_s).redrawn(theta, weights, rng=rng)
 
 
 def candidate_change_times_s(extent: Extent) -> tuple[float, ...] | None:
     """Return the distinct times of a recording's readings, thinned to at most 512 intervals; None for one time."""
     times = distinct_values(extent.plan.time_s)
-    if len(times) < 2:
-        return None
-    stride = -(-(len(times) - 1) // _MOST_TIMES)
-    return tuple(np.append(times[:-1:stride], times[-1]).tolist())
+    return None if len(times) < 2 else thinned(times, _MOST_CHANGE_POINTS)
 
 
 PHASE = Uniform(-2 * np.pi, 2 * np.pi)

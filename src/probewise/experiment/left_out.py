@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from probewise.calibration import FittedSensor
-from probewise.effects import AmbientStep, GainDrift, OffsetDrift, spoken_name
+from probewise.effects import spoken_name
+from probewise.effects.reading import AmbientStep, GainDrift, OffsetDrift
 from probewise.experiment.pace import theta_in_seconds_of
 from probewise.experiment.rivals import WITH_CARDS
 from probewise.experiment.state import Step

@@ -12,13 +12,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.effects import (
-    CorrelatedNoise,
-    HeavyTailedPrior,
-    Outliers,
-    SignalDependentNoise,
-    lattice_step,
-)
+from probewise.effects import HeavyTailedPrior
+from probewise.effects.noise import CorrelatedNoise, Outliers, SignalDependentNoise, lattice_step
 from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.priors import LogUniform
 

@@ -15,17 +15,9 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import (
-    VOCABULARY,
-    AmbientStep,
-    Backlash,
-    Extent,
-    GainDrift,
-    Hysteresis,
-    Lag,
-    NamedEffect,
-    OffsetDrift,
-)
+from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.effects.pose import Backlash
+from probewise.effects.reading import AmbientStep, GainDrift, Hysteresis, Lag, OffsetDrift
 from probewise.errors import ParameterError
 from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.experiment.effect_with_run_prior import EffectWithRunPrior

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.effects import lattice_step
+from probewise.effects.noise import lattice_step
 from probewise.inference.student_t import StudentT
 from probewise.recordings.plan import Recording
 

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
-from probewise.effects import EdgeBlur, Halo, Known
+from probewise.effects import Known
+from probewise.effects.optics import EdgeBlur, Halo
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.scanlines import ROWS, Interval, PlacesNearEdges, ScanlineIntervals, to_single_precision

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.arm.fitting import spread_mark_places
-from probewise.effects import orientation_deg
+from probewise.effects.reference import orientation_deg
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.recordings.plan import Plan

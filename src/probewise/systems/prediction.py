@@ -14,15 +14,9 @@ from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
-from probewise.effects import (
-    AGAIN,
-    EFFECTS,
-    PROPOSAL,
-    NamedEffect,
-    NoisePerRun,
-    PredictiveMixture,
-    RandomWalk,
-)
+from probewise.effects import AGAIN, EFFECTS, PROPOSAL, NamedEffect
+from probewise.effects.noise import NoisePerRun, RandomWalk
+from probewise.effects.noise_distribution import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically

@@ -12,7 +12,9 @@ from probewise.diagnosis.arm_scans import candidate_scans
 from probewise.diagnosis.audit import ExpectedSensor, PlanTemplates, ProjectedTemplates, _curing_step_by_effect
 from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.sensors import default_sensor
-from probewise.effects import Backlash, EdgeMisplacement, Extent
+from probewise.effects import Extent
+from probewise.effects.optics import EdgeMisplacement
+from probewise.effects.pose import Backlash
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plan import Plan

@@ -14,7 +14,7 @@ from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.refits import NoiseModels
-from probewise.effects import CorrelatedNoise, DriftingNoise, Outliers, RandomWalk, SignalDependentNoise
+from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Outliers, RandomWalk, SignalDependentNoise
 from probewise.recordings import Plan, Recording
 
 N = 2000

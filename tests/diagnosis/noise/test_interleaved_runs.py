@@ -14,7 +14,7 @@ from probewise.diagnosis.noise_law import (
 )
 from probewise.diagnosis.noise_models import NoiseModel, rough_sd
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
-from probewise.effects import CorrelatedNoise
+from probewise.effects.noise import CorrelatedNoise
 from probewise.systems import RunTable, Simulator, as_recording
 
 SIMULATOR = Simulator(

@@ -17,7 +17,8 @@ from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.noise_law import NoiseLaw, Tail, white_noise
 from probewise.diagnosis.noise_models import NoiseModel, log_prior_of_lost_value, rough_sd
-from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Extent, Outliers, SignalDependentNoise
+from probewise.effects import Extent
+from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World

@@ -8,7 +8,8 @@ import pytest
 from scipy.special import gammaln, logsumexp
 
 from probewise.diagnosis.noise_law import NoiseLaw, white_noise
-from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, reading_variance
+from probewise.effects.noise import NoisePerRun, RandomWalk
+from probewise.effects.noise_distribution import FittedReadings, reading_variance
 from probewise.sensor import NoiseParameters
 
 

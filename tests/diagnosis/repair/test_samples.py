@@ -15,7 +15,9 @@ from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.samples import ModelSamples, sample_model
 from probewise.diagnosis.sensors import FreeFormSensor, GaussianMixtureSensor, default_sensor
-from probewise.effects import AmbientGradient, DriftingNoise, Extent, GainDrift
+from probewise.effects import Extent
+from probewise.effects.noise import DriftingNoise
+from probewise.effects.reading import AmbientGradient, GainDrift
 from probewise.recordings import Recording, Uniform, two_way_plan
 
 PLAN = two_way_plan()

@@ -13,7 +13,8 @@ from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.search import search as searching
 from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, are_proportional, is_significantly_better
 from probewise.diagnosis.search.searched import Evidences, posterior_of
-from probewise.effects import CorrelatedNoise, Extent, RandomWalk
+from probewise.effects import Extent
+from probewise.effects.noise import CorrelatedNoise, RandomWalk
 from probewise.priors import LogUniform, Uniform
 from probewise.progress import silent
 from probewise.systems import RunTable, Simulator

@@ -16,7 +16,8 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
-from probewise.effects import VOCABULARY, Extent, Flicker
+from probewise.effects import VOCABULARY, Extent
+from probewise.effects.reading import Flicker
 from probewise.priors import Normal, Product
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.scene import KnownScene

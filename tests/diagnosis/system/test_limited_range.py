@@ -13,7 +13,8 @@ from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.left_out import readings_near_ends, recording_from_table
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
-from probewise.effects import CorrelatedNoise, Dropouts, Extent
+from probewise.effects import Extent
+from probewise.effects.noise import CorrelatedNoise, Dropouts
 from probewise.errors import ParameterError
 from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system, table_for
 

@@ -9,7 +9,8 @@ from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.templates import templates_of_effect
-from probewise.effects import Dropouts, Extent
+from probewise.effects import Extent
+from probewise.effects.noise import Dropouts
 from probewise.systems import Simulator, table_for
 
 EPOCH = 1.7e9

@@ -620,7 +620,7 @@ def test_a_fast_wave_in_times_that_come_in_clusters_is_tried_where_the_residuals
     table = RunTable({"t": times, "y": wave}, time="t")
     system = System.of(simulator, table)
     form = bind_forms(ReferenceFit(system, table, np.zeros(system.n_params), SD))["interference"]
-    assert form.suggested is not None
+    assert form.suggested.size
     assert np.abs(form.bank()[:, 0, 1] - 1 / 4.785).min() < 0.25 / np.ptp(times)
     assert np.isfinite(form.prior.log_prob(np.array([[SD, 1 / 4.785, 0.0]])))[0]
     # What these readings suggest is nothing to test them by: the draws of a null would have suggested others.
@@ -629,7 +629,7 @@ def test_a_fast_wave_in_times_that_come_in_clusters_is_tried_where_the_residuals
 
 
 def test_evenly_spaced_rows_suggest_no_further_frequencies():
-    assert FORMS["interference"].suggested is None
+    assert not FORMS["interference"].suggested.size
 
 
 def test_a_rate_of_change_of_what_has_no_unit_counts_from_one():

@@ -42,16 +42,8 @@ from probewise.diagnosis.templates import (
     log_bayes_factors_by_label,
     log_mean_exp,
 )
-from probewise.effects import (
-    NUISANCES,
-    CorrelatedNoise,
-    NamedEffect,
-    NoiseEffect,
-    Quantisation,
-    RandomWalk,
-    is_out_of_vocabulary,
-    lattice_step,
-)
+from probewise.effects import NUISANCES, NamedEffect, NoiseEffect, is_out_of_vocabulary
+from probewise.effects.noise import CorrelatedNoise, Quantisation, RandomWalk, lattice_step
 from probewise.effects.priors import SharedScalePrior
 from probewise.errors import NotConvergedError
 from probewise.recordings.plan import Recording

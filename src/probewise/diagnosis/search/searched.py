@@ -25,7 +25,8 @@ from probewise.diagnosis.search.refits import (
     or_impossible,
 )
 from probewise.diagnosis.templates import TemplateBank, TemplateCache
-from probewise.effects import PROPOSAL, Outliers, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects import PROPOSAL, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects.noise import Outliers
 from probewise.sensor import Stage
 
 _BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them

@@ -47,7 +47,8 @@ from probewise.diagnosis.search.refits import (
 )
 from probewise.diagnosis.sensors import Start
 from probewise.diagnosis.templates import TemplateBank, TemplateCache, log_bayes_factors_of_pairs, log_mean_exp
-from probewise.effects import AGAIN, NamedEffect, lattice_step, name_of_first_copy
+from probewise.effects import AGAIN, NamedEffect, name_of_first_copy
+from probewise.effects.noise import lattice_step
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 

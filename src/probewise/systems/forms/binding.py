@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects import AGAIN, PROPOSAL
 from probewise.errors import ParameterError
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, Form
+from probewise.systems.forms.form import Act, Form, StepForm, WaveForm
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.inputs import INPUT_WORDS, driving_columns, forms_on_inputs
 from probewise.systems.forms.parameters import PARAMETER_WORDS, forms_of_extras, forms_on_parameters
@@ -39,7 +39,7 @@ def bind_forms(about: ReferenceFit) -> dict[str, Form]:
     if (column := sorting_column(about)) is not None:
         named = [jump_in_sorted_rows(form, about.table, column) for form in named]
     found = [*named, *forms_of_extras(about)]
-    waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]
+    waves = [replace(form, name=form.name + AGAIN) for form in found if isinstance(form, WaveForm)]
     return {form.name: form for form in [*found, *waves]}
 
 
@@ -62,7 +62,7 @@ def sorting_column(about: ReferenceFit) -> str | None:
 
 def jump_in_sorted_rows(form: Form, table: RunTable, column: str) -> Form:
     """Return a form with a jump at a row as one that shows in the column, and says where that is; others as given."""
-    if form.change_points is None or not form.change_points.by_row:
+    if not isinstance(form, StepForm) or not form.change_points.by_row:
         return form
     values = table.covariates[column]
 
@@ -81,10 +81,7 @@ def names_of_jumps_in_sorted_rows(effects: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(
         name
         for name, effect in effects.items()
-        if isinstance(effect, Form)
-        and effect.change_points is not None
-        and effect.change_points.by_row
-        and effect.covariates[0] != "row"
+        if isinstance(effect, StepForm) and effect.change_points.by_row and effect.covariates[0] != "row"
     )
 
 

@@ -15,10 +15,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, varies
 from probewise._words import value_with_sd
-from probewise.effects.effect import PHASE, sine_and_cosine_entries, single_column_bank, starting_point_of_wave
+from probewise.effects.effect import PHASE, ChangePoints, sine_and_cosine_entries, single_column_bank, thinned
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, ChangePoints, Form, period_with_sd
+from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, Form, StepForm, WaveForm, period_with_sd
 from probewise.systems.forms.modulations import (
     frequency_prior,
     origin_in_words,
@@ -160,33 +160,28 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     own, values = about.system.simulator, distinct_values(about.table.covariates[name])
     if len(values) <= 2:
         return
-    at = np.append(values[: -1 : -(-(len(values) - 1) // _MOST_SWITCHES)], values[-1]).tolist()
+    at = thinned(values, _MOST_SWITCHES)
 
     def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
         return np.asarray(value + theta[:, :1] * (table.covariates[name] > theta[:, 1:2]))
 
-    entry = np.array([[[about.sd, 0.5 * (at[0] + at[-1])]]])
-    typical = about.typical_amplitude(Stage.OFFSET, act, entry, about.sd)
-    if typical is None:
-        return
-    entry[..., 0] = typical
     text = f"(1 + sign({name} - at)) / 2"
-    yield Form(
-        f"formula:reading:{own.reading}:{text}",
-        Stage.OFFSET,
-        marginals={"a": about.amplitude_prior(typical), "at": Uniform(at[0], at[-1])},
+    form = StepForm(
+        name=f"formula:reading:{own.reading}:{text}",
+        stage=Stage.OFFSET,
+        parameters={"a": AMPLITUDE, "at": Uniform(at[0], at[-1])},
         units=(own.unit, name),
         covariates=(covariate_of_column(name),),
         act=act,
-        entries=entry,
-        amplitudes=(0,),
+        entries=np.array([[[1.0, 0.5 * (at[0] + at[-1])]]]),
         says=lambda mean, sd: (
             f"{own.reading} shifts by {value_with_sd(mean[0], sd[0], own.unit)} where {name} is above "
             f"{value_with_sd(mean[1], sd[1], '')}: a proposal, not a known effect"
         ),
-        change_points=ChangePoints(tuple(at), by_row=False, gated=True, column=name),
         expression=f"a {text}",
+        change_points=ChangePoints(at, column=name),
     )
+    yield from about.scaled(form, about.sd)
 
 
 def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
@@ -205,24 +200,18 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
             sizes = f"a = {value_with_sd(mean[0], sd[0], '')} and at = {value_with_sd(mean[1], sd[1], '')}"
             return f"the rate of {state} lacks the term a {text} with {sizes}: a proposal, not a known effect"
 
-        guess = trial_rate(about, state) / (high - low)
-        entries = np.array([[[guess, at]] for at in np.quantile(values, _THRESHOLDS)])
-        typical = about.typical_amplitude(Stage.RATE, act, entries, guess)
-        if typical is None or not np.isfinite(typical):
-            continue
-        entries[:, :, 0] = typical
-        yield Form(
+        form = Form(
             f"formula:rate:{state}:{text}",
             Stage.RATE,
-            marginals={"a": about.amplitude_prior(typical), "at": Uniform(low, high)},
+            {"a": AMPLITUDE, "at": Uniform(low, high)},
             units=("", state),
             covariates=(f"state:{state}", "time"),
             act=act,
-            entries=entries,
-            amplitudes=(0,),
+            entries=single_column_bank(1.0, np.quantile(values, _THRESHOLDS)),
             says=says,
             expression=f"a {text}",
         )
+        yield from about.scaled(form, trial_rate(about, state) / (high - low))
 
 
 def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
@@ -272,28 +261,25 @@ def _covariate_name_of_variable(about: ReferenceFit, side: str, name: str) -> st
 def _single_term_form(
     about: ReferenceFit, side: str, target: str, stage: Stage, act: Act, term: _Term, guess: float
 ) -> Iterator[Form]:
-    typical = about.typical_amplitude(stage, act, np.full((1, 1, 1), guess), guess)
-    if typical is None or not np.isfinite(typical):
-        return
     where = tuple(
         _covariate_name_of_variable(about, side, c) for c in dict.fromkeys(variable.name for variable in term.variables)
     )
     text = f"a {term.text}"
     what = target if side == "reading" else f"the rate of {target}"
-    yield Form(
+    form = Form(
         f"formula:{side}:{target}:{term.text}",
         stage,
-        marginals={"a": about.amplitude_prior(typical)},
+        {"a": AMPLITUDE},
         units=("",),
         covariates=where,
         act=act,
-        entries=np.full((1, 1, 1), typical),
-        amplitudes=(0,),
+        entries=np.ones((1, 1, 1)),
         says=lambda mean, sd: (
             f"{what} lacks the term {text} with a = {value_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect"
         ),
         expression=text,
     )
+    yield from about.scaled(form, guess)
 
 
 def formula_forms_in_time(about: ReferenceFit) -> Iterator[Form]:
@@ -314,19 +300,14 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
         return np.asarray(value + 0.5 * a * (1 + np.tanh(inside / edge)))
 
     phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
-    grid = np.meshgrid(about.sd, frequencies, phases, shares, _SOFT, indexing="ij")
-    entries = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
-    typical = about.typical_amplitude(Stage.OFFSET, act, entries, about.sd)
-    if typical is None:
-        return
-    entries[:, :, 0] = typical
+    grid = np.meshgrid(1.0, frequencies, phases, shares, _SOFT, indexing="ij")
     since = f"({table.time} - {origin:.12g})" if origin else table.time
     text = f"while |({since} / period + phase) mod 1| < share / 2"
-    yield Form(
+    form = Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        marginals={
-            "a": about.amplitude_prior(typical),
+        {
+            "a": AMPLITUDE,
             "hz": frequency_prior(frequencies),
             "phase": Uniform(-1.0, 1.0),
             "share": Uniform(0.03, 0.97),
@@ -335,8 +316,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
         units=(own.unit, f"1/{about.time_unit}", "1", "1", "1"),
         covariates=("time",),
         act=act,
-        entries=entries,
-        amplitudes=(0,),
+        entries=np.stack([each.ravel() for each in grid], axis=-1)[:, None, :],
         says=lambda mean, sd: (
             f"{own.reading} shifts by {value_with_sd(mean[0], sd[0], own.unit)} during "
             f"{value_with_sd(mean[3], sd[3], '')} of every "
@@ -345,6 +325,7 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
         expression=f"a {text}",
         counted_from=origin_in_words(table.time, origin, about.time_unit),
     )
+    yield from about.scaled(form, about.sd)
 
 
 def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
@@ -363,18 +344,13 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     for hz in frequencies:
         n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
         settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
-    entries = sine_and_cosine_entries(about.sd, *np.transpose(settings))
-    typical = about.typical_amplitude(Stage.OFFSET, act, entries, about.sd)
-    if typical is None:
-        return
-    entries[:, :, 0] = typical
     turned = f"2 pi hz (u + sweep u^2 / (2 {half:.4g})) + phase"
     text = f"sin({turned}), u = {table.time} - {text_rounded_to_spread(middle, half)}"
-    yield Form(
-        f"formula:reading:{own.reading}:{text}",
-        Stage.OFFSET,
-        marginals={
-            "a": about.amplitude_prior(typical, positive=True),
+    form = WaveForm(
+        name=f"formula:reading:{own.reading}:{text}",
+        stage=Stage.OFFSET,
+        parameters={
+            "a": POSITIVE,
             "hz": frequency_prior(frequencies),
             "sweep": Uniform(-1.2, 1.2),
             "phase": PHASE,
@@ -382,16 +358,15 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
         units=(own.unit, f"1/{about.time_unit}", "1", "rad"),
         covariates=("time",),
         act=act,
-        entries=entries,
-        amplitudes=(0,),
+        entries=sine_and_cosine_entries(1.0, *np.transpose(settings)),
         says=lambda mean, sd: (
             f"{own.reading} oscillates with an amplitude of {value_with_sd(mean[0], sd[0], own.unit)} and a frequency "
             f"that goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
             "proposal, not a known effect"
         ),
-        joined=starting_point_of_wave,
         expression=f"a {text}",
     )
+    yield from about.scaled(form, about.sd)
 
 
 def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
@@ -412,34 +387,25 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
             for j in range(i + _APART, _N_SETTLING)
         ]
     )
-    typical = about.typical_amplitude(Stage.OFFSET, act, entries, 1.0, (0, 1))
-    if typical is None:
-        return
-    entries[:, :, :2] *= typical
     text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
-    yield Form(
+    form = Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        marginals={
-            "a": about.amplitude_prior(typical),
-            "b": about.amplitude_prior(typical),
-            "tau1": between,
-            "tau2": between,
-        },
+        {"a": AMPLITUDE, "b": AMPLITUDE, "tau1": between, "tau2": between},
         units=(own.unit, own.unit, about.time_unit, about.time_unit),
         covariates=("time", "run"),
         act=act,
         entries=entries,
-        amplitudes=(0, 1),
         says=lambda mean, sd: (
             f"{own.reading} is off by {value_with_sd(mean[0], sd[0], own.unit)} and "
             f"{value_with_sd(mean[1], sd[1], own.unit)} at the start of each run, which settle with time constants of "
             f"{value_with_sd(mean[2], sd[2], about.time_unit)} and {value_with_sd(mean[3], sd[3], about.time_unit)}: a "
             "proposal, not a known effect"
         ),
+        amplitudes=(0, 1),
         expression=text,
-        exchangeable=True,
     )
+    yield from about.scaled(form, 1.0)
 
 
 def formula_forms_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
@@ -465,30 +431,27 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
         a, b, c = (theta[:, k : k + 1] for k in range(3))
         return np.asarray(value + (a + b * z + c * z**2) * (rows.covariates[name] - centre) / spread)
 
-    entries = np.eye(3)[None, :, :]
-    typical = about.typical_amplitude(Stage.OFFSET, act, about.sd * entries, about.sd, (0, 1, 2))
-    if typical is None:
-        return
     scaled = f"({name} - {text_rounded_to_spread(centre, spread)}) / {spread:.4g}"
     z = f"({own.reading} - {text_rounded_to_spread(middle, half)}) / {half:.4g}"
     text = f"(a + b z + c z^2) {scaled}, z = {z}"
-    yield Form(
+    form = Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        marginals=dict.fromkeys("abc", about.amplitude_prior(typical)),
+        dict.fromkeys("abc", AMPLITUDE),
         units=(own.unit,) * 3,
         covariates=(covariate_of_column(name), "level"),
         act=act,
-        entries=typical * entries,
-        amplitudes=(0, 1, 2),
+        entries=np.eye(3)[None, :, :],
         says=lambda mean, sd: (
             f"{own.reading} rises with {name} by {value_with_sd(mean[0], sd[0], own.unit)} per sd in the middle of its "
             f"range, {value_with_sd(float(mean @ (1, -1, 1)), float(np.hypot(*sd[1:])), own.unit)} at its low end and "
             f"{value_with_sd(float(mean.sum()), float(np.hypot(*sd[1:])), own.unit)} at its high end: a proposal, "
             "not a known effect"
         ),
+        amplitudes=(0, 1, 2),
         expression=text,
     )
+    yield from about.scaled(form, about.sd)
 
 
 def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
@@ -520,19 +483,15 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
             continue
         saturating = LogUniform(_LEAST_DOSE * largest, _MOST_DOSE * largest)
         tried = np.geomspace(1.5 * saturating.low, 0.7 * saturating.high, _N_DOSES)
-        typical = about.typical_amplitude(Stage.OFFSET, act, single_column_bank(about.sd, tried), about.sd)
-        if typical is None:
-            continue
         text = f"1 - exp(-D / d), D the {summed} of {what} since the start of the run"
-        yield Form(
+        form = Form(
             f"formula:reading:{own.reading}:{text}",
             Stage.OFFSET,
-            marginals={"a": about.amplitude_prior(typical), "d": saturating},
+            {"a": AMPLITUDE, "d": saturating},
             units=(own.unit, ""),
             covariates=(covariate_of_column(name), "time", "run"),
             act=act,
-            entries=single_column_bank(typical, tried),
-            amplitudes=(0,),
+            entries=single_column_bank(1.0, tried),
             says=lambda mean, sd, what=what: (  # type: ignore[misc]  # the second name of a value, not a parameter
                 f"{own.reading} shifts in the end by {value_with_sd(mean[0], sd[0], own.unit)} as the {summed} of "
                 f"{what} grows in a run, by 63 % of it when that is {value_with_sd(mean[1], sd[1], '')}: a proposal, "
@@ -541,6 +500,7 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
             expression=f"a ({text.split(',')[0]}),{text.split(',', 1)[1]}",
             needs_rising_time=in_time,
         )
+        yield from about.scaled(form, about.sd)
 
 
 def _integral_since_start_of_run(values: FloatArray, rows: RunTable, *, in_time: bool) -> FloatArray:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
-from probewise.effects.effect import PHASE, sine_and_cosine_entries, starting_point_of_wave
+from probewise.effects.effect import PHASE, sine_and_cosine_entries
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, ActInTime, Form, Say
+from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, ActInTime, Form, WaveForm
 from probewise.systems.forms.modulations import (
     max_n_trial_frequencies,
     origin_in_words,
@@ -60,73 +60,41 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
     table, time = about.table, about.table.time
     for name in driving_columns(about):
-        values, covariate = table.covariates[name], covariate_of_column(name)
+        values, unit = table.covariates[name], about.time_unit
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
-        says = partial(_fill_sentence, f"the true {name} is the recorded {name} plus {{}}")
-        yield from _amplitude_form(
-            about,
-            f"input_offset:{name}",
-            _column_changer(name, _column_with_offset),
-            1e-4 * spread,
-            name,
-            says,
-            covariate,
-        )
-        says = partial(_fill_sentence, f"the true {name} is the recorded {name} times (1 + a), a = {{}}")
-        yield from _amplitude_form(
-            about, f"input_gain:{name}", _column_changer(name, _scaled_column), 1e-4, "1", says, covariate
-        )
+        about_it = (covariate_of_column(name),)
+
+        def amplitude(
+            kind: str, change: Change, guess: float, unit: str, says: str, name: str = name, about_it: Any = about_it
+        ) -> Iterator[Form]:
+            return _amplitude_form(about, f"{kind}:{name}", _column_changer(name, change), guess, unit, says, about_it)
+
+        def size(
+            kind: str, act: Act, most: float, unit: str, says: str, *before: str, name: str = name, it: Any = about_it
+        ) -> Iterator[Form]:
+            parameter = "tau_s" if kind == "input_delay" else "width"
+            return _log_uniform_form(about, f"{kind}:{name}", parameter, act, most, unit, says, (*before, *it))
+
+        says = f"the true {name} is the recorded {name}"
+        yield from amplitude("input_offset", _column_with_offset, 1e-4 * spread, name, f"{says} plus {{}}")
+        yield from amplitude("input_gain", _scaled_column, 1e-4, "1", f"{says} times (1 + a), a = {{}}")
         yield from _clipped_column_form(about, name)
-        says = partial(_fill_sentence, f"{name} has no effect within {{}} of 0")
         if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # if larger, it is an offset
-            yield from _log_uniform_form(
-                about,
-                f"dead_zone:{name}",
-                "width",
-                _column_changer(name, _column_with_dead_zone),
-                high - low,
-                name,
-                says,
-                covariate,
-            )
+            act = _column_changer(name, _column_with_dead_zone)
+            yield from size("dead_zone", act, high - low, name, f"{name} has no effect within {{}} of 0")
         if _moves_both_ways(values, table):
-            says = partial(_fill_sentence, f"{name} has {{}} of play")
-            yield from _log_uniform_form(
-                about,
-                f"backlash:{name}",
-                "width",
-                _column_changer(name, column_with_play),
-                high - low,
-                name,
-                says,
-                "previous",
-                covariate,
-            )
+            act = _column_changer(name, column_with_play)
+            yield from size("backlash", act, high - low, name, f"{name} has {{}} of play", "previous")
         yield from _periodic_error_form(about, name)
         if table.has_varying_time:
-            says = partial(_fill_sentence, f"{name} acts with a delay of {{}} {about.time_unit}")
-            for form in _log_uniform_form(
-                about,
-                f"input_delay:{name}",
-                "tau_s",
-                _column_delayer(about, name),
-                about.duration,
-                about.time_unit,
-                says,
-                "previous",
-                covariate,
-            ):
+            says = f"{name} acts with a delay of {{}} {unit}"
+            for form in size("input_delay", _column_delayer(about, name), about.duration, unit, says, "previous"):
                 yield replace(form, needs_rising_time=True)
     if time is not None:
-        says = partial(_fill_sentence, "the true time is the recorded time times (1 + a), a = {}")
-        origin = time_origin(table)
+        says, origin = "the true time is the recorded time times (1 + a), a = {}", time_origin(table)
         clock = _column_changer(time, _clock_scaler(origin))
-        for form in _amplitude_form(about, "clock_drift", clock, 1e-5, "1", says, "time"):
+        for form in _amplitude_form(about, "clock_drift", clock, 1e-5, "1", says, ("time",)):
             yield replace(form, counted_from=origin_in_words(time, origin, about.time_unit))
-
-
-def _fill_sentence(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
-    return sentence.format(value_with_sd(mean[0], sd[0], ""))
 
 
 def _column_with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -157,39 +125,43 @@ def _column_delayer(about: ReferenceFit, name: str) -> Act:
 
 
 def _amplitude_form(
-    about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: Say, *covariates: str
+    about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: str, covariates: tuple[str, ...]
 ) -> Iterator[Form]:
-    typical = about.typical_amplitude(Stage.INPUT, act, np.full((1, 1, 1), guess), guess)
-    if typical is not None:
-        yield Form(
-            name,
-            Stage.INPUT,
-            marginals={"a": about.amplitude_prior(typical)},
-            units=(unit,),
-            covariates=covariates,
-            act=act,
-            entries=np.full((1, 1, 1), typical),
-            amplitudes=(0,),
-            says=says,
-        )
+    form = Form(
+        name,
+        Stage.INPUT,
+        {"a": AMPLITUDE},
+        units=(unit,),
+        covariates=covariates,
+        act=act,
+        entries=np.ones((1, 1, 1)),
+        says=lambda mean, sd: says.format(value_with_sd(mean[0], sd[0], "")),
+    )
+    yield from about.scaled(form, guess)
 
 
 def _log_uniform_form(
-    about: ReferenceFit, name: str, parameter: str, act: Act, most: float, unit: str, says: Say, *covariates: str
+    about: ReferenceFit,
+    name: str,
+    parameter: str,
+    act: Act,
+    most: float,
+    unit: str,
+    says: str,
+    covariates: tuple[str, ...],
 ) -> Iterator[Form]:
     prior = about.log_uniform_size_prior(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
     if prior is not None:
-        entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
         yield Form(
             name,
             Stage.INPUT,
-            marginals={parameter: prior},
+            {parameter: prior},
             units=(unit,),
             covariates=covariates,
             act=act,
-            entries=entries,
+            entries=np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None],
+            says=lambda mean, sd: says.format(value_with_sd(mean[0], sd[0], "")),
             amplitudes=(),
-            says=says,
             absent={0: 0.0},
         )
 
@@ -208,7 +180,7 @@ def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         yield Form(
             f"input_saturation:{name}",
             Stage.INPUT,
-            marginals={"level": ends.prior},
+            {"level": ends.prior},
             units=(name,),
             covariates=(covariate_of_column(name),),
             act=act,
@@ -242,31 +214,25 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     frequencies = trial_frequencies(
         np.sort(values), [np.arange(len(values))], _max_n_trial_frequencies(about), _ROWS_OF_A_WAVE, _LEAST_WAVES
     )
-    guess = 1e-4 * float(np.std(values))
-    typical = about.typical_amplitude(Stage.INPUT, act, sine_and_cosine_entries(guess, 1 / frequencies), guess)
-    if typical is None:
-        return
-    marginals = {
-        "a": about.amplitude_prior(typical, positive=True),
-        "period": LogUniform(float(1 / frequencies[-1]) * 0.98, float(1 / frequencies[0]) / 0.9),
-        "phase": PHASE,
-    }
-    yield Form(
-        f"periodic_error:{name}",
-        Stage.INPUT,
-        marginals=marginals,
+    form = WaveForm(
+        name=f"periodic_error:{name}",
+        stage=Stage.INPUT,
+        parameters={
+            "a": POSITIVE,
+            "period": LogUniform(float(1 / frequencies[-1]) * 0.98, float(1 / frequencies[0]) / 0.9),
+            "phase": PHASE,
+        },
         units=(name, name, "rad"),
         covariates=(covariate_of_column(name),),
         act=act,
-        entries=sine_and_cosine_entries(typical, 1 / frequencies),
-        amplitudes=(0,),
+        entries=sine_and_cosine_entries(1.0, 1 / frequencies),
         says=lambda m, s: (
             f"{name} has a periodic error with an amplitude of {value_with_sd(m[0], s[0], '')} "
             f"and a period of {value_with_sd(m[1], s[1], '')}, both in units of {name}"
         ),
-        joined=starting_point_of_wave,
         counted_from=origin_in_words(name, origin),
     )
+    yield from about.scaled(form, 1e-4 * float(np.std(values)))
 
 
 def _column_with_dead_zone(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

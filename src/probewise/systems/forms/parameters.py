@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
 from probewise._arrays import FloatArray, varies
 from probewise._words import unit_of_name, value_with_sd
-from probewise.priors import LogUniform
+from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, ActInTime, Form, Say, flag_with_prior
+from probewise.systems.forms.form import Act, ActInTime, Form, Say, flag
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
     column_proportional_modulation,
     linear_drift_modulation,
+    modulated_form,
     value_per_run_modulation,
 )
-from probewise.systems.forms.readings import modulated_form
 from probewise.systems.forms.reference import ReferenceFit
 from probewise.systems.table import RunTable
 
@@ -41,7 +42,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     over: dict[str, Modulation] = {}
     if table.has_varying_time:
         over["drifts"] = linear_drift_modulation(table, about.time_unit)
-    over["steps"] = change_point_step_modulation(table, about.time_unit, gated=False)
+    over["steps"] = change_point_step_modulation(table, about.time_unit)
     columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and varies(v)]
     for name in own.parameters:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(own.parameters[name].from_unit(_QUARTILES))))
@@ -54,27 +55,13 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
             if how.between_rows is not None:
                 act = ActInTime(act, how.between_rows(name))
             yield from modulated_form(
-                about,
-                f"{kind}:{name}",
-                stage=Stage.PARAMETER,
-                how=how,
-                act=act,
-                guess=size,
-                what=name,
-                unit=unit_of_name(name),
+                about, f"{kind}:{name}", Stage.PARAMETER, how, act, size, name, unit_of_name(name)
             )
         for column in columns:
             how = column_proportional_modulation(column, table)
-            size = guess / float(np.nanstd(table.covariates[column]))
+            size, act = guess / float(np.nanstd(table.covariates[column])), _parameter_shifter(name, how)
             for form in modulated_form(
-                about,
-                f"depends:{name}:{column}",
-                stage=Stage.PARAMETER,
-                how=how,
-                act=_parameter_shifter(name, how),
-                guess=size,
-                what=name,
-                unit=unit_of_name(name),
+                about, f"depends:{name}:{column}", Stage.PARAMETER, how, act, size, name, unit_of_name(name)
             ):
                 is_scale = isinstance(own.parameters[name], LogUniform)
                 yield _linear_or_by_factor(about, form, name, how) if is_scale else form
@@ -101,17 +88,14 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
         return form.says(mean, sd) + by_factor
 
     def variant(as_factor: bool) -> Form:
-        flag, prior = flag_with_prior(as_factor)
-        which = np.full((*form.entries.shape[:2], 1), flag)
-        marginals = {**form.marginals, _AS_FACTOR: prior}
+        value, prior = flag(as_factor)
         return replace(
             form,
-            marginals=marginals,
+            parameters={**cast(Mapping[str, Marginal], form.parameters), _AS_FACTOR: prior},
             units=(*form.units, "1"),
             act=act,
-            entries=np.concatenate([form.entries, which], axis=2),
+            entries=np.insert(form.entries, 1, value, axis=2),
             says=says,
-            fixed=(_AS_FACTOR,),
         )
 
     linear = variant(False)
@@ -145,7 +129,7 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
             yield Form(
                 name,
                 Stage.PARAMETER,
-                marginals={"value": extra.prior},
+                {"value": extra.prior},
                 units=("",),
                 covariates=("level", "time", "row"),
                 act=act,

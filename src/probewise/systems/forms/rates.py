@@ -11,10 +11,10 @@ import numpy as np
 from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects import name_without_copy_suffix
-from probewise.effects.effect import PHASE, sine_and_cosine_entries, starting_point_of_wave
+from probewise.effects.effect import PHASE, sine_and_cosine_entries, single_column_bank
 from probewise.priors import Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Form, period_with_sd
+from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Fixed, Form, WaveForm, period_with_sd
 from probewise.systems.forms.modulations import (
     frequency_prior,
     max_n_trial_frequencies,
@@ -28,78 +28,32 @@ from probewise.systems.law import LawWithEffects, Limit
 _N_SIZES = 9
 _NO_SHARE = 1e-9  # of what a bound stops: none
 
-Of = Callable[[Any, Any], Any]
-"""Function of the state whose rate it is in and another state; returns a term of unit amplitude."""
-
 
 def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each term that may be missing from the rate of a state, for friction and for bounds."""
     if not about.table.has_varying_time:  # nothing moves
         return
     for state, values in about.states.items():
-        size = float(np.nanmax(np.abs(values))) or 1.0
-        own = f"{state} per {about.time_unit}"
-        yield from _rate_term_form(
-            about,
-            f"damping:{state}",
-            state=state,
-            other=state,
-            term=lambda r: -r,
-            scale=size,
-            what=f"a damping term -a {state}",
-        )
-        yield from _rate_term_form(
-            about,
-            f"drag:{state}",
-            state=state,
-            other=state,
-            term=lambda r: -np.abs(r) * r,
-            scale=size**2,
-            what=f"a drag term -a |{state}| {state}",
-        )
-        yield from _rate_term_form(
-            about,
-            f"forcing:{state}",
-            state=state,
-            other=state,
-            term=lambda r: 1.0 + 0.0 * r,
-            scale=1.0,
-            what="a constant term a",
-            unit=own,
-        )
-        yield from _friction_form(about, state, own)
-        yield from _periodic_forcing_form(about, state, own)
+        unit = f"{state} per {about.time_unit}"
+        for kind in ("damping", "drag", "forcing"):
+            yield from _rate_term_form(about, f"{kind}:{state}", state, state)
+        yield from _friction_form(about, state, unit)
+        yield from _periodic_forcing_form(about, state, unit)
         yield from _limit_form(about, state, values)
-        for other, there in about.states.items():
-            scale = float(np.nanmax(np.abs(there))) or 1.0
-            yield from _rate_term_form(
-                about,
-                f"cubic:{state}:{other}",
-                state=state,
-                other=other,
-                term=lambda r: -(r * r * r),  # a power other than the square takes numpy twenty times as long
-                scale=scale**3,
-                what=f"a term -a {other}^3",
-            )
-            yield from _rate_term_form(
-                about,
-                f"quadratic:{state}:{other}",
-                state=state,
-                other=other,
-                term=lambda r: -(r**2),
-                scale=scale**2,
-                what=f"a term -a {other}^2",
-            )
-            if other != state:
-                yield from _rate_term_form(
-                    about,
-                    f"coupling:{state}:{other}",
-                    state=state,
-                    other=other,
-                    term=lambda r: -r,
-                    scale=scale,
-                    what=f"a term -a {other}",
-                )
+        for other in about.states:
+            for kind in ("cubic", "quadratic", *(("coupling",) if other != state else ())):
+                yield from _rate_term_form(about, f"{kind}:{state}:{other}", state, other)
+
+
+_TERMS: dict[str, tuple[Callable[[Any], Any], int, str]] = {
+    "damping": (lambda r: -r, 1, "a damping term -a {0}"),
+    "drag": (lambda r: -np.abs(r) * r, 2, "a drag term -a |{0}| {0}"),
+    "forcing": (lambda r: 1.0 + 0.0 * r, 0, "a constant term a"),
+    "cubic": (lambda r: -(r * r * r), 3, "a term -a {0}^3"),  # other powers than the square take twenty times as long
+    "quadratic": (lambda r: -(r**2), 2, "a term -a {0}^2"),
+    "coupling": (lambda r: -r, 1, "a term -a {0}"),
+}
+"""The term of each kind, of unit amplitude, as a function of a state; its degree in the state; and its words."""
 
 
 def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset[str]:
@@ -117,42 +71,32 @@ def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset
     )
 
 
-def _rate_term_form(
-    about: ReferenceFit,
-    name: str,
-    state: str,
-    other: str,
-    term: Callable[[Any], Any],
-    scale: float,
-    what: str,
-    unit: str | None = None,
-) -> Iterator[Form]:
+def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> Iterator[Form]:
+    kind = name.split(":")[0]
+    term, degree, what = _TERMS[kind]
+
     def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
         a = theta[:, :1]
         return value.with_term(state, lambda s, p, u: a * term(s[other]))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        _, minus, of = what.partition(" -a ")
-        if minus and mean[0] < 0:  # a term that adds to the rate, told without a double negative
+        said, minus, of = what.format(other).partition(" -a ")
+        if minus and mean[0] < 0:  # a term that adds to the rate, without a double negative
             return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], '')}"
-        return f"the rate of {state} lacks {what}, a = {value_with_sd(mean[0], sd[0], '')}"
+        return f"the rate of {state} lacks {said}{minus}{of}, a = {value_with_sd(mean[0], sd[0], '')}"
 
-    guess = trial_rate(about, state) / scale
-    typical = about.typical_amplitude(Stage.RATE, act, np.full((1, 1, 1), guess), guess)
-    if typical is None:
-        return
-    unit = f"rate of {state}" if unit is None else unit
-    yield Form(
+    form = Form(
         name,
         Stage.RATE,
-        marginals={"a": about.amplitude_prior(typical)},
-        units=(unit,),
+        {"a": AMPLITUDE},
+        units=(f"{state} per {about.time_unit}" if kind == "forcing" else f"rate of {state}",),
         covariates=(f"state:{other}", "time"),
         act=act,
-        entries=np.full((1, 1, 1), typical),
-        amplitudes=(0,),
+        entries=np.ones((1, 1, 1)),
         says=says,
     )
+    largest = float(np.nanmax(np.abs(about.states[other]))) or 1.0
+    yield from about.scaled(form, trial_rate(about, state) / largest**degree)
 
 
 def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
@@ -166,7 +110,7 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
         yield Form(
             f"friction:{state}",
             Stage.RATE,
-            marginals={"a": prior},
+            {"a": prior},
             units=(unit,),
             covariates=(f"state:{state}", "level"),
             act=act,
@@ -189,31 +133,21 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[str(time)] - origin) + phase))
 
-    guess = trial_rate(about, state)
-    typical = about.typical_amplitude(Stage.RATE, act, sine_and_cosine_entries(guess, frequencies), guess)
-    if typical is None:
-        return
-    marginals = {
-        "a": about.amplitude_prior(typical, positive=True),
-        "hz": frequency_prior(frequencies),
-        "phase": PHASE,
-    }
-    yield Form(
-        f"periodic_forcing:{state}",
-        Stage.RATE,
-        marginals=marginals,
+    form = WaveForm(
+        name=f"periodic_forcing:{state}",
+        stage=Stage.RATE,
+        parameters={"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE},
         units=(unit, f"1/{about.time_unit}", "rad"),
         covariates=("time",),
         act=act,
-        entries=sine_and_cosine_entries(typical, frequencies),
-        amplitudes=(0,),
+        entries=sine_and_cosine_entries(1.0, frequencies),
         says=lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {value_with_sd(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {period_with_sd(mean[1], sd[1], about.time_unit)}"
         ),
-        joined=starting_point_of_wave,
         counted_from=origin_in_words(time, origin, about.time_unit),
     )
+    yield from about.scaled(form, trial_rate(about, state))
 
 
 def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator[Form]:
@@ -231,38 +165,28 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
         floor = Limit(state, np.where(above, -np.inf, level), upper=False, spilt=spilt)
         return value.with_limit(ceiling).with_limit(floor)
 
-    def entries(taking: str | None) -> FloatArray:
-        shares = np.array([0.5 * (other == taking) for other in others])
-        return np.concatenate([ends.trial_levels[:, None], np.tile(shares, (len(ends.trial_levels), 1))], axis=1)[
-            :, None, :
-        ]
-
-    def marginals(taking: str | None) -> dict[str, Any]:
-        shares = {f"share[{other}]": Uniform(0.0, 1.0 if other == taking else _NO_SHARE) for other in others}
-        return {"level": ends.prior, **shares}
-
-    def names_of_fixed_shares(taking: str | None) -> tuple[str, ...]:
-        return tuple(f"share[{other}]" for other in others if other != taking)
-
     def says(mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > ends.least_ceiling else "falls"
-        return f"{state} {way} no further than {value_with_sd(mean[0], sd[0], '')}" + _spilling_in_words(
-            others, mean, sd
+        spilling = _spilling_in_words(others, mean, sd)
+        return f"{state} {way} no further than {value_with_sd(mean[0], sd[0], '')}{spilling}"
+
+    def variant(taking: str | None) -> Form:
+        shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
+        tried = [0.5 * (other == taking) for other in others]
+        return Form(
+            f"limit:{state}",
+            Stage.RATE,
+            {"level": ends.prior, **{f"share[{other}]": prior for other, prior in shares.items()}},
+            units=(state, *("1" for _ in others)),
+            covariates=(f"state:{state}", "level"),
+            act=act,
+            entries=single_column_bank(ends.trial_levels, *tried),
+            says=says,
+            amplitudes=(),
+            absent={0: ends.level_out_of_reach},
         )
 
-    alone = Form(
-        f"limit:{state}",
-        Stage.RATE,
-        marginals=marginals(None),
-        units=(state, *("1" for _ in others)),
-        covariates=(f"state:{state}", "level"),
-        act=act,
-        entries=entries(None),
-        amplitudes=(),
-        says=says,
-        absent={0: ends.level_out_of_reach},
-        fixed=names_of_fixed_shares(None),
-    )
+    alone = variant(None)
     if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
         # Downstream only: states that drive each other, as an angle and its rate, are no vessels.
         into = [
@@ -270,11 +194,7 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
             for other in others
             if about.state_drives_rate(state, other) and not about.state_drives_rate(other, state)
         ]
-        spilling = [
-            replace(alone, marginals=marginals(other), entries=entries(other), fixed=names_of_fixed_shares(other))
-            for other in into
-        ]
-        yield replace(alone, alternatives=tuple(spilling))
+        yield replace(alone, alternatives=tuple(variant(other) for other in into))
 
 
 def _spilling_in_words(others: Sequence[str], mean: FloatArray, sd: FloatArray) -> str:

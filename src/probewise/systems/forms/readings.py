@@ -12,15 +12,17 @@ from scipy.linalg import solve_banded
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
+from probewise.effects.effect import single_column_bank
 from probewise.effects.reading import decaying_sum
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, Form, flag_with_prior
+from probewise.systems.forms.form import AMPLITUDE, Act, Form, flag
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
     column_proportional_modulation,
     linear_drift_modulation,
+    modulated_form,
     sinusoid_modulation,
     value_per_run_modulation,
 )
@@ -116,21 +118,19 @@ def _with_smooth_variant(
     sizes = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)
 
     def variant(smooth: bool) -> Form:
-        flag, prior_of_flag = flag_with_prior(smooth)
+        value, prior_of_flag = flag(smooth, odds=_ODDS_OF_SMOOTH if smooth else 1.0)
         return Form(
             name,
             Stage.LAG,
-            marginals={"tau_s": prior, _SMOOTH: prior_of_flag},
+            {"tau_s": prior, _SMOOTH: prior_of_flag},
             units=(time_unit, "1"),
             covariates=("previous",),
             act=act,
-            entries=np.stack([sizes, np.full(_N_SIZES, flag)], axis=1)[:, None, :],
-            amplitudes=(),
+            entries=np.stack([sizes, np.full(_N_SIZES, value)], axis=1)[:, None, :],
             says=lambda mean, sd: f"{says} {value_with_sd(mean[0], sd[0], time_unit)}",
+            amplitudes=(),
             absent={0: 0.0},
             needs_rising_time=True,
-            fixed=(_SMOOTH,),
-            relative_odds=_ODDS_OF_SMOOTH if smooth else 1.0,
         )
 
     at_rows, smooth = variant(False), variant(True)
@@ -229,41 +229,6 @@ def _smooth_values_at_earlier_times(time: FloatArray, values: FloatArray, by: Fl
     return np.where(by[:, None] == 0, np.broadcast_to(values, asked.shape), found)
 
 
-def modulated_form(
-    about: ReferenceFit,
-    name: str,
-    stage: Stage,
-    how: Modulation,
-    act: Act,
-    guess: float,
-    what: str,
-    unit: str,
-    covariates: tuple[str, ...] = (),
-) -> Iterator[Form]:
-    """Yield the form by which a quantity varies over the rows as `how`, applied by `act`; none if without effect."""
-    entries = how.entries(guess)
-    typical = about.typical_amplitude(stage, act, entries, guess, how.amplitudes)
-    if typical is not None and np.isfinite(typical) and typical > 0:
-        form = Form(
-            name,
-            stage,
-            marginals=how.marginals(about.amplitude_prior(typical)),
-            units=how.units(unit),
-            covariates=(*how.covariates, *covariates),
-            act=act,
-            entries=how.entries(typical),
-            amplitudes=how.amplitudes,
-            says=lambda mean, sd: how.says(what, unit, mean, sd),
-            change_points=how.change_points,
-            joined=how.joined,
-            counted_from=how.counted_from,
-            suggested=how.suggested(typical),
-            shared_scale=how.shared_scale,
-        )
-        # All runs may differ about as much, or one of them alone by far more than the others.
-        yield replace(form, alternatives=(replace(form, shared_scale=False),)) if form.shared_scale else form
-
-
 def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     """Yield every form of the reading that could be detectable in this table."""
     table, unit, zero = about.table, about.reading_unit, about.system.simulator.noise.zero
@@ -272,69 +237,36 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     over: dict[str, Modulation] = {}
     if table.has_varying_time:
         over["drift"] = linear_drift_modulation(table, about.time_unit)
-    over["step"] = change_point_step_modulation(table, about.time_unit, gated=True)
+    over["step"] = change_point_step_modulation(table, about.time_unit)
     if about.can_fit_value_per_run:
         over["per_run"] = value_per_run_modulation(table)
+
+    def added(name: str, how: Modulation) -> Iterator[Form]:
+        def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+            return value + how.at_rows(theta, rows)
+
+        return modulated_form(about, name, Stage.OFFSET, how, act, about.sd, reading, unit)
+
+    def scaled(name: str, how: Modulation) -> Iterator[Form]:
+        def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+            return zero + (value - zero) * (1 + how.at_rows(theta, rows))
+
+        gain = f"the gain of {reading}"
+        return modulated_form(about, name, Stage.GAIN, how, act, about.sd / span, gain, "1", ("level",))
+
     for kind, how in over.items():
-        yield from modulated_form(
-            about,
-            f"offset_{kind}",
-            stage=Stage.OFFSET,
-            how=how,
-            act=_reading_adder(how),
-            guess=about.sd,
-            what=reading,
-            unit=unit,
-        )
-        yield from modulated_form(
-            about,
-            f"gain_{kind}",
-            stage=Stage.GAIN,
-            how=how,
-            act=_reading_scaler(how, zero),
-            guess=about.sd / span,
-            what=f"the gain of {reading}",
-            unit="1",
-            covariates=("level",),
-        )
+        yield from added(f"offset_{kind}", how)
+        yield from scaled(f"gain_{kind}", how)
     if table.has_varying_time:
-        how = sinusoid_modulation(about)
-        yield from modulated_form(
-            about,
-            "interference",
-            stage=Stage.OFFSET,
-            how=how,
-            act=_reading_adder(how),
-            guess=about.sd,
-            what=reading,
-            unit=unit,
-        )
+        yield from added("interference", sinusoid_modulation(about))
         yield from _settling_form(about)
         yield from late_forms(about)
     for name, values in table.covariates.items():
         if name not in (reading, about.system.simulator.noise.sd) and varies(values):
-            how = column_proportional_modulation(name, table)
-            yield from modulated_form(
-                about,
-                f"sensitivity:{name}",
-                stage=Stage.OFFSET,
-                how=how,
-                act=_reading_adder(how),
-                guess=about.sd,
-                what=reading,
-                unit=unit,
-            )
+            yield from added(f"sensitivity:{name}", column_proportional_modulation(name, table))
     yield from _hysteresis_form(about)
     yield from _nonlinearity_form(about)
     yield from _saturation_form(about)
-
-
-def _reading_adder(how: Modulation) -> Act:
-    return lambda value, theta, table: value + how.at_rows(theta, table)
-
-
-def _reading_scaler(how: Modulation, zero: float) -> Act:
-    return lambda value, theta, table: zero + (value - zero) * (1 + how.at_rows(theta, table))
 
 
 def time_since_start_of_run(table: RunTable) -> FloatArray:
@@ -358,26 +290,21 @@ def _settling_form(about: ReferenceFit) -> Iterator[Form]:
 
     prior = settling_time_prior(about)
     taus = np.geomspace(prior.low * 1.5, 0.5 * prior.high, _N_SIZES)
-    entries = np.stack([np.full(_N_SIZES, 1.0), taus], axis=-1)[:, None, :]
-    typical = about.typical_amplitude(Stage.OFFSET, act, entries, 1.0)
-    if typical is None:
-        return
-    entries[:, :, 0] = typical
     unit, time_unit, reading = about.reading_unit, about.time_unit, about.system.simulator.reading
-    yield Form(
+    settling = Form(
         "settling",
         Stage.OFFSET,
-        marginals={"a": about.amplitude_prior(typical), "tau_s": prior},
+        {"a": AMPLITUDE, "tau_s": prior},
         units=(unit, time_unit),
         covariates=("time", "run"),
         act=act,
-        entries=entries,
-        amplitudes=(0,),
+        entries=single_column_bank(1.0, taus),
         says=lambda mean, sd: (
             f"{reading} is off by {value_with_sd(mean[0], sd[0], unit)} at the start of each run, and settles "
             f"with a time constant of {value_with_sd(mean[1], sd[1], time_unit)}"
         ),
     )
+    yield from about.scaled(settling, 1.0)
 
 
 def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
@@ -411,12 +338,11 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         "hysteresis",
         Stage.HYSTERESIS,
-        marginals={"a": about.amplitude_prior(about.sd)},
+        {"a": about.amplitude_prior(about.sd)},
         units=(unit,),
         covariates=("previous",),
         act=act,
         entries=np.full((1, 1, 1), about.sd),
-        amplitudes=(0,),
         says=lambda mean, sd: (
             f"{reading} reads {value_with_sd(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} "
             "while it rises than while it falls"
@@ -461,29 +387,21 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
         bent = np.sign(share) * np.abs(share) ** theta[:, 1:2]
         return np.asarray(value + theta[:, :1] * (high - low) * (bent - share))
 
-    powers = np.array([0.5, 1.5, 2.0, 3.0, 4.0])
-    entries = np.stack([np.full(len(powers), 1.0), powers], axis=-1)[:, None, :]
-    guess = about.sd / (high - low)
-    entries[:, :, 0] = guess
-    typical = about.typical_amplitude(Stage.BEND, act, entries, guess)
-    if typical is None:
-        return
-    entries[:, :, 0] = typical
     unit, reading = about.reading_unit, about.system.simulator.reading
-    yield Form(
+    nonlinearity = Form(
         "nonlinearity",
         Stage.BEND,
-        marginals={"a": about.amplitude_prior(typical), "power": LogUniform(0.4, 5.0)},
+        {"a": AMPLITUDE, "power": LogUniform(0.4, 5.0)},
         units=("1", "1"),
         covariates=("level",),
         act=act,
-        entries=entries,
-        amplitudes=(0,),
+        entries=single_column_bank(1.0, np.array([0.5, 1.5, 2.0, 3.0, 4.0])),
         says=lambda mean, sd: (
             f"{reading} has a bent response, y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at "
             f"{high:.4g} {unit}, a = {value_with_sd(mean[0], sd[0], '')}, power = {value_with_sd(mean[1], sd[1], '')}"
         ),
     )
+    yield from about.scaled(nonlinearity, about.sd / (high - low))
 
 
 def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
@@ -516,7 +434,7 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     yield Form(
         "saturation",
         Stage.SATURATION,
-        marginals={"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)},
+        {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)},
         units=(unit,),
         covariates=("level",),
         act=clip,

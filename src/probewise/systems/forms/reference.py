@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,10 @@ from scipy.special import gammaln
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise.effects import HeavyTailedPrior
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_read_only, read_only_views
-from probewise.systems.forms.form import Act, Form
+from probewise.systems.forms.form import POSITIVE, Act, Form
 from probewise.systems.law import integrate_states
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
@@ -288,17 +289,8 @@ class ReferenceFit:
 
     def change_of_readings(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the readings' change, (n_settings, n_points), by `act` with parameters (n_settings, n_params)."""
-        trial = Form(
-            "trial",
-            stage,
-            marginals=dict.fromkeys(map(str, range(settings.shape[1])), _ANY),
-            units=(),
-            covariates=(),
-            act=act,
-            entries=settings,
-            amplitudes=(),
-            says=lambda mean, sd: "",
-        )
+        priors = dict.fromkeys(map(str, range(settings.shape[1])), _ANY)
+        trial = Form("trial", stage, priors, (), (), act, settings, lambda mean, sd: "", amplitudes=())
         chain = replace(self.system.chain(self.table, ()), effects=(trial,))
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
         return np.asarray(chain.predict(theta, self.table) - self.predicted)
@@ -323,6 +315,25 @@ class ReferenceFit:
             if rms.size and rms.max() > _UNSEEN:
                 return _TYPICAL * times * guess / float(np.median(rms[rms > _UNSEEN]))
         return None
+
+    def scaled(self, form: Form, guess: float) -> Iterator[Form]:
+        """Yield a form, declared with amplitudes of 1, with typical ones and their priors; none if without effect.
+
+        `guess` is an amplitude so small that the readings change in proportion.
+        """
+
+        def at_size(size: float) -> FloatArray:
+            entries = form.entries.copy()
+            entries[..., list(form.amplitudes)] *= size
+            return entries
+
+        typical = self.typical_amplitude(form.stage, form.act, at_size(guess), guess, form.amplitudes)
+        if typical is not None and np.isfinite(typical) and typical > 0:
+            priors = dict(cast(Mapping[str, Marginal], form.parameters))
+            for k in form.amplitudes:
+                name = form.prior.names[k]
+                priors[name] = self.amplitude_prior(typical, positive=priors[name] is POSITIVE)
+            yield replace(form, parameters=priors, entries=at_size(typical))
 
     def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
         """Return the heavy-tailed prior of an amplitude of this typical size; a misfit above 1 widens its tails."""

@@ -10,7 +10,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.effects import Extent, NoiseEffect, lattice_step
+from probewise.effects import Extent, NoiseEffect
+from probewise.effects.noise import lattice_step
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage

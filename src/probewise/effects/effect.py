@@ -304,17 +304,14 @@ class LinearEffect(NamedEffect[V]):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """Indices of all parameters."""
         return tuple(range(len(self.parameters)))
 
     @cached_property
     def prior(self) -> Product:
-        """The same heavy-tailed prior for each parameter."""
         size = HeavyTailedPrior(self._typical_size, positive=self.positive)
         return Product(dict.fromkeys(self.parameters, size))
 
     def bank(self) -> FloatArray:
-        """Return one entry with a column for each parameter, (1, n_params, n_params)."""
         return self._typical_size * np.eye(len(self.parameters))[None, :, :]
 
 
@@ -401,17 +398,14 @@ class ChangePointEffect(NamedEffect[V]):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """Indices of all parameters but the last, the time."""
         return tuple(range(len(self.typical_sizes)))
 
     @cached_property
     def prior(self) -> Product:
-        """Prior of the amplitudes, heavy-tailed with either sign, and of the time, uniform in `change_interval_s`."""
         sizes = {name: HeavyTailedPrior(size) for name, size in self.typical_sizes.items()}
         return Product({**sizes, "at_s": Uniform(*self.change_interval_s)})
 
     def bank(self) -> FloatArray:
-        """Return one entry, (1, n_amplitudes, n_params): a column per amplitude, the time amid its interval."""
         sizes = np.diag(list(self.typical_sizes.values()))
         return np.column_stack([sizes, np.full(len(sizes), sum(self.change_interval_s) / 2)])[None, :, :]
 
@@ -430,7 +424,6 @@ class ChangePointEffect(NamedEffect[V]):
         return True
 
     def variants(self) -> tuple[Self, ...]:
-        """Return one variant for each interval between consecutive `times_s`."""
         return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
 
     def with_fewer_variants(self) -> Self:

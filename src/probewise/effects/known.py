@@ -31,7 +31,6 @@ class WrappedEffect(Effect[V]):
 
     @property
     def prior(self) -> Prior:
-        """The prior of the wrapped effect."""
         return self.effect.prior
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:

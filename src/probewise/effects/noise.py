@@ -46,7 +46,6 @@ class CorrelatedNoise(NoiseEffect):
         return Product({"rho": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        """Return the noise with this correlation; the sd of a single reading does not change."""
         return replace(value, rho=theta[:, :1])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -133,11 +132,9 @@ class RandomWalk(NoiseEffect):
 
     @cached_property
     def prior(self) -> Product:
-        """Prior of the sd of a step in noise sds, log-uniform."""
         return Product({"sd_per_row": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        """Return the noise parameters with a random walk of the offset added; its steps have the sd in theta."""
         return replace(
             value, walk=theta[:, :1], walked=np.asarray(self.n_before + 1.0 + np.arange(len(plan)), dtype=np.float64)
         )
@@ -169,33 +166,27 @@ class NoisePerRun(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect for the runs of a recording; None if there is only one."""
         plan = extent.plan
         names = tuple(plan.scan_names)
         return cls(names, tuple(np.bincount(plan.scan, minlength=len(names)).tolist())) if len(names) > 1 else None
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the values: pure numbers."""
         return ("1",) * len(self.runs)
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """No amplitudes: the values are factors, which do nothing at 1."""
         return ()
 
     @property
     def nothing(self) -> dict[int, float]:
-        """Factor 1 in every run."""
         return dict.fromkeys(range(len(self.runs)), 1.0)
 
     @cached_property
     def prior(self) -> Product:
-        """Independent priors of the runs' values."""
         return Product({f"values[{run}]": LogHeavyTailedPrior(0.3) for run in self.runs})
 
     def bank(self) -> FloatArray:
-        """Return one entry, 1 in every run: `weighed_nodes` finds the values from a fit's residuals."""
         return np.ones((1, 1, len(self.runs)))
 
     def weighed_nodes(self, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
@@ -225,14 +216,12 @@ class NoisePerRun(NoiseEffect):
         return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        """Return the noise, its sd times the value of each reading's run; 1 for a run that is not listed."""
         known = {name: k for k, name in enumerate(self.runs)}
         at = np.array([known.get(name, len(self.runs)) for name in plan.scan_names])
         values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)
         return replace(value, sd=value.sd * values[:, at[plan.scan]])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say which runs have the least and the most noise."""
         low, high = int(np.argmin(mean)), int(np.argmax(mean))
         return (
             f"the noise differs from run to run: its sd is {value_with_sd(mean[high], sd[high])} times the typical one "
@@ -321,7 +310,6 @@ class Dropouts(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with values within the readings' range, 1 % wider each way, and with the declared ends."""
         low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
         return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.reading_unit)
 
@@ -404,7 +392,6 @@ class Quantisation(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with steps from 0.1 to 20 % of the readings' range; None if a step is declared."""
         if extent.plan.instrumentation.step is not None:
             return None
         return cls(1e-3 * extent.span, 0.2 * extent.span, unit=extent.reading_unit)

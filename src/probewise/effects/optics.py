@@ -57,7 +57,6 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical offset to 0.3 % of the length of the longest scan."""
         return cls(typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
@@ -82,7 +81,6 @@ class ScanMisplacement(ScanGroupEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical offset to 0.3 % of the length of the longest scan; None for a single scan."""
         names = tuple(dict.fromkeys(extent.plan.scan_names))
         if len(names) < 2:
             return None
@@ -265,15 +263,12 @@ class PatchEffect(NamedEffect[V]):
 
     @cached_property
     def prior(self) -> PatchPrior:
-        """Prior of height, place and radius."""
         return PatchPrior(self.size, self.typical, self.line)
 
     def variants(self) -> tuple[Self, ...]:
-        """Return one variant for each scanned line."""
         return tuple(replace(self, line=line) for line in self.lines)
 
     def bank(self) -> FloatArray:
-        """Return parameters of patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
         patches = []
         for share in _RADII:
             r = share * self.line.length_mm
@@ -299,7 +294,6 @@ class Glint(PatchEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical height to 2 % of the readings' range, and the bank on straight scans; None without any."""
         lines = distinct_scan_lines(extent.plan)
         return cls(0.02 * extent.span, lines[0], lines, unit=extent.reading_unit) if lines else None
 
@@ -333,7 +327,6 @@ class AlbedoGradient(CountsPlaceFromOrigin, LinearEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with a typical slope of 2 % over the length of the longest scan."""
         return cls(typical_per_mm=0.02 / extent.length_mm, origin=extent.origin)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
@@ -363,7 +356,6 @@ class AlbedoPatch(PatchEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with a bank on the straight scans; None without any."""
         lines = distinct_scan_lines(extent.plan)
         return cls(line=lines[0], lines=lines) if lines else None
 
@@ -499,7 +491,6 @@ class HeightGradient(CountsPlaceFromOrigin, LinearEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical slope to 1 % of the height over the longest scan."""
         typical = 0.01 * _nominal_height_mm(extent.plan) / extent.length_mm
         return cls(typical=typical, origin=extent.origin)
 
@@ -533,7 +524,6 @@ class HeightOffset(ScanGroupEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical offset to 1 % of the height; None for a single scan."""
         choices = candidate_scan_groups(extent.plan)
         return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
 
@@ -570,7 +560,6 @@ class SlowSinking(CountsTimeFromOrigin, LinearEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical rate to 1 % of the height over the recording."""
         return cls(typical_per_hour=0.01 / (extent.duration_s / 3600), origin=extent.origin)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
@@ -603,7 +592,6 @@ class EdgeBlur(LinearEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with a typical sd of 2 % of the length of the longest scan."""
         return cls(typical_mm=0.02 * extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
@@ -639,7 +627,6 @@ class Halo(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with radii from a tenth of the length of the longest scan to all of it."""
         return cls(narrowest_mm=0.1 * extent.length_mm, widest_mm=extent.length_mm)
 
     @cached_property
@@ -770,7 +757,6 @@ class Reflection(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with displacements up to half the length of the longest scan, along X and along Y."""
         return cls(farthest_mm=0.5 * extent.length_mm)
 
     @cached_property

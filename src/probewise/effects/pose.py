@@ -63,11 +63,9 @@ class Backlash(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical width to 0.5 % of the length of the longest scan."""
         return cls(typical_mm=0.005 * extent.length_mm)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Return the poses, shifted against the direction of the last commanded motion."""
         half_mm = theta[:, :1] / 2
         return replace(
             value,
@@ -123,7 +121,7 @@ class PositionScale(CountsPlaceFromOrigin, LinearEffect[Poses]):
 class OrientationError(LinearEffect[Poses]):
     """The sensor is turned by deg more than was commanded, in all scans, anticlockwise."""
 
-    typical_deg: float = 3.0
+    typical_deg: float = 3.0  # of a mount set by eye
 
     name = "orientation_error"
     words = "a wrong sensor angle in all scans"
@@ -131,11 +129,6 @@ class OrientationError(LinearEffect[Poses]):
     units = ("deg",)
     covariates = ("orientation",)
     parameters = ("deg",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with its default scale: three degrees are typical of a mount set by eye."""
-        return cls()
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta))
@@ -163,7 +156,6 @@ class ScanAngleError(ScanGroupEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with each mounting and each scan as a candidate; None for a single scan."""
         choices = candidate_scan_groups(extent.plan)
         return cls(choices=choices) if choices else None
 
@@ -202,7 +194,6 @@ class SensorTilt(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical shift to 0.3 % of the length of the longest scan."""
         return cls(typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -237,7 +228,6 @@ class BentRails(CountsPlaceFromOrigin, LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical quadratic error at X = max(L / 2, 10 mm) to 0.5 % of L, the length of the longest scan."""
         typical_mm = 0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2
         return cls(typical_mm=typical_mm, origin=extent.origin)
 
@@ -275,13 +265,11 @@ class MissingTooth(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical jump to 0.5 % of the longest scan's length; None where no axis has over two positions."""
         places = tuple(_thinned_positions(axis) for axis in (extent.plan.x_mm, extent.plan.y_mm))
         return cls(0.005 * extent.length_mm, (places[0], places[1])) if any(len(own) > 2 for own in places) else None
 
     @cached_property
     def prior(self) -> Product:
-        """Prior of the jump (of either sign), of its place, and of its axis, near 0 for X or near 1 for Y."""
         axis = Uniform(self.along - 0.5, self.along + 0.5)
         return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "at_mm": Uniform(*self.between_mm), "axis": axis})
 
@@ -329,7 +317,6 @@ class ArmKnock(ChangePointEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical displacement to 0.5 % of the longest scan's length; None if all readings share one time."""
         times = candidate_change_times_s(extent)
         return None if times is None else cls(times, typical_mm=0.005 * extent.length_mm)
 
@@ -369,7 +356,6 @@ class SlowTurn(CountsTimeFromOrigin, LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical rate to two degrees over the recording."""
         return cls(typical_deg_per_hour=2.0 / (extent.duration_s / 3600), origin=extent.origin)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -403,7 +389,6 @@ class PeriodicPositionError(CountsPlaceFromOrigin, WaveEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with periods from three steps of X to twice its range; None for under eight positions."""
         shortest, reach = _shortest_period_and_range_mm(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 2 * reach, origin=extent.origin) if reach > 0 else None
 
@@ -417,7 +402,6 @@ class PeriodicPositionError(CountsPlaceFromOrigin, WaveEffect[Poses]):
         return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
-        """Return sines and cosines: periods up to the range, evenly in wave number, and longer ones, in log period."""
         n_even = self.n_periods - 8
         waves = np.linspace(1.0, self.longest_mm / 2 / self.shortest_mm, n_even + 1)[1:]
         periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))
@@ -448,7 +432,6 @@ class StickSlip(CountsPlaceFromOrigin, PeriodicEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with periods from three steps of X to a quarter of its range; None if that is empty."""
         shortest, reach = _shortest_period_and_range_mm(extent.plan)
         if 0.25 * reach <= shortest:
             return None
@@ -456,7 +439,6 @@ class StickSlip(CountsPlaceFromOrigin, PeriodicEffect[Poses]):
 
     @cached_property
     def prior(self) -> Product:
-        """Prior of the amplitude, of either sign, the period (log-uniform), and the phase in turns."""
         period = LogUniform(self.shortest_mm, self.longest_mm)
         return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
 

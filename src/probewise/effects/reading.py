@@ -105,7 +105,6 @@ class GainDrift(CountsTimeFromOrigin, NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with time constants from a hundredth of the recording's duration to twice the duration."""
         duration_s = extent.duration_s
         return cls(shortest_s=0.01 * duration_s, longest_s=2 * duration_s, origin=extent.origin)
 
@@ -149,7 +148,6 @@ class BatterySag(LinearEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical change to 2 % over the recorded voltages; None if there are none or all are equal."""
         millivolts = extent.plan.covariates.get(_BATTERY, np.empty(0))
         recorded = (millivolts[np.isfinite(millivolts)] - _REFERENCE_MV) / 1000
         fall = float(np.ptp(recorded)) if recorded.size else 0.0
@@ -192,7 +190,6 @@ class GainStep(ChangePointEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with a change between any two readings; None if all readings share one time."""
         times = candidate_change_times_s(extent)
         return None if times is None else cls(times)
 
@@ -229,7 +226,6 @@ class Polarisation(LinearEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect; None where all orientations are equal or opposite."""
         columns = _columns(extent.plan)
         return cls() if np.ptp(columns, axis=1).max() > _MOST_EQUAL else None
 
@@ -267,7 +263,6 @@ class AmbientGradient(CountsPlaceFromOrigin, LinearEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical slope to 1 % of the readings' range over the longest scan; None where nothing moves."""
         if not (varies(extent.plan.x_mm) or varies(extent.plan.y_mm)):
             return None
         typical = 0.01 * extent.span / extent.length_mm
@@ -301,7 +296,6 @@ class OffsetDrift(CountsTimeFromOrigin, LinearEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical drift to 1 % of the readings' range over the recording."""
         typical = 0.01 * extent.span / (extent.duration_s / 3600)
         return cls(typical_per_hour=typical, unit=extent.reading_unit, origin=extent.origin)
 
@@ -331,7 +325,6 @@ class AmbientStep(ChangePointEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical step to 1 % of the readings' range; None where all readings share one time."""
         times = candidate_change_times_s(extent)
         return None if times is None else cls(times, typical=0.01 * extent.span, unit=extent.reading_unit)
 
@@ -375,7 +368,6 @@ class Flicker(CountsTimeFromOrigin, WaveEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect for 0.01 Hz to half the median rate of readings; None if that range is empty."""
         highest = 0.5 / extent.gap_s
         if highest <= cls.lowest_hz:
             return None
@@ -425,7 +417,6 @@ class Hysteresis(LinearEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical amplitude to 1 % of the readings' range; None where the direction never changes."""
         signs = tuple(np.unique(sign_of_motion(extent.plan)).tolist())
         return cls(0.01 * extent.span, unit=extent.reading_unit, directions=signs) if len(signs) > 1 else None
 
@@ -464,7 +455,6 @@ class Lag(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with time constants from a sixth of the median time between readings to thirty times it."""
         return cls(shortest_s=extent.gap_s / 6, longest_s=30 * extent.gap_s)
 
     @cached_property
@@ -472,7 +462,6 @@ class Lag(NamedEffect[FloatArray]):
         return Product({"tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Return the lagged readings, (n_samples, n_points)."""
         same = np.diff(plan.scan, prepend=-1) == 0
         waited_s = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
         tau_s = theta[:, :1]
@@ -509,10 +498,6 @@ class Overshoot(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with time constants from the median time between readings to thirty times it.
-
-        None if all readings share one time.
-        """
         if not np.any(np.diff(extent.plan.time_s) > 0):
             return None
         return cls(shortest_s=extent.gap_s, longest_s=30 * extent.gap_s)
@@ -559,12 +544,10 @@ class Saturation(NamedEffect[FloatArray]):
 
     @property
     def nothing(self) -> Mapping[int, float]:
-        """A level out of reach, by the index of the level, for any softness."""
         return {0: self.highest + 100 * self.softest}
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with levels from 20 % up the readings' range to 30 % above its top."""
         return cls(
             lowest=extent.low + 0.2 * extent.span,
             highest=extent.high + 0.3 * extent.span,
@@ -575,7 +558,6 @@ class Saturation(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        """Prior of the level, uniform where the limit would act, and of the softness, log-uniform."""
         return Product(
             {"level": Uniform(self.lowest, self.highest), "softness": LogUniform(self.sharpest, self.softest)}
         )
@@ -585,7 +567,6 @@ class Saturation(NamedEffect[FloatArray]):
         return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
 
     def bank(self) -> FloatArray:
-        """Return 13 entries, (13, 1, 2): nine sharp limits, denser near the top, and four soft ones."""
         span = (self.highest - self.lowest) / 1.1
         top = self.highest - 0.3 * span
         sharp = [(top - share * 0.8 * span, self.sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]

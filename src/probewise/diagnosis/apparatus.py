@@ -6,8 +6,9 @@ apparatus' part: a light sensor on an arm (`light_sensor`), or a user's simulato
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,7 +18,6 @@ from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.held_out import Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.sensors import SsfForms
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
@@ -36,22 +36,18 @@ class Command(Protocol):
     @property
     def kind(self) -> str:
         """Kind of measurement, in a word or two."""
-        ...
 
     @property
     def description(self) -> str:
         """The measurement in words, as an instruction."""
-        ...
 
     @property
     def plan(self) -> Plan:
         """Rows of the measurement."""
-        ...
 
     @property
     def minutes(self) -> float:
         """Duration in minutes, including the break before it."""
-        ...
 
 
 def rows_by_command(commands: Sequence[Command]) -> list[IntArray]:
@@ -94,52 +90,54 @@ class Words:
         return self.covariates.get(name, name.replace("state:", "state ").replace("column:", "column "))
 
 
-class Apparatus(Protocol):
+class Apparatus(ABC):
     """What the engine asks of an apparatus: its effects, priors, covariates, parts to hold out, next measurements."""
 
     @property
+    @abstractmethod
     def words(self) -> Words:
         """Words for sentences about the apparatus."""
-        ...
 
     @property
     def rows_are_in_order(self) -> bool:
         """Whether the order of rows is that of recording, as far as readings tell."""
-        ...
+        return True
 
     @property
     def controls(self) -> Sequence[str]:
         """Covariates that a person sets and has declared as such."""
-        ...
+        return ()
 
+    @property
+    def takes_one_measurement_at_a_time(self) -> bool:
+        """Whether a plan holds one of the candidate measurements only, since its file would not keep two apart."""
+        return False
+
+    @abstractmethod
     def effects(self, recording: Recording, null: Null | None) -> Mapping[str, NamedEffect[Any]]:
         """Return the vocabulary scaled to a recording, by name, without effects that could not be detectable there."""
-        ...
 
     def proposed_formulas(self) -> Mapping[str, NamedEffect[Any]]:
         """Return formulas for effects out of vocabulary, by name, which begins with `effects.PROPOSAL`."""
-        ...
+        return {}
 
+    @abstractmethod
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Return the names of the user's own effects, which are always tried."""
-        ...
 
     def refit_budget_share_spent(self) -> float:
         """Return the share of the budget of costly predictions that is spent: 1 or more if it is used up."""
-        ...
+        return 0.0
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:
         """Return whether at least this share of the budget of costly predictions is spent."""
-        ...
+        return False
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
-        ...
+        return PriorOdds.for_effects(effects)
 
-    def null_forms(self, recording: Recording) -> SsfForms:
-        """Return the forms that a sensor's SSF may take when the null is calibrated from the recording."""
-        ...
-
+    @abstractmethod
     def covariates_and_predicted_slope(
         self, found: Fit, recording: Recording
     ) -> tuple[Sequence[Covariate], FloatArray]:
@@ -147,11 +145,13 @@ class Apparatus(Protocol):
 
         The slope is along the motion, per mm, or, of a table, the change since the previous row.
         """
-        ...
 
     def multiplied_covariates(self, covariates: Sequence[Covariate]) -> Sequence[Covariate]:
-        """Choose, from the covariates of the readings, those of which a product of two may be an unknown effect."""
-        ...
+        """Choose the covariates of which a product of two may be an unknown effect; none by default.
+
+        What an arm logs beside the readings is not known to act by products.
+        """
+        return ()
 
     def covariate_of_effect(
         self,
@@ -161,36 +161,33 @@ class Apparatus(Protocol):
         plan: Plan,
         known: Sequence[Covariate],
     ) -> Covariate | None:
-        """Choose, from those `known`, the covariate in which an effect is located; None if there is none.
+        """Return the first of an effect's covariates that is `known`; None if none is, or `change` is 0 at every row.
 
-        `change` are the effect's changes of the readings, `without` the predictions without it, (n_points,) both.
+        `change` are the effect's changes of the readings, `without` the predictions without it, which are the values of
+        `level`, (n_points,) both; `plan` is that of the readings.
         """
-        ...
+        pooled = {c.name: c for c in known}
+        name = next((name for name in effect.covariates if name in pooled), None)
+        if name is None or not np.any(change):
+            return None
+        return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
 
-    def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Return slopes of the readings by structure too fine for any form of the null: (n_usable, n_columns)."""
-        ...
-
+    @abstractmethod
     def held_out_parts(self, recording: Recording) -> Parts:
         """Return the part of each usable reading, (n_usable,), and the names of the parts, to hold out in turn."""
-        ...
 
     def coordinates_of_new_run(self, model: Model) -> IntArray:
-        """Return the indices of a model's coordinates of which each run has a value of its own, (n_coordinates,).
+        """Return the indices of a model's coordinates of which each run has a value of its own; none by default.
 
         In a run that is yet to be recorded such a value is known by its prior alone.
         """
-        ...
+        return np.zeros(0, dtype=np.int64)
 
+    @abstractmethod
     def settings_of(self, plan: Plan) -> FloatArray:
         """Return what a person sets, and so may repeat, of each row of a plan, (n_points, n_settings): no readings."""
-        ...
 
-    @property
-    def takes_one_measurement_at_a_time(self) -> bool:
-        """Whether a plan holds one of the candidate measurements only, since its file would not keep two apart."""
-        ...
-
+    @abstractmethod
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> Sequence[Command]:
@@ -198,12 +195,11 @@ class Apparatus(Protocol):
 
         With stride k, only every k-th reading is taken; `level` (n_points,) are the expected readings of the plan.
         """
-        ...
 
+    @abstractmethod
     def plan_of_alternatives(self, commands: Sequence[Any], after: Plan) -> Plan:
         """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
-        ...
 
+    @abstractmethod
     def plan_of_sequence(self, commands: Sequence[Any], after: Plan) -> Plan:
         """Concatenate commands into one plan, timed to be carried out in sequence after a plan."""
-        ...

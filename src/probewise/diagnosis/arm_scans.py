@@ -58,21 +58,21 @@ def duration_minutes(plan: Plan) -> float:
     return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
 
 
-def plan_of_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
+def plan_of_alternatives(commands: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate alternative scans, each timed as if directly after a plan, to predict all of them at once.
 
     Covariates that the scans lack, such as battery voltage, keep their last value of that plan.
     """
-    return _with_last_known_covariates(_joined_plan(scans), after)
+    return _with_last_known_covariates(_joined_plan(commands), after)
 
 
-def plan_of_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
+def plan_of_sequence(commands: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
 
     Covariates that the scans lack are filled as in `plan_of_alternatives`, to be replaced by measured values.
     """
     out: list[Scan] = []
-    for scan in scans:
+    for scan in commands:
         out.append(_scan_started_at(scan, earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])))
     return _with_last_known_covariates(_joined_plan(out), after)
 

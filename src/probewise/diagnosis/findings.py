@@ -204,7 +204,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
         prepared.expand_usable_to_all_rows(found.predicted)
     ).without_declared_range()
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
-    sigma = float(law.likeliest_sigma(law(found.residuals)[:, None])[0])
+    sigma = law.likeliest_sigma_of(found.residuals)
     refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)
     if not math.isfinite(refit.objective):
         # Without the effect these parameters predict no readings to start from; those of the null do.

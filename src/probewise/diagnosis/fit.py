@@ -33,27 +33,22 @@ class Predictor(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, one per column of theta."""
-        ...
 
     @property
     def effects(self) -> tuple[AnyEffect, ...]:
         """The model's effects, in the order in which they act."""
-        ...
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Return noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
-        ...
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> Any:
         """Simulate the stages before `Stage.SEEN`: a sensor's view of the scene, for theta (1 or n_samples, n_params).
 
         For a simulator, these are its own readings, with the effects on inputs, parameters and rates.
         """
-        ...
 
     def readings_from_simulated_view(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effects from `Stage.SEEN` on to a result of `simulated_view`: readings (n_samples, n_points)."""
-        ...
 
 
 class Null(Protocol):
@@ -66,7 +61,6 @@ class Null(Protocol):
     @property
     def n_params(self) -> int:
         """Number of coordinates."""
-        ...
 
     @property
     def n_gaussians(self) -> int:
@@ -106,7 +100,6 @@ class Null(Protocol):
     @property
     def starts(self) -> FloatArray:
         """Coordinates to fit from, (n_starts, n_params)."""
-        ...
 
     @property
     def nuisance_names(self) -> tuple[str, ...]:
@@ -119,15 +112,12 @@ class Null(Protocol):
     @property
     def least_readings(self) -> int:
         """Fewest usable readings for a verdict."""
-        ...
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
         """Return whether this model has the stage at which an effect acts."""
-        ...
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates z, (n_samples, n_params), to the model's own parameters: theta without the effects'."""
-        ...
 
     def coordinates(self, theta: FloatArray) -> FloatArray | None:
         """Map parameters of its own to coordinates, each of one parameter, (n_samples, n_params) both.
@@ -138,7 +128,6 @@ class Null(Protocol):
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Predictor:
         """Build the model of a plan's readings, with effects; `n_nodes` for curved edges, as in `sensor.Chain`."""
-        ...
 
 
 def log_multiplicity(null: Null) -> float:
@@ -437,7 +426,7 @@ def _fit_coroutine(
             predicted, slopes = yield from request_slopes(z)
         if settled or best - gained * (max_steps - k - 1) > hopeless_above:
             break
-    sd = float(law.likeliest_sigma(law(readings - predicted)[:, None])[0])
+    sd = law.likeliest_sigma_of(readings - predicted)
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)
 
 

@@ -1,23 +1,16 @@
-"""A light sensor on an arm over printed patterns, as an `Apparatus`: covariates, held-out parts, next scans, and words.
-
-Structure of an SSF that is finer than any form fitted to it (a ring, a ridge's shadow, a sharp rim) leaves residuals of
-one to three noise sds in all, which are not physics. Narrow Gaussians of small weight, spread over the footprint,
-absorb them to first order. They are not part of any fit: the global test checks whether its alarm persists when they
-are projected out.
-"""
+"""A light sensor on an arm over printed patterns, as an `Apparatus`: covariates, held-out parts, next scans, words."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.calibration import mixture_moments
-from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.apparatus import Apparatus, Words
 from probewise.diagnosis.arm_scans import (
     Scan,
     candidate_scans,
@@ -26,16 +19,13 @@ from probewise.diagnosis.arm_scans import (
     rows_repeatable_without_hands,
     target_swaps,
 )
-from probewise.diagnosis.fit import Fit, Model, Null
+from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.sensors import CalibratedSensor, SsfForms
 from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Extent, NamedEffect
 from probewise.effects.reference import orientation_deg, sign_of_motion
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene import edge_distance, region_of
-from probewise.sensor import FAST_NODES, FreeMixture
 
 
 def held_out_parts(recording: Recording) -> Parts:
@@ -54,58 +44,6 @@ def held_out_parts(recording: Recording) -> Parts:
                 f"{plan.pattern_names[int(code)]}, {turn:.0f} degrees" for code, turn in kinds.T
             )
     return scan, plan.scan_names
-
-
-# In sds of the SSF, in its own metric.
-_REACH = 2.4
-_APART = 0.6
-_WIDTH = 0.35
-_SHARE = 0.03  # prior sd of each weight, as a share of the mass
-
-
-def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
-    """Return the slopes of the readings by fine structure about an SSF, in coordinates with a standard normal prior.
-
-    Parameters
-    ----------
-    model
-        A sensor calibrated from the recording, without effects.
-    z
-        Its coordinates, (n_params,).
-    usable
-        Numbers of the plan's rows to use.
-
-    Returns
-    -------
-    Slopes, (n_usable, n_places), in reading units; no columns if the model is no `CalibratedSensor`.
-    """
-    sensor = model.sensor
-    if not isinstance(sensor, CalibratedSensor):
-        return np.zeros((len(usable), 0))
-    theta = sensor.theta(z[None, :])
-    of_all = {name: float(values[0]) for name, values in mixture_moments(theta, sensor.n_gaussians).items()}
-    sd_u, sd_v = (np.exp(of_all[f"log width along {axis}"]) for axis in ("x'", "y'"))
-    cov = of_all["correlation of x' and y'"] * sd_u * sd_v
-    covariance = np.array([[sd_u**2, cov], [cov, sd_v**2]])
-    center = np.array([of_all["centre x'"], of_all["centre y'"]])
-    places = center + _PLACES @ np.linalg.cholesky(covariance).T
-    (aa, cc), (_, bb) = np.linalg.inv(_WIDTH**2 * covariance) / 2
-    levels = theta[0, 6 * sensor.n_gaussians :]
-    narrow = np.array([[1.0, u, v, aa, bb, cc, *levels] for u, v in places])
-    chain = replace(sensor.chain(model.plan, (), n_nodes=FAST_NODES), ssf=FreeMixture(1))
-    whole = model.predict(z[None, :])[0]  # normalised, so that the total weight is unchanged
-    return np.asarray(_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
-
-
-def _hexagonal_grid() -> FloatArray:
-    """Return places on a hexagonal grid over a disc, (n, 2)."""
-    steps = np.arange(-8, 9)
-    i, j = (a.ravel() for a in np.meshgrid(steps, steps))
-    places = _APART * np.stack([i + j / 2, j * np.sqrt(3) / 2], axis=-1)
-    return np.asarray(places[np.hypot(*places.T) <= _REACH])
-
-
-_PLACES = _hexagonal_grid()
 
 
 _NOT_COLUMNS = frozenset({"time", "level", "edge_distance", "slope", "direction", "orientation", "scan", "place"})
@@ -243,7 +181,7 @@ def _varies(values: FloatArray, size: float = 0.0) -> bool:
 
 
 @dataclass(frozen=True)
-class LightSensorApparatus:
+class LightSensorApparatus(Apparatus):
     """A light sensor that an arm moves over patterns; `vocabulary` holds its possible effects, by name.
 
     `hands`: a person can exchange or turn sheets; otherwise the next scans are over the pattern of the last reading.
@@ -251,16 +189,11 @@ class LightSensorApparatus:
 
     vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: dict(VOCABULARY))
     hands: bool = True
-    words: ClassVar[Words] = Words(
+    words = Words(
         null="the sensor",
         find_signal="scan across an edge",
         settles_nothing="no reading that this apparatus can take tells them apart",
     )
-
-    @property
-    def rows_are_in_order(self) -> bool:
-        """True: an arm takes readings in order."""
-        return True
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Scale effects to a recording, by name: the vocabulary, effects out of it with a formula, and drifting noise.
@@ -277,25 +210,9 @@ class LightSensorApparatus:
             if (null.admits(effect) if null is not None else not effect.is_absorbed_by_ssf(plan))
         }
 
-    def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
-        """Return an empty mapping: no formulas are proposed for a light sensor."""
-        return {}
-
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Return the names of effects defined outside this library."""
         return frozenset(effects.keys() - EFFECTS)
-
-    def refit_budget_share_spent(self) -> float:
-        """Return the spent share of the budget of refits: 0, since predictions are cheap here."""
-        return 0.0
-
-    def is_refit_budget_spent(self, share: float = 1.0) -> bool:
-        """Return False: predictions are cheap here."""
-        return False
-
-    def null_forms(self, recording: Recording) -> SsfForms:
-        """Return the forms that the SSF may take when it is calibrated from the recording."""
-        return SsfForms(Extent.of(recording))
 
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
         """Return the covariates that vary, and the predicted slope along the motion, per mm, (n_usable,)."""
@@ -303,25 +220,10 @@ class LightSensorApparatus:
         slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
-    def multiplied_covariates(self, covariates: Sequence[Covariate]) -> tuple[Covariate, ...]:
-        """Return no covariates: what an arm logs beside the readings is not known to act by products."""
-        return ()
-
-    controls: ClassVar[Sequence[str]] = ()  # an arm's places are its covariates
-    takes_one_measurement_at_a_time = False  # a plan names its scans
-    prior_odds = staticmethod(PriorOdds.for_effects)
     covariate_of_effect = staticmethod(covariate_of_effect)
     held_out_parts = staticmethod(held_out_parts)
     plan_of_alternatives = staticmethod(plan_of_alternatives)
     plan_of_sequence = staticmethod(plan_of_sequence)
-
-    def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Return the slopes of the readings by fine structure of the SSF, (n_usable, n_columns)."""
-        return fine_structure_slopes(found.model, found.z, usable)
-
-    def coordinates_of_new_run(self, model: Model) -> IntArray:
-        """Return no indices: the sensor is the same in every scan."""
-        return np.zeros(0, dtype=np.int64)
 
     def settings_of(self, plan: Plan) -> FloatArray:
         """Return place, orientation and a number for the pattern of each row, (n_points, 4)."""

@@ -421,6 +421,10 @@ class NoiseLaw:
         """Return the known or most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
         return self.whitened_density.likeliest_sigma(whitened, self.n_kept, floor=self.sigma_floor)
 
+    def likeliest_sigma_of(self, residuals: FloatArray) -> float:
+        """Return the same for residuals that are not yet whitened, (n_points,)."""
+        return float(self.likeliest_sigma(self(residuals)[:, None])[0])
+
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return minus the log likelihood, without n/2 log 2 pi, of whitened residuals (n_points, k) at sigma (k,)."""
         return self.whitened_density.minus_log_likelihood(whitened, sigma, self.n_kept)

@@ -239,44 +239,27 @@ class QuadraticPredictions:
         return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)
 
 
-@dataclass(frozen=True, eq=False)
-class SurrogatePosterior:
-    """An approximate posterior of coordinates z = center + e @ steps, as a function of e, (n_samples, n_params).
+def surrogate_log_density(
+    quadratic: QuadraticPredictions, center: FloatArray, steps: FloatArray, readings: FloatArray, law: NoiseLaw
+) -> Density:
+    """Return the unnormalised log posterior, as a function of e, of coordinates z = center + e @ steps, approximately.
 
-    The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-residuals. `residual` (n_axes,), at
-    the center, and `changes` (n_axes, n_changes) are whitened, in orthonormal axes of the space that they span: n_axes
-    is n_changes + 1, or n_usable if that is less.
+    It is that of quadratic predictions at `steps` from `center` for the readings (n_usable,) under normal noise: for
+    heavy-tailed noise, residuals are replaced by pseudo-residuals. Minus infinity beyond six prior sds.
     """
+    residual = law(readings - quadratic.center)[:, None]
+    residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
+    # In orthonormal axes of the space that residual and changes span, or of all readings if these are fewer.
+    _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
+    normal = law.without_tail_or_rounding()
 
-    quadratic: QuadraticPredictions
-    center: FloatArray
-    steps: FloatArray
-    law: NoiseLaw
-    residual: FloatArray
-    changes: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        quadratic: QuadraticPredictions,
-        center: FloatArray,
-        steps: FloatArray,
-        readings: FloatArray,
-        law: NoiseLaw,
-    ) -> Self:
-        """Build from quadratic predictions at steps from `center`, the readings (n_usable,), and their noise."""
-        residual = law(readings - quadratic.center)[:, None]
-        residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
-        _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
-        normal = law.without_tail_or_rounding()
-        return cls(quadratic, center, steps, normal, turned[:, -1], turned[:, :-1])
-
-    def log_density(self, e: FloatArray) -> FloatArray:
-        """Return the unnormalised log posterior at steps e, (n_samples,); minus infinity beyond six prior sds."""
-        z = self.center + e @ self.steps
-        whitened = self.residual[:, None] - self.changes @ self.quadratic.change_coefficients(e).T
-        height = log_likelihood_marginal_over_sigma(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
+    def log_density(e: FloatArray) -> FloatArray:
+        z = center + e @ steps
+        whitened = turned[:, -1][:, None] - turned[:, :-1] @ quadratic.change_coefficients(e).T
+        height = log_likelihood_marginal_over_sigma(normal, whitened) - 0.5 * np.sum(z**2, axis=1)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
+
+    return log_density
 
 
 _N_WALKERS = 250
@@ -410,7 +393,7 @@ def _annealed(
     """Move standard normal draws, (n, n_params), to the surrogate of the posterior, then to the posterior itself."""
     model, usable, center, steps = laplace.found.model, laplace.recording.usable, laplace.center, laplace.steps
     quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), laplace.sd)
-    near = SurrogatePosterior.of(quadratic, center, steps, laplace.recording.readings[usable], laplace.law)
+    near = surrogate_log_density(quadratic, center, steps, laplace.recording.readings[usable], laplace.law)
 
     def log_laplace(e: FloatArray) -> FloatArray:
         return np.asarray(-0.5 * np.sum(e**2, axis=1))
@@ -426,5 +409,5 @@ def _annealed(
             first[:_N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress
         )
 
-    e = resampled_or_annealed(draws, log_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
-    return center + resampled_or_annealed(e, near.log_density, log_posterior_of_steps, _MOVES, n_samples) @ steps
+    e = resampled_or_annealed(draws, log_laplace, near, _MOVES_NEAR, _N_NEAR)
+    return center + resampled_or_annealed(e, near, log_posterior_of_steps, _MOVES, n_samples) @ steps

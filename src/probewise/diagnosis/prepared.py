@@ -21,11 +21,12 @@ from probewise.diagnosis.outlying import LostReadings, find_lost_readings
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,
     SensorPrior,
+    SsfForms,
     require_same_unit,
     require_sensor_prior,
     sensor_from_samples,
 )
-from probewise.effects import NamedEffect, NoiseEffect
+from probewise.effects import Extent, NamedEffect, NoiseEffect
 from probewise.effects.noise import LARGEST_SIZE
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording, require_patterns_described
@@ -215,7 +216,7 @@ def _lost_readings(recording: Recording, null: Null | None, apparatus: Apparatus
     wild = np.flatnonzero(recording.usable & (np.abs(readings - middle) > _WILD * (high - low)))
     if null is None:
         kept = replace(recording, left_out=(*recording.left_out, *wild.tolist()))
-        null, starts = apparatus.null_forms(kept).one_gaussian_and_starts()
+        null, starts = SsfForms(Extent.of(kept)).one_gaussian_and_starts()
     else:
         starts = null.starts
     model = Model(null, (), recording.plan)

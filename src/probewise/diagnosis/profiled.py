@@ -62,7 +62,7 @@ class ProfiledDensity:
         None if there is no such coordinate, or none whose slices can be fitted.
         """
         slopes = law(found.slopes)
-        sd = max(float(law.likeliest_sigma(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.fisher_information)
+        sd = max(law.likeliest_sigma_of(found.residuals), 1e-150) / np.sqrt(law.fisher_information)
         covariance = np.linalg.inv(slopes.T @ slopes / sd**2 + np.eye(len(found.z)))
         tried = [
             cls._of_coordinate(found, law, recording, at, covariance, float(sd)) for at in _nonlinear_coordinates(found)

@@ -15,21 +15,22 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any, Protocol, Self
 
 import numpy as np
 
-from probewise._arrays import FloatArray, read_only_floats
+from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise._kinds import require_like
-from probewise.calibration import FittedSensor
-from probewise.diagnosis.fit import FARTHEST, Fit, Null
+from probewise.calibration import FittedSensor, mixture_moments
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
 from probewise.effects import Extent, NamedEffect
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
+    FAST_NODES,
     N_BENDS,
     N_FREE_FORM,
     Chain,
@@ -56,6 +57,13 @@ class CalibratedSensor(ABC):
     center: FloatArray
     factor: FloatArray
     calibrated_height_mm: float | None
+    predicts_in_bulk = predicts_cheaply_nearby = may_be_far_off = has_exchangeable_gaussians = False
+    nuisance_names: tuple[str, ...] = ()
+    least_readings = LEAST_READINGS
+
+    def coordinates(self, theta: FloatArray) -> None:
+        """Return None: what it simulates is no array of readings."""
+        return None
 
     def __post_init__(self) -> None:
         n = self.n_params
@@ -82,30 +90,6 @@ class CalibratedSensor(ABC):
     def ssf_in_words(self) -> str:
         """Description of its SSF, in words."""
 
-    @property
-    def predicts_in_bulk(self) -> bool:
-        """False: every sample costs as much as the first."""
-        return False
-
-    def coordinates(self, theta: FloatArray) -> FloatArray | None:
-        """Return None: what it simulates is no array of readings."""
-        return None
-
-    @property
-    def predicts_cheaply_nearby(self) -> bool:
-        """False: a prediction costs as much near another one as elsewhere."""
-        return False
-
-    @property
-    def may_be_far_off(self) -> bool:
-        """False: a fit of a sensor without a missing effect is near enough to screen the effects about it."""
-        return False
-
-    @property
-    def has_exchangeable_gaussians(self) -> bool:
-        """Whether its Gaussians are exchangeable."""
-        return False
-
     @abstractmethod
     def theta_from_natural(self, natural: FloatArray) -> FloatArray:
         """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
@@ -118,16 +102,6 @@ class CalibratedSensor(ABC):
     def starts(self) -> FloatArray:
         """One starting point: 0 in the coordinates z, the centre of the prior, (1, n_params)."""
         return np.zeros((1, self.n_params))
-
-    @property
-    def nuisance_names(self) -> tuple[str, ...]:
-        """Empty: all its parameters belong to the sensor."""
-        return ()
-
-    @property
-    def least_readings(self) -> int:
-        """Fewest usable readings for a verdict."""
-        return LEAST_READINGS
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
         """Return True: every effect can act on a sensor."""
@@ -366,12 +340,10 @@ class SensorPrior(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Parameter names, one per column."""
-        ...
 
     @property
     def samples(self) -> FloatArray:
         """Posterior samples, (n_samples, n_params)."""
-        ...
 
 
 def require_sensor_prior(sensor: object) -> None:
@@ -467,3 +439,58 @@ def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: GaussianMixtu
         rest = np.delete(blocks, at, axis=0)
         out.append(np.concatenate([np.concatenate([rest, np.stack(pair)]).ravel(), theta[-2:]]))
     return np.clip(wanted.z(np.stack(out)), -FARTHEST + 0.5, FARTHEST - 0.5)
+
+
+# In sds of the SSF, in its own metric.
+_REACH = 2.4
+_APART = 0.6
+_WIDTH = 0.35
+_FINE_SHARE = 0.03  # prior sd of each weight, as a share of the mass
+
+
+def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
+    """Return the slopes of the readings by fine structure about an SSF, in coordinates with a standard normal prior.
+
+    Structure that is finer than any form fitted to an SSF (a ring, a ridge's shadow, a sharp rim) leaves residuals of
+    one to three noise sds in all, which are not physics. Narrow Gaussians of small weight, spread over the footprint,
+    absorb them to first order. They are part of no fit: the global test asks whether its alarm persists beside them.
+
+    Parameters
+    ----------
+    model
+        A sensor calibrated from the recording, without effects.
+    z
+        Its coordinates, (n_params,).
+    usable
+        Numbers of the plan's rows to use.
+
+    Returns
+    -------
+    Slopes, (n_usable, n_places), in reading units.
+    """
+    sensor = model.sensor
+    assert isinstance(sensor, CalibratedSensor)
+    theta = sensor.theta(z[None, :])
+    of_all = {name: float(values[0]) for name, values in mixture_moments(theta, sensor.n_gaussians).items()}
+    sd_u, sd_v = (np.exp(of_all[f"log width along {axis}"]) for axis in ("x'", "y'"))
+    cov = of_all["correlation of x' and y'"] * sd_u * sd_v
+    covariance = np.array([[sd_u**2, cov], [cov, sd_v**2]])
+    center = np.array([of_all["centre x'"], of_all["centre y'"]])
+    places = center + _PLACES @ np.linalg.cholesky(covariance).T
+    (aa, cc), (_, bb) = np.linalg.inv(_WIDTH**2 * covariance) / 2
+    levels = theta[0, 6 * sensor.n_gaussians :]
+    narrow = np.array([[1.0, u, v, aa, bb, cc, *levels] for u, v in places])
+    chain = replace(sensor.chain(model.plan, (), n_nodes=FAST_NODES), ssf=FreeMixture(1))
+    whole = model.predict(z[None, :])[0]  # normalised, so that the total weight is unchanged
+    return np.asarray(_FINE_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
+
+
+def _hexagonal_grid() -> FloatArray:
+    """Return places on a hexagonal grid over a disc, (n, 2)."""
+    steps = np.arange(-8, 9)
+    i, j = (a.ravel() for a in np.meshgrid(steps, steps))
+    places = _APART * np.stack([i + j / 2, j * np.sqrt(3) / 2], axis=-1)
+    return np.asarray(places[np.hypot(*places.T) <= _REACH])
+
+
+_PLACES = _hexagonal_grid()

@@ -10,11 +10,12 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import MOST_READINGS, Words
+from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Words
 from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.words import join_names
 from probewise.effects import Extent, NamedEffect
 from probewise.effects.noise import (
     CorrelatedNoise,
@@ -113,7 +114,7 @@ def _variations_of_run(
     if any(np.ptp(values) > 0 for values in own.values()):
         yield (
             "reversed",
-            f"take {of} with {_list_in_words(ends)} in reverse order",
+            f"take {of} with {join_names(list(ends))} in reverse order",
             {k: v[::-1] for k, v in own.items()},
             1.0,
         )
@@ -244,11 +245,6 @@ def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
     return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
 
 
-def _list_in_words(names: Mapping[str, object]) -> str:
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
-
-
 ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     SignalDependentNoise,
     CorrelatedNoise,
@@ -284,7 +280,7 @@ _UNLIKELY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatorApparatus:
+class SimulatorApparatus(Apparatus):
     """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects.
 
     Parameters
@@ -403,10 +399,6 @@ class SimulatorApparatus:
             unlikely_weight=_UNLIKELY,
         )
 
-    def null_forms(self, recording: Recording) -> Any:
-        """Raise NotImplementedError: the only null is the simulator."""
-        raise NotImplementedError("a simulator is its own null")
-
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
         """Return the covariates that vary, and the predicted change since the previous row, (n_usable,).
 
@@ -449,28 +441,6 @@ class SimulatorApparatus:
         out["previous"] = _differences_within_runs(predicted, table)
         out["run"] = table.scan.astype(np.float64)
         return out
-
-    def covariate_of_effect(
-        self,
-        effect: NamedEffect[Any],
-        change: FloatArray,
-        without: FloatArray,
-        plan: Plan,
-        known: Sequence[Covariate],
-    ) -> Covariate | None:
-        """Return the first of an effect's covariates that is `known`; None if none is, or `change` is 0 at every row.
-
-        The values of `level` are those predicted `without` the effect.
-        """
-        pooled = {c.name: c for c in known}
-        name = next((name for name in effect.covariates if name in pooled), None)
-        if name is None or not np.any(change):
-            return None
-        return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
-
-    def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Return no columns, (n_usable, 0): a simulator has no fine structure."""
-        return np.zeros((len(usable), 0))
 
     def held_out_parts(self, recording: Recording) -> Parts:
         """Return the part of each usable reading, (n_usable,), and names: runs or, of one run, five blocks."""

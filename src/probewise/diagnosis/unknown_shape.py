@@ -34,6 +34,12 @@ class SensorAndShape:
     sensor: CalibratedSensor
     shape: Shape
     starts: FloatArray
+    predicts_in_bulk = predicts_cheaply_nearby = False
+    may_be_far_off = True  # without a missing effect the shape may be found at another place
+
+    def coordinates(self, theta: FloatArray) -> None:
+        """Return None: what it simulates is no array of readings."""
+        return None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "starts", read_only_floats(self.starts))
@@ -85,25 +91,6 @@ class SensorAndShape:
     def ssf_in_words(self) -> str:
         """Description of the sensor's SSF, in words."""
         return self.sensor.ssf_in_words
-
-    def coordinates(self, theta: FloatArray) -> FloatArray | None:
-        """Return None: what it simulates is no array of readings."""
-        return None
-
-    @property
-    def predicts_in_bulk(self) -> bool:
-        """Whether many samples cost little more than one: False."""
-        return False
-
-    @property
-    def predicts_cheaply_nearby(self) -> bool:
-        """Whether a prediction near another one costs less: False."""
-        return False
-
-    @property
-    def may_be_far_off(self) -> bool:
-        """True: without a missing effect the shape may be found at another place."""
-        return True
 
     @property
     def has_exchangeable_gaussians(self) -> bool:

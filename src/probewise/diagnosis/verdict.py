@@ -20,7 +20,9 @@ from probewise.diagnosis.search.refits import (
     require_converged_fit,
 )
 from probewise.diagnosis.search.searched import Searched
-from probewise.effects import PROPOSAL, name_without_copy_suffix
+from probewise.diagnosis.sensors import fine_structure_slopes
+from probewise.diagnosis.words import combination_label
+from probewise.effects import PROPOSAL
 
 N_DRAWS = 999
 """Number of residual draws under the null."""
@@ -79,7 +81,7 @@ def _max_p_value_over_orders(
         if p_value > _NO_ALARM:
             break
         found = rival.found
-        beside = prepared.apparatus.fine_structure_slopes(found, prepared.usable_rows) if fine else None
+        beside = fine_structure_slopes(found.model, found.z, prepared.usable_rows) if fine else None
         problem = Linearised.of(found, rival.evidence[rival.possible_noise(noise)].likeliest_law, beside)
         draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
         p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_global_test(found), draws))
@@ -143,7 +145,7 @@ class Hypothesis:
     @property
     def label(self) -> str:
         """Name in a credible set: effects joined by "+", or "clean"."""
-        return "+".join(sorted(map(name_without_copy_suffix, self.effects))) or "clean"
+        return combination_label(self.effects)
 
 
 @dataclass(frozen=True)

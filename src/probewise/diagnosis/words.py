@@ -115,6 +115,11 @@ def _two(said: str) -> str:
     return plural if n else f"{said} (twice)"
 
 
+def combination_label(effects: Sequence[str]) -> str:
+    """Return the name of a combination in a credible set: effects joined by "+", or "clean"."""
+    return "+".join(sorted(map(name_without_copy_suffix, effects))) or "clean"
+
+
 def join_names(names: Sequence[str] | map[str]) -> str:
     """Join names as in "A, B and C"."""
     *others, last = names

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from function_null import FunctionNull
 
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.light_sensor import fine_structure_slopes
 from probewise.diagnosis.noise_law import white_noise
-from probewise.diagnosis.sensors import FreeFormSensor, cached_known_scene, default_sensor
+from probewise.diagnosis.sensors import FreeFormSensor, cached_known_scene, default_sensor, fine_structure_slopes
 from probewise.effects import VOCABULARY, Extent
-from probewise.priors import LogUniform, Product
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.sensor import Chain, FixedLevels, FreeMixture
 from probewise.world.spots import Blob, gaussian_spot, ring_spot
@@ -91,11 +88,3 @@ def test_effects_outlast_it():
         change = (model.predict(z[None, :])[0] - found.model.predict(found.z[None, :])[0])[:, None]
         kept = np.linalg.norm(beside.project(change)) / np.linalg.norm(without.project(change))
         assert kept > 0.9, name
-
-
-def test_a_model_without_an_ssf_has_none():
-    plan = paper_plan()
-    prior = Product({"level": LogUniform(1.0, 10.0)})
-    null = FunctionNull(lambda parameters, plan: parameters["level"] * np.ones(len(plan)), prior)
-    model = Model(null, (), plan)
-    assert fine_structure_slopes(model, np.zeros(1), np.arange(len(plan))).shape == (len(plan), 0)

@@ -9,7 +9,7 @@ import pytest
 
 from probewise.diagnosis.hypothesis_problem import log_likelihood_marginal_over_sigma
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.posterior import QuadraticPredictions, SurrogatePosterior
+from probewise.diagnosis.posterior import QuadraticPredictions, surrogate_log_density
 
 CENTER = np.array([0.3, -0.2, 1.0])
 STEPS = np.array([[0.4, 0.1, 0.0], [0.0, 0.3, -0.2], [0.0, 0.0, 0.5]])
@@ -78,9 +78,9 @@ def test_the_density_is_that_of_its_predictions():
     z = CENTER + e @ STEPS
     residuals = (readings - predicted(quadratic, e)).T
     expected = log_likelihood_marginal_over_sigma(LAW, LAW(residuals)) - 0.5 * np.sum(z**2, axis=1)
-    near = SurrogatePosterior.of(quadratic, CENTER, STEPS, readings, LAW)
-    np.testing.assert_allclose(near.log_density(e), expected, rtol=1e-9)
-    assert near.log_density(np.full((1, 3), 100.0))[0] == -np.inf
+    near = surrogate_log_density(quadratic, CENTER, STEPS, readings, LAW)
+    np.testing.assert_allclose(near(e), expected, rtol=1e-9)
+    assert near(np.full((1, 3), 100.0))[0] == -np.inf
 
 
 def test_under_a_tail_the_density_falls_off_as_it_should():
@@ -91,13 +91,13 @@ def test_under_a_tail_the_density_falls_off_as_it_should():
     falls = []
     for seed in range(60):
         readings = noisy(0.1, seed, tailed)
-        near = SurrogatePosterior.of(quadratic, CENTER, STEPS, readings, tailed)
+        near = surrogate_log_density(quadratic, CENTER, STEPS, readings, tailed)
         true = [
             log_likelihood_marginal_over_sigma(tailed, tailed((readings - predicted(quadratic, at)).T))
             for at in (e, np.zeros((1, 3)))
         ]
         prior = 0.5 * np.sum((CENTER + e @ STEPS) ** 2, axis=1) - 0.5 * np.sum(CENTER**2)
-        falls.append([true[1] - true[0], near.log_density(np.zeros((1, 3))) - near.log_density(e) - prior])
+        falls.append([true[1] - true[0], near(np.zeros((1, 3))) - near(e) - prior])
     true, found = np.mean(falls, axis=0)
     np.testing.assert_allclose(found, true, rtol=0.25, atol=0.3)
     assert true.max() > 5

@@ -31,6 +31,10 @@ class Held:
     def evidence(self):
         return {(): SimpleNamespace(log_z=self.log_z)}
 
+    @property
+    def log_z_by_noise(self):
+        return {(): self.log_z}
+
     whitened_sd = 1.0
 
     @property

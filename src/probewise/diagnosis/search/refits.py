@@ -114,6 +114,11 @@ class WeighedFit:
         return self.found.model.sensor.effective_n_gaussians
 
     @property
+    def log_z_by_noise(self) -> dict[Names, float]:
+        """Log evidence under each noise model."""
+        return {noise: evidence.log_z for noise, evidence in self.evidence.items()}
+
+    @property
     def log_z(self) -> float:
         """Log evidence under the best noise model."""
         return max(e.log_z for e in self.evidence.values())
@@ -623,7 +628,7 @@ class Refits:
                 promised = parent.evidence[plain].log_z + log_mean_exp(scores)
                 if fitted[0].evidence[plain].log_z < promised - STEERING:
                     fitted.append(self.fit_and_weigh(model, np.stack(starts), about.law, beyond=parent))
-        return max(fitted, key=lambda candidate: self.noises.average_log_evidence(_log_z_by_noise(candidate)))
+        return max(fitted, key=lambda candidate: self.noises.average_log_evidence(candidate.log_z_by_noise))
 
     def _linearised_under_simplest_noise(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
         """Linearise a fit under the simplest noise: one problem; none if `problem` is under the same noise."""
@@ -642,10 +647,6 @@ def _amplitudes_in_residual(projected: FloatArray, residual: FloatArray) -> Floa
         return np.asarray(np.linalg.lstsq(projected, residual)[0], dtype=np.float64)
     prior = np.eye(n) / SCALES[-1]
     return np.asarray(np.linalg.lstsq(np.concatenate([projected, prior]), np.append(residual, np.zeros(n)))[0])
-
-
-def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:
-    return {noise: evidence.log_z for noise, evidence in candidate.evidence.items()}
 
 
 def is_significantly_better(candidate: WeighedFit, parent: WeighedFit) -> bool:

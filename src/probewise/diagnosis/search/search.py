@@ -75,7 +75,7 @@ def prune_out_of_vocabulary(
     """
 
     def average_log_evidence(candidate: WeighedFit) -> float:
-        return noises.average_log_evidence({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
+        return noises.average_log_evidence(candidate.log_z_by_noise)
 
     leading = {c.names: c for c in sorted(candidates.values(), key=average_log_evidence) if c.names}
     stay, pruned = dict(candidates), set()
@@ -181,9 +181,7 @@ class UnknownEffects:
         return self._log_evidence_without_unknown(candidate) - (self.log_n_choices(candidate.names) if several else 0.0)
 
     def _log_evidence_without_unknown(self, candidate: WeighedFit) -> float:
-        return self.noises.average_log_evidence(
-            {noise: evidence.log_z for noise, evidence in candidate.evidence.items()}
-        )
+        return self.noises.average_log_evidence(candidate.log_z_by_noise)
 
     def _log_evidence_with_unknown(self, candidate: WeighedFit) -> float:
         own = candidate.n_gaussians, candidate.names

@@ -143,7 +143,7 @@ class Evidences:
             return False
         law = null.evidence[noise].likeliest_law
         narrow = 1 - outlier_probabilities(null.found.residuals, law)
-        sd = float(law.likeliest_sigma(law(null.found.residuals)[:, None])[0])
+        sd = law.likeliest_sigma_of(null.found.residuals)
         apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
         return all(0.5 * float(narrow @ change**2) < ALIASED_NATS for change in apart)
 

@@ -45,9 +45,9 @@ from probewise.diagnosis.search.refits import (
     effects_out_of_vocabulary,
     is_significantly_better,
 )
-from probewise.diagnosis.sensors import Start
+from probewise.diagnosis.sensors import SsfForms, Start
 from probewise.diagnosis.templates import TemplateBank, TemplateCache, log_bayes_factors_of_pairs, log_mean_exp
-from probewise.effects import AGAIN, NamedEffect, name_of_first_copy
+from probewise.effects import AGAIN, Extent, NamedEffect, name_of_first_copy
 from probewise.effects.noise import lattice_step
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
@@ -328,7 +328,7 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     if null is not None:
         fit_and_keep((null, null.starts), law)
     else:
-        forms = prepared.apparatus.null_forms(recording)
+        forms = SsfForms(Extent.of(recording))
         last = fit_and_keep(forms.one_gaussian_and_starts(), law)
         if max_order > 1:
             best = max(

@@ -24,7 +24,7 @@ from probewise.diagnosis.hypothesis_problem import HypothesisProblem, fold_probl
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.searched import Searched
-from probewise.effects import name_without_copy_suffix
+from probewise.diagnosis.words import combination_label
 from probewise.errors import DoubtfulResultWarning
 from probewise.progress import Progress, silent
 
@@ -49,7 +49,7 @@ class Weighing:
     @property
     def label(self) -> str:
         """Effects joined by "+", or "clean"."""
-        return "+".join(sorted(map(name_without_copy_suffix, self.effects))) or "clean"
+        return combination_label(self.effects)
 
     @property
     def gap(self) -> float:

@@ -410,10 +410,6 @@ def _fits_of_open_hypotheses(searched: Searched, null: WeighedFit, ranked: Mappi
 def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str, apparatus: Apparatus) -> Rival:
     label, found = hypothesis_in_words(candidate.names, nothing=as_calibrated), candidate.found
     of_run = apparatus.coordinates_of_new_run(found.model)
-    return Rival(label, found.model, found.z, _covariance_root_of_fit(candidate), probability, of_run)
-
-
-def _covariance_root_of_fit(candidate: WeighedFit) -> FloatArray:
-    """Return a square root of the covariance of a fit's coordinates under white noise, (n_params, n_params)."""
-    slopes, sd = candidate.found.slopes, candidate.whitened_sd
-    return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd, len(slopes)))
+    slopes, sd = found.slopes, candidate.whitened_sd
+    root = covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd, len(slopes)))
+    return Rival(label, found.model, found.z, root, probability, of_run)

@@ -40,7 +40,8 @@ class Scan:
     @property
     def minutes(self) -> float:
         """Duration in minutes, including the break before it."""
-        return duration_minutes(self.plan) + self.sheet_laying_s / 60.0
+        scanning = (float(np.ptp(self.plan.time_s)) + BREAK_S) / 60.0 if len(self.plan) else 0.0
+        return scanning + self.sheet_laying_s / 60.0
 
     @property
     def sheet_laying_s(self) -> float:
@@ -53,17 +54,12 @@ def earliest_start_s(plan: Plan) -> float:
     return float(plan.time_s.max(initial=0.0)) + BREAK_S
 
 
-def duration_minutes(plan: Plan) -> float:
-    """Estimate the duration of a plan in minutes, including the break before it."""
-    return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
-
-
 def plan_of_alternatives(commands: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate alternative scans, each timed as if directly after a plan, to predict all of them at once.
 
     Covariates that the scans lack, such as battery voltage, keep their last value of that plan.
     """
-    return _with_last_known_covariates(_joined_plan(commands), after)
+    return _with_last_known_covariates(commands, after)
 
 
 def plan_of_sequence(commands: Sequence[Scan], after: Plan) -> Plan:
@@ -74,18 +70,15 @@ def plan_of_sequence(commands: Sequence[Scan], after: Plan) -> Plan:
     out: list[Scan] = []
     for scan in commands:
         out.append(_scan_started_at(scan, earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])))
-    return _with_last_known_covariates(_joined_plan(out), after)
+    return _with_last_known_covariates(out, after)
 
 
-def _with_last_known_covariates(plan: Plan, after: Plan) -> Plan:
-    """Fill covariates that cannot be commanded with their last known values of the preceding plan."""
+def _with_last_known_covariates(scans: Sequence[Scan], after: Plan) -> Plan:
+    """Concatenate scans; covariates that cannot be commanded have their last known values of the preceding plan."""
+    plan = join_plans([scan.plan for scan in scans])
     read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
     kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
     return replace(plan, covariates={**kept, **plan.covariates})
-
-
-def _joined_plan(scans: Sequence[Scan]) -> Plan:
-    return join_plans([scan.plan for scan in scans])
 
 
 def scan_started_after(scan: Scan, plan: Plan) -> Scan:
@@ -193,7 +186,7 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
                 words = f"take scan {name} with the sensor turned to {degrees + _TURN_DEG:.0f} degrees{every}"
                 out.append(Scan("rotate", words, _with_scan_name_suffix(turned, "turned")))
             if "led" in controls:
-                dark = _with_commanded_value(once, "led", 0.0)
+                dark = replace(once, covariates={**once.covariates, "led": np.zeros(len(once))})
                 out.append(
                     Scan("relight", f"take scan {name} with the LED off{every}", _with_scan_name_suffix(dark, "dark"))
                 )
@@ -241,10 +234,6 @@ def _with_scan_name_suffix(plan: Plan, how: str) -> Plan:
     return replace(plan, scan_names=(f"{plan.scan_names[0]}_{how}",))
 
 
-def _with_commanded_value(plan: Plan, name: str, value: float) -> Plan:
-    return replace(plan, covariates={**plan.covariates, name: np.full(len(plan), value)})
-
-
 def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
     """Return the row numbers of the first six moving scans of eight rows or more, without repeats and reversals."""
     seen: dict[tuple[object, ...], IntArray] = {}
@@ -286,7 +275,7 @@ def target_swaps(plan: Plan) -> list[Scan]:
     for part in excerpts_of_scan(first, strides=(_STRIDE // 2, _STRIDE)):
         across = _rotated_scan(_rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
         out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
-    edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
+    edges = ((scan, plan.patterns.get(plan.pattern_names[int(plan.pattern[scan[0]])])) for scan in scans)
     laid = (_scans_over_moved_targets(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
     return [*out, *next(filter(None, laid), [])]
 
@@ -332,10 +321,6 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
             taken = _with_pattern(_rows_as_next_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     return out
-
-
-def _pattern_under(plan: Plan, scan: IntArray) -> Pattern | None:
-    return plan.patterns.get(plan.pattern_names[int(plan.pattern[scan[0]])])
 
 
 def _rows_as_next_scan(plan: Plan, rows: IntArray, name: str) -> Plan:

@@ -386,7 +386,8 @@ class PlanAudit(ShowsItself):
         n_runs = len(self.plan.scan_names)
         lines = [f"{len(self.plan)} readings in {n_runs} {self.words.run}{'' if n_runs == 1 else 's'}; {self.assumed}"]
         lines += _wrapped_lines("fine", [e.name for e in self.effects_with_detectability("fine")])
-        lines += _wrapped_lines("aliased", [_name_with_alias(e) for e in self.effects_with_detectability("aliased")])
+        aliased = self.effects_with_detectability("aliased")
+        lines += _wrapped_lines("aliased", [f"{e.name} ({e.alike[0][0]} {e.alike[0][1]:.2f})" for e in aliased])
         lines += _wrapped_lines("invisible", [e.name for e in self.effects_with_detectability("invisible")])
         lines += _READING_GUIDE
         if not self.cures:
@@ -404,10 +405,6 @@ class PlanAudit(ShowsItself):
             lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
         left = [e.name for e in self.after if e.detectability != "fine"]
         return "\n".join([*lines, *_wrapped_lines("left", left or ["nothing"])])
-
-
-def _name_with_alias(effect: EffectAudit) -> str:
-    return f"{effect.name} ({effect.alike[0][0]} {effect.alike[0][1]:.2f})"
 
 
 def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:

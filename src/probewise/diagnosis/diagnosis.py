@@ -126,7 +126,8 @@ class Diagnosis(ShowsItself):
         """Describe the diagnosis in plain text."""
         lines = [f"{self.verdict}: {self.reason}"]
         if self.verdict != "unknown" or self.p_value <= ALARM:  # otherwise the reason says why it does not count
-            lines.append(_p_value_in_words(self.p_value))
+            odd = "probability of readings at least this odd if nothing is missing from the mean"
+            lines.append(f"{p_in_words(self.p_value)} ({odd})")
         lines.append("probability  explanation")
         lines += [f"  {h.probability:9.3f}  {_with_code(h)}" for h in self.hypotheses[:5] if h.probability > 1e-3]
         # The reason is not repeated.
@@ -161,10 +162,6 @@ def _with_code(hypothesis: Hypothesis) -> str:
     """Return a hypothesis in words, followed by its label in diagnosis.json."""
     words, label = hypothesis_in_words(hypothesis.effects), hypothesis.label
     return words if words == label else f"{words} ({label})"
-
-
-def _p_value_in_words(p_value: float) -> str:
-    return f"{p_in_words(p_value)} (probability of readings at least this odd if nothing is missing from the mean)"
 
 
 def require_diagnosis(diagnosis: object) -> None:

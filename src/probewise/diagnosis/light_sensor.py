@@ -86,7 +86,7 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
         "time": plan.time_s[usable],
         "level": level,
         "edge_distance": _edge_distance_mm(plan)[usable],
-        **{_covariate_of_column(name): values[usable] for name, values in plan.covariates.items()},
+        **{f"column {k}" if k in _NOT_COLUMNS else k: values[usable] for k, values in plan.covariates.items()},
     }
     out: list[Covariate] = []
     for name, values in pooled.items():
@@ -103,11 +103,6 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
     if len(np.unique(scan)) > 1:
         out.append(Covariate("scan", scan.astype(np.float64), everything, groups=True))
     return out + _place_covariates_along_scans(plan, usable)
-
-
-def _covariate_of_column(name: str) -> str:
-    """Return the covariate's name for a column of the recording: as it is, or "column NAME" if that is taken."""
-    return f"column {name}" if name in _NOT_COLUMNS else name
 
 
 def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariate]:

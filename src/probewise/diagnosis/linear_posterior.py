@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.effects import HeavyTailedPrior, NamedEffect
@@ -399,7 +399,8 @@ class ConditionallyLinearDensity:
         """Return the log density of coordinates, up to a constant, (n_samples, n_params) -> (n_samples,)."""
         x, at = np.delete(self.view.straightened(z), self.at, axis=1), list(self.amplitude.at)
         x[:, self._own] = self.amplitude.values(z[:, at])[:, 0]
-        node = self._nearest_nodes(z[:, self.at])
+        steps = np.rint((z[:, self.at] - self.nodes[0]) / (self.nodes[1] - self.nodes[0]))
+        node = np.clip(steps, 0, len(self.nodes) - 1).astype(np.int64)
         apart = x[:, None] - self._interpolated_means(z[:, self.at])
         eps = np.einsum("ncji,ncj->nci", self.roots[node], apart)
         volume = np.log(np.diagonal(self.roots[node], axis1=2, axis2=3)).sum(axis=2)
@@ -417,11 +418,6 @@ class ConditionallyLinearDensity:
         below = np.clip(np.floor(position), 0, len(self.nodes) - 2).astype(np.int64)
         share = (position - below)[:, None, None]
         return np.asarray((1 - share) * self.means[below] + share * self.means[below + 1])
-
-    def _nearest_nodes(self, value: FloatArray) -> IntArray:
-        spacing = self.nodes[1] - self.nodes[0]
-        nearest = np.clip(np.rint((value - self.nodes[0]) / spacing), 0, len(self.nodes) - 1)
-        return np.asarray(nearest, dtype=np.int64)
 
 
 def _quadratic_log_likelihood(

@@ -30,7 +30,7 @@ _MANY = 12  # nodes of one effect above which they are thinned before combinatio
 _APART = 0.3  # initial spacing of nodes in the log of half a step over the noise sd
 _WIDEST, _NARROWEST = -6, 9  # range of nodes: noise sds from 3 steps, or the residual rms, to a thirtieth of a step
 _UNLIKELY = 15.0  # nats behind the best from which nodes of noise with rounding are dropped
-_HIDDEN = 0.6  # sd over step from which rounding is negligible (lattice sum 1 + 2 exp(-2 pi^2 0.36) = 1.0016)
+HIDDEN = 0.6  # sd over step from which rounding is negligible (lattice sum 1 + 2 exp(-2 pi^2 0.36) = 1.0016)
 
 _FINE = 0.01  # noise sds: tolerance of a lost reading's value without rounding
 
@@ -93,7 +93,8 @@ class NoiseModel:
         """
         residuals, sd = self._residuals_and_rough_sd(predicted)
         rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._usable_readings)
-        banks = [self._weighted_nodes(effect, residuals / sd, rows) for effect in self.effects]
+        whitened = residuals / sd
+        banks = [self.likely.get(e.name) or e.weighed_nodes(whitened, rows) for e in self.effects]
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
         for bank, log_each in banks:
             settings = np.concatenate(
@@ -126,19 +127,11 @@ class NoiseModel:
 
     def _residuals_and_rough_sd(self, predicted: FloatArray) -> tuple[FloatArray, float]:
         """Return the residuals over their declared relative sds, (n_usable,), and a robust estimate of their sd."""
-        residuals = (self._usable_readings - predicted) / self._relative_sd
+        residuals = (self._usable_readings - predicted) / self.recording.relative_sd[self.recording.usable]
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
         free = residuals[~self._censored] if self._censored.any() else residuals
         sd = max(float(np.median(np.abs(free))) / 0.6745, self._rounding_step / math.sqrt(12))
         return residuals, sd or 1.0
-
-    def _weighted_nodes(
-        self, effect: NoiseEffect, residuals: FloatArray, rows: FittedReadings
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the nodes of one effect, (n_nodes, n_params), and their log weights, (n_nodes,)."""
-        if effect.name in self.likely:
-            return self.likely[effect.name]
-        return effect.weighed_nodes(residuals, rows)
 
     def _noise_parameters_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
         """Return the relative sds, correlations, ... of the noise at all nodes, with every noise effect applied.
@@ -174,9 +167,10 @@ class NoiseModel:
         carry[unknown] = 0.0
         above = self._previous_in_scan
         carry[(above >= 0) & unknown[above]] = 0.0
-        walk = (
-            value_at_node(noise.walk) ** 2 * self._n_rows_since_previous_in_table if np.any(noise.walk) else np.zeros(0)
-        )
+        walk = np.zeros(0)
+        if np.any(noise.walk):  # from the row of the previous usable reading, even of another run
+            n_rows = np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
+            walk = value_at_node(noise.walk) ** 2 * n_rows
         log_extra = 0.0
         if lost_share > 0:
             n_lost, cells = (
@@ -198,7 +192,7 @@ class NoiseModel:
             least=self.least_sd,
             walk=walk,
             before=np.maximum(above, 0)
-            if self._has_interleaved_scans and np.any(carry)
+            if np.any((above >= 0) & (above != np.arange(len(above)) - 1)) and np.any(carry)
             else np.zeros(0, dtype=np.int64),
             censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),
         )
@@ -213,11 +207,6 @@ class NoiseModel:
         return previous_usable(self.recording)
 
     @cached_property
-    def _has_interleaved_scans(self) -> bool:
-        above = self._previous_in_scan
-        return bool(np.any((above >= 0) & (above != np.arange(len(above)) - 1)))
-
-    @cached_property
     def _usable_readings(self) -> FloatArray:
         return self.recording.readings[self.recording.usable]
 
@@ -229,15 +218,6 @@ class NoiseModel:
     @cached_property
     def _n_rows_since_previous_in_scan(self) -> IntArray:
         return n_rows_since_previous_usable(self.recording)
-
-    @cached_property
-    def _n_rows_since_previous_in_table(self) -> FloatArray:
-        """Number of rows back to the previous usable reading, even of another run; at first, to before the table."""
-        return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
-
-    @cached_property
-    def _relative_sd(self) -> FloatArray:
-        return self.recording.relative_sd[self.recording.usable]
 
     @cached_property
     def _lost_value_resolution(self) -> float:
@@ -291,15 +271,10 @@ def _sd_nodes_with_rounding(
     return np.exp(x[likely]), log_weights[likely]
 
 
-def rounding_hides_noise(step: float, sd: float) -> bool:
-    """Return whether a noise sd is below 0.6 rounding steps: too coarse for a normal density of the readings."""
-    return sd < _HIDDEN * step
-
-
 def least_sd_given_rounding(recording: Recording) -> float:
     """Return the least sd of a normal density of the readings: the usual floor, and at least 0.6 of a rounding step."""
     # On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice.
-    return max(sd_floor(recording), _HIDDEN * lattice_step(recording.readings[recording.usable]))
+    return max(sd_floor(recording), HIDDEN * lattice_step(recording.readings[recording.usable]))
 
 
 def rough_sd(recording: Recording) -> float:

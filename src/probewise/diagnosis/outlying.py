@@ -86,7 +86,8 @@ class LostReadings:
 
     def left_out_of(self, recording: Recording) -> Recording:
         """Return the recording with these readings left out, and a note that says so."""
-        n, far = len(self.rows), _rounded(float(self.in_sds.min()))
+        n, least = len(self.rows), float(self.in_sds.min())
+        far = f"{least:,.0f}" if least < 1e6 else f"{least:.1g}"
         note = (
             f"{count_with_noun(n, 'reading')} left out as lost: {rows_in_words(recording, self.rows)}, {far} noise sds "
             f"{'or more ' if n > 1 else ''}from a fit to the others, with {_percent(self.share)} of the squared "
@@ -276,7 +277,3 @@ def rows_in_words(recording: Recording, rows: IntArray) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share < 0.995 else "nearly all"
-
-
-def _rounded(number: float) -> str:
-    return f"{number:,.0f}" if number < 1e6 else f"{number:.1g}"

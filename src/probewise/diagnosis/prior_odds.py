@@ -76,7 +76,8 @@ class PriorOdds:
             log_p += n_again * math.log(self.twice) + (len(once) - n_again) * math.log1p(-self.twice)
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
-            log_p += math.log(share * self.out_of_vocabulary / (self._n_unnamed_as_likely - k))
+            n_as_likely = self.n_unnamed - (1 - self.unlikely_weight) * self._n_unlikely_unnamed
+            log_p += math.log(share * self.out_of_vocabulary / (n_as_likely - k))
         return log_p + len(self.unlikely.intersection(names)) * math.log(self.unlikely_weight)
 
     def _log_prior_per_combination(self, n: int) -> float:
@@ -94,11 +95,6 @@ class PriorOdds:
     @cached_property
     def _n_unlikely_unnamed(self) -> int:
         return sum(map(is_out_of_vocabulary, self.unlikely))
-
-    @property
-    def _n_unnamed_as_likely(self) -> float:
-        """Number of effects out of vocabulary, each unlikely one counted by its weight."""
-        return self.n_unnamed - (1 - self.unlikely_weight) * self._n_unlikely_unnamed
 
     def log_prior_with_unknown(self, names: Names) -> float:
         """Return the log prior of an unknown effect without a formula, together with effects on the mean."""

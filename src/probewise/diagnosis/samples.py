@@ -207,7 +207,9 @@ def sample_model(
     if law.flat:  # sd at each noise node, without rounding if that is an effect, else including it
         noise_sd = noise_sd_by_node(noise, with_rounding=not of_lattice)[nodes]
     else:
-        noise_sd = _sd_without_rounding(noise_sd, rounding, law.n_kept)
+        # Without the rounding variance, but no less than the accuracy of the total.
+        least = np.where(rounding > 0, math.sqrt(8 / law.n_kept), 1)
+        noise_sd = np.sqrt(np.maximum(noise_sd**2 - rounding**2 / 12, noise_sd**2 * least))
     return ModelSamples(
         chain,
         theta,
@@ -228,11 +230,6 @@ def draw_noise_sd(law: NoiseLaw, residuals: FloatArray, *, rng: np.random.Genera
 def noise_sd_by_node(noise: NoiseEvidence, *, with_rounding: bool) -> FloatArray:
     """Return the sd of the noise at each node of a rounding noise model, (n_nodes,), with the rounding or without."""
     return np.array([own.sigma * (own.sd_factor_of_rounding if with_rounding else 1.0) for own in noise.nodes.laws])
-
-
-def _sd_without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:
-    """Return the noise sd without the rounding variance, but no less than the accuracy of the total; (n_samples,)."""
-    return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
 
 
 def noise_effect_samples(effect: NoiseEffect, noise: NoiseEvidence, *, rng: np.random.Generator) -> FloatArray:

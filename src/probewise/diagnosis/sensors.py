@@ -405,13 +405,9 @@ class SsfForms:
 
 def starts_of_one_gaussian(sensor: GaussianMixtureSensor) -> FloatArray:
     """Return coordinates to start from for one Gaussian: typical, narrow and wide, (3, n_params)."""
-    return np.stack([_with_widths(np.zeros(sensor.n_params), step) for step in (0.0, -1.5, 1.5)])
-
-
-def _with_widths(z: FloatArray, step: float) -> FloatArray:
-    z = z.copy()
-    z[2:4] = step
-    return z
+    out = np.zeros((3, sensor.n_params))
+    out[:, 2:4] = [[0.0], [-1.5], [1.5]]
+    return out
 
 
 def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: GaussianMixtureSensor) -> FloatArray:

@@ -58,7 +58,8 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     """
     table = table_for(simulator, table)
     table.require_rising_time()
-    own = cast(RunTable, as_recording(simulator, _without_reading_column(simulator, table)).plan)
+    inputs = replace(table, columns={name: v for name, v in table.columns.items() if name != simulator.reading})
+    own = cast(RunTable, as_recording(simulator, inputs).plan)
     system = System.of(simulator, own)
     z, predicted, where = _point_where_readings_vary(system, own)
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
@@ -80,7 +81,12 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     each = math.sqrt(len(own) / len(rows))  # every row taken stands for several, with as much information as they have
     laid = replace(laid, slopes=each * laid.slopes[rows], columns=each * laid.columns[rows])
     found, cosines = audits_and_cosines(laid, cast(Any, names), simulator.unit)
-    effects = tuple(_with_rows_needed(effect, reasons) for effect in found)
+    effects = tuple(
+        replace(e, reason=e.reason if e.share > 0 else reasons.get(e.name, e.reason))
+        if e.detectability == "invisible"
+        else replace(e, rows=math.ceil((LAMBDA / e.share) ** 2))
+        for e in found
+    )
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words
     return PlanAudit(
@@ -104,10 +110,6 @@ def _evenly_spread_rows(n_points: int, most: int) -> IntArray:
         return np.arange(n_points)
     stretch = np.arange(most)
     return np.asarray((stretch + stretch * _GOLDEN % 1.0) * n_points / most, dtype=np.int64)
-
-
-def _without_reading_column(simulator: Simulator, table: RunTable) -> RunTable:
-    return replace(table, columns={name: v for name, v in table.columns.items() if name != simulator.reading})
 
 
 def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
@@ -178,16 +180,6 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
         kinds = ("damping", "drag", "friction", "forcing", "periodic_forcing", "limit")
         out |= {f"{kind}:{state}": nothing for kind in kinds}
     return out
-
-
-def _with_rows_needed(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
-    """Return an audit with the number of rows like these that give lambda 8 to an effect of one noise sd rms.
-
-    An invisible effect gets a reason why it is invisible instead.
-    """
-    if effect.detectability == "invisible":
-        return replace(effect, reason=effect.reason if effect.share > 0 else reasons.get(effect.name, effect.reason))
-    return replace(effect, rows=math.ceil((LAMBDA / effect.share) ** 2))
 
 
 def _alias_classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:

@@ -88,7 +88,7 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
     """
     out: list[RunCommand] = []
     settable = [name for name in controls if name in table.covariates]
-    ends = {name: _least_and_greatest(table.covariates[name]) for name in settable}
+    ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     for rows in _rows_of_distinct_runs(table, settable):
         name = table.scan_names[int(table.scan[rows[0]])]
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
@@ -224,15 +224,6 @@ def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[Int
     return list(seen.values())[:_MOST_RUNS]
 
 
-def _least_and_greatest(values: FloatArray) -> tuple[float, float]:
-    return float(np.nanmin(values)), float(np.nanmax(values))
-
-
-def is_known_duration(table: RunTable, time_unit: str) -> bool:
-    """Return whether a table tells how long its rows take: it has a time, in a unit that is known."""
-    return _minutes_of_time_unit(table, time_unit) is not None
-
-
 def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
     minutes = _minutes_of_time_unit(table, time_unit)
     if minutes is None:
@@ -340,7 +331,7 @@ class SimulatorApparatus(Apparatus):
     @property
     def tells_duration(self) -> bool:
         """Whether the table says how long a measurement takes: it has a time, in a known unit."""
-        return is_known_duration(self.about.table, self.system.simulator.time_unit)
+        return _minutes_of_time_unit(self.about.table, self.system.simulator.time_unit) is not None
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""

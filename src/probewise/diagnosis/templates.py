@@ -258,16 +258,11 @@ def templates_of_effect(
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
-        for _, group in itertools.groupby(
-            range(len(choice)), key=lambda at: _scans_and_patterns_of(variants[choice[at]])
-        ):
+        bound = [(variants[k].scans, variants[k].patterns) for k in choice]
+        for _, group in itertools.groupby(range(len(choice)), key=bound.__getitem__):
             at = list(group)
             columns += _predicted_changes(found, variants[choice[at[0]]], entries[at], usable)
     return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
-
-
-def _scans_and_patterns_of(variant: NamedEffect[Any]) -> tuple[object, object]:
-    return variant.scans, variant.patterns
 
 
 def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:

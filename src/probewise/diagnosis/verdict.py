@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -91,8 +91,6 @@ def _max_p_value_over_orders(
 OUT_OF_THE_QUESTION = 0.2
 """Share of a leader's probability up to which its rivals are not credible; priors differ by less."""
 
-_NO_NAMES = ("unknown",)
-
 
 def shared_effects(probabilities: Mapping[Names, float]) -> Names:
     """Return the effects that are in nearly all hypotheses at once, sorted; () if there are none.
@@ -100,8 +98,11 @@ def shared_effects(probabilities: Mapping[Names, float]) -> Names:
     The hypotheses without one of them have together at most a fifth of the probability of those with all of them, so
     that no alias of one is credible. `probabilities` are by the effects of each hypothesis.
     """
-    total, shared = sum(probabilities.values()), frozenset[str]()
-    for name in _most_probable_first(probabilities):
+    total, shared, of_effect = sum(probabilities.values()), frozenset[str](), dict[str, float]()
+    for names, p in probabilities.items():
+        for name in names if names != ("unknown",) else ():
+            of_effect[name] = of_effect.get(name, 0.0) + p
+    for name in sorted(of_effect, key=lambda name: (-of_effect[name], name)):  # the most probable first
         with_all = sum(p for names, p in probabilities.items() if shared | {name} <= {*names})
         if total - with_all <= OUT_OF_THE_QUESTION * with_all:
             shared |= {name}
@@ -119,15 +120,6 @@ def probabilities_beside(shared: Names, probabilities: Mapping[Names, float]) ->
         if {*shared} <= {*names}
     }
     return dict(sorted(beside.items(), key=lambda item: -item[1]))
-
-
-def _most_probable_first(probabilities: Mapping[Names, float]) -> Iterator[str]:
-    """Iterate over all effects, those first that are in hypotheses of the largest probability."""
-    of_effect: dict[str, float] = {}
-    for names, p in probabilities.items():
-        for name in names if names != _NO_NAMES else ():
-            of_effect[name] = of_effect.get(name, 0.0) + p
-    yield from sorted(of_effect, key=lambda name: (-of_effect[name], name))
 
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]

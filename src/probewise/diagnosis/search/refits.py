@@ -21,7 +21,7 @@ from probewise.diagnosis.evidence import (
 )
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_start
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.noise_models import NoiseModel, least_sd_given_rounding, rough_sd, rounding_hides_noise
+from probewise.diagnosis.noise_models import HIDDEN, NoiseModel, least_sd_given_rounding, rough_sd
 from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.constants import (
     ALIASED_NATS,
@@ -198,7 +198,7 @@ class NoiseModels:
         }
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
         self.certain = tuple(sorted(self._known))
-        self._hidden = rounding_hides_noise(self._step, sd)
+        self._hidden = sd < HIDDEN * self._step
         others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
         single = [tuple(sorted({*names, *self.certain})) for names in combinations_up_to(others, 1)]
         self.models = {names: self._build_model(names) for names in single}
@@ -543,7 +543,8 @@ class Refits:
         weights = templates.variant_probabilities(scores)
         # Under heavy-tailed noise, a few readings changed by an effect count as outliers; so start from white noise
         # too.
-        plain = self._linearised_under_simplest_noise(parent, problem)
+        law = parent.evidence[self.noises.certain].likeliest_law
+        plain = [] if law.is_practically_equal(problem.law) else [Linearised.of(parent.found, law)]
         seen = [(problem, scores), *((about, log_bayes_factors_about(about)) for about in plain)]
         likeliest = (int(np.argmax(templates.variant_probabilities(own_scores))) for _, own_scores in seen[1:])
         tried = list(dict.fromkeys([*_variants_to_refit(templates, weights), *likeliest]))
@@ -629,11 +630,6 @@ class Refits:
                 if fitted[0].evidence[plain].log_z < promised - STEERING:
                     fitted.append(self.fit_and_weigh(model, np.stack(starts), about.law, beyond=parent))
         return max(fitted, key=lambda candidate: self.noises.average_log_evidence(candidate.log_z_by_noise))
-
-    def _linearised_under_simplest_noise(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
-        """Linearise a fit under the simplest noise: one problem; none if `problem` is under the same noise."""
-        plain = parent.evidence[self.noises.certain].likeliest_law
-        return [] if plain.is_practically_equal(problem.law) else [Linearised.of(parent.found, plain)]
 
 
 def _amplitudes_in_residual(projected: FloatArray, residual: FloatArray) -> FloatArray:

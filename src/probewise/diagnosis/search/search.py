@@ -163,7 +163,11 @@ class UnknownEffects:
         The rival's evidence is at most three nats lower, and an unknown effect adds less than three to it.
         """
         most = max((self._log_evidence_with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
-        believed = {c: self._log_evidence_less_choices(c, len(known)) for c in rivals}
+        believed = {
+            c: self._log_evidence_without_unknown(c)
+            - (self.log_n_choices(c.names) if len(c.names) - len(known) > 1 else 0.0)
+            for c in rivals
+        }
         for candidate in sorted(believed, key=lambda c: -believed[c]):
             if believed[candidate] < most - ALIASED_NATS:
                 return False
@@ -175,10 +179,6 @@ class UnknownEffects:
             ):
                 return True
         return False
-
-    def _log_evidence_less_choices(self, candidate: WeighedFit, n_known: int) -> float:
-        several = len(candidate.names) - n_known > 1
-        return self._log_evidence_without_unknown(candidate) - (self.log_n_choices(candidate.names) if several else 0.0)
 
     def _log_evidence_without_unknown(self, candidate: WeighedFit) -> float:
         return self.noises.average_log_evidence(candidate.log_z_by_noise)
@@ -224,7 +224,8 @@ def search(
     if max_order is None:
         max_order = 1 if len(prepared.usable_rows) < FEW_READINGS else MAX_ORDER
     prior = prior or prepared.apparatus.prior_odds(effects)
-    on_mean, on_noise = _effects_on_mean_and_noise(prepared)
+    on_mean = {name: effect for name, effect in effects.items() if name not in prepared.noise_effect_names}
+    on_noise = {name: cast(NoiseEffect, effect) for name, effect in effects.items() if name not in on_mean}
     refits = (
         Refits(
             prepared.null,
@@ -296,12 +297,6 @@ def search(
         evidences=evidences(),
         posterior=posterior(),
     )
-
-
-def _effects_on_mean_and_noise(prepared: Prepared) -> tuple[dict[str, NamedEffect[Any]], dict[str, NoiseEffect]]:
-    effects, on_noise = prepared.effects, prepared.noise_effect_names
-    on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
-    return on_mean, {name: cast(NoiseEffect, effects[name]) for name in effects if name in on_noise}
 
 
 def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:

@@ -116,7 +116,7 @@ class Evidences:
         Unnamed are unknown effects and formulas; without any, False. Combinations do not count: they were chosen from
         too many for their evidence alone to decide.
         """
-        plain = self._simplest_noise
+        plain = min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
         nameless = [v for (_, names, noise), v in self.unknown.items() if not names and noise == plain]
         alone: dict[bool, list[float]] = {True: [], False: nameless}
         for (_, names), fit in self.fits.items():
@@ -146,11 +146,6 @@ class Evidences:
         sd = law.likeliest_sigma_of(null.found.residuals)
         apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
         return all(0.5 * float(narrow @ change**2) < ALIASED_NATS for change in apart)
-
-    @property
-    def _simplest_noise(self) -> Names:
-        """Names of the noise model with the fewest effects."""
-        return min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
 
     def _largest_log_z(self, names: Names) -> float:
         """Return a combination's largest log evidence over SSF orders and noise models; minus infinity: no fit."""

@@ -188,7 +188,8 @@ def _weigh_by_nested_sampling(
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     problem = _hypothesis_problem(candidate, noise, searched)
     once = fold_problem(problem, candidate.found.z)
-    log_factor = _log_prior_factor_of_whole_prior(candidate)
+    # Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
+    log_factor = candidate.log_prior_factor - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
         nested.run,
@@ -209,21 +210,17 @@ def _weigh_by_nested_sampling(
 
         told = weighing_from_samples(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
-            told = max(told, weighing_from_samples(_draw_from_laplace(candidate, rng)), key=lambda own: own.nested)
+            found, law = candidate.found, candidate.law
+            root = covariance_root(law(found.slopes), found.sd**2 / law.fisher_information)
+            draws = found.z + rng.standard_normal((_N_SAMPLES, len(found.z))) @ root.T
+            again = weighing_from_samples(np.clip(draws, -FARTHEST, FARTHEST))
+            told = max(told, again, key=lambda own: own.nested)
     more = explored.log_z + log_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:
         return told
     doubt = f"the whole prior holds more evidence than was found near the posterior, by {apart:.1f} standard errors"
     return replace(told, doubts=(*told.doubts, doubt))
-
-
-def _log_prior_factor_of_whole_prior(candidate: WeighedFit) -> float:
-    """Return the log prior factor in a candidate's evidence but for its equivalent peaks.
-
-    Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
-    """
-    return candidate.log_prior_factor - sum(math.log(effect.n_peaks) for effect in candidate.found.model.effects)
 
 
 def _hypothesis_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> HypothesisProblem:
@@ -296,14 +293,6 @@ def _evidence_near_posterior(
             log_z = float(np.average([own.log_z for own in runs], weights=weights))
             return _Evidence(log_z, error, tuple(doubt for own in runs for doubt in own.warnings))
         theta = found.samples(_N_SAMPLES, rng=rng)
-
-
-def _draw_from_laplace(candidate: WeighedFit, rng: np.random.Generator) -> FloatArray:
-    """Draw coordinates from Laplace's approximation, (_N_SAMPLES, n_params)."""
-    found = candidate.found
-    root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.fisher_information)
-    draws = rng.standard_normal((_N_SAMPLES, len(found.z)))
-    return np.clip(found.z + draws @ root.T, -FARTHEST, FARTHEST)
 
 
 @dataclass(frozen=True)

@@ -506,7 +506,8 @@ def user_function_error(
     elif law is not None and what == "rates":
         allowed = f"a function that returns a rate for each state somewhere in the prior: {', '.join(law.states)}"
     else:
-        allowed = f"a function that returns a reading for each of the {_n_rows(columns)} rows somewhere in the prior"
+        n_rows = max((np.shape(values)[-1] for values in columns.values()), default=0)
+        allowed = f"a function that returns a reading for each of the {n_rows} rows somewhere in the prior"
     return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
 
 
@@ -526,7 +527,3 @@ def _first_non_numeric_cell(values: NDArray[Any]) -> str:
         except ValueError:
             return str(cell)
     return str(values[0]) if len(values) else ""
-
-
-def _n_rows(columns: Mapping[str, NDArray[Any]]) -> int:
-    return max((np.shape(values)[-1] for values in columns.values()), default=0)

@@ -187,7 +187,10 @@ class FittedSystem(NamedSamples):
         try:
             own = document["simulator"]
             if not isinstance(simulator, Simulator):
-                simulator = _run_unchanged_file(Path(simulator), own, path)
+                file = Path(simulator)
+                source = read_text(file, "a Python file that describes a simulator")
+                _require_fingerprint(fingerprint_of_text(source), file.name, own, path)
+                simulator = run_simulator_text(source, file)
             fitted_to, here = f"{own['reading']} ({own['unit']})", f"{simulator.reading} ({simulator.unit})"
             if fitted_to != here:  # simulators made in Python have no fingerprint
                 raise FileError(path, f"fitted to {fitted_to}", f"a model of {here}, as the simulator predicts")
@@ -204,8 +207,8 @@ class FittedSystem(NamedSamples):
                 },
                 level=(float(document["level"][0]), float(document["level"][1])),
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
-                stiff=bool(own.get("stiff", False)),
-                known=None if known is None else _stored_fit_from_json(known, simulator),
+                stiff=bool(own["stiff"]),
+                known=None if known is None else _stored_fit_from_json(known),
                 recording=str(document["recording"]["fingerprint"]),
                 source=str(document["recording"]["source"]),
                 notes=tuple(document["notes"]),
@@ -232,12 +235,6 @@ class FittedSystem(NamedSamples):
             raise FileError(
                 path, f"contents that do not fit together ({message_of(error, kind=False)})", f"undamaged: {_WHAT}"
             ) from error
-
-
-def _run_unchanged_file(file: Path, own: Mapping[str, Any], path: object) -> Simulator:
-    text = read_text(file, "a Python file that describes a simulator")
-    _require_fingerprint(fingerprint_of_text(text), file.name, own, path)
-    return run_simulator_text(text, file)
 
 
 def _require_fingerprint(here: str, source: str, own: Mapping[str, Any], path: object) -> None:
@@ -295,15 +292,12 @@ def _column_to_json(values: NDArray[Any]) -> list[Any]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _stored_fit_from_json(document: Mapping[str, Any], simulator: Simulator) -> StoredFit:
+def _stored_fit_from_json(document: Mapping[str, Any]) -> StoredFit:
     columns = {name: _column_from_json(values) for name, values in document["columns"].items()}
     table = RunTable(columns, document["time"], document["run"])
     states = {name: _column_from_json(values) for name, values in document["states"].items()}
-    held = document.get("held")  # a file of an earlier version has none: only a law's columns were held then
-    if held is None:
-        held = table.covariates if simulator.law is not None and simulator.law.hold == "previous" else ()
-    sd = float(document.get("sd", 1.0))  # a file of an earlier version has none: only ends of bends depend on it
-    return StoredFit(table, _column_from_json(document["predicted"]), sd, states, tuple(held))
+    predicted = _column_from_json(document["predicted"])
+    return StoredFit(table, predicted, float(document["sd"]), states, tuple(document["held"]))
 
 
 def _column_from_json(values: list[Any]) -> NDArray[Any]:

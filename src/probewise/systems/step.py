@@ -41,9 +41,8 @@ _NUDGE = 1e-5
 _LEAST_SIZE = 1e-6  # of the largest state's size, for one that is 0 and at rest
 _TINY = 1e-150  # where all are
 _LATER = 1e-4  # of a step, for the rates' change with time: inputs between rows are constant or straight lines
-_DEARER = (
-    1.5  # evaluations of the eighth order, in those of the fourth, up to which its far smaller error is worth them
-)
+# Evaluations of the eighth order, in those of the fourth, up to which its far smaller error is worth them.
+_DEARER = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,20 +264,15 @@ class Steps:
         n_steps = np.asarray(np.maximum(np.ceil(longest / self.max_step - 1e-9), 1), dtype=np.int64)
         return StepSchedule(n_steps, RODAS) if self.stiff else StepSchedule.from_fourth_order_steps(n_steps)
 
-    @property
-    def n_steps_by_gap(self) -> IntArray:
-        """Number of steps from each row of a run to the next, (n_places - 1,); the same in all runs."""
-        return self.schedule.n_steps
-
     @cached_property
     def gap_of_step(self) -> IntArray:
         """Number of the gap in which each step lies, (n_steps,); gap k is between rows k and k + 1 of every run."""
-        return np.repeat(np.arange(len(self.n_steps_by_gap)), self.n_steps_by_gap)
+        return np.repeat(np.arange(len(self.schedule.n_steps)), self.schedule.n_steps)
 
     @cached_property
     def n_steps_before_position(self) -> IntArray:
         """Number of steps from the first row of a run to its row at each position, (n_places,)."""
-        return np.concatenate([[0], np.cumsum(self.n_steps_by_gap)])
+        return np.concatenate([[0], np.cumsum(self.schedule.n_steps)])
 
     @property
     def n_runs(self) -> int:
@@ -289,13 +283,13 @@ class Steps:
     def begin_share_of_gap(self) -> FloatArray:
         """Share of its gap between rows at which each step begins, (n_steps * n_runs,), ordered by step, then run."""
         gap = self.gap_of_step
-        share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.n_steps_by_gap[gap]
+        share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.schedule.n_steps[gap]
         return np.repeat(share, self.n_runs)
 
     @cached_property
     def length_share_of_gap(self) -> FloatArray:
         """Share of its gap between rows that each step takes, (n_steps * n_runs,), ordered by step, then run."""
-        return np.repeat(1.0 / self.n_steps_by_gap[self.gap_of_step], self.n_runs)
+        return np.repeat(1.0 / self.schedule.n_steps[self.gap_of_step], self.n_runs)
 
     def states_at_rows(self, states: FloatArray) -> FloatArray:
         """Select states (n_states, n_samples, n_steps + 1, n_runs) at every row: (n_states, n_samples, n_points)."""

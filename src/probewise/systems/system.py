@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,13 @@ class System:
     limited: bool = True
     slack: float = 0.0
 
+    # It has no SSF, and effects are screened about its fit.
+    n_gaussians: ClassVar[int] = 0
+    effective_n_gaussians: ClassVar[int] = 0
+    ssf_in_words: ClassVar[str] = ""
+    has_exchangeable_gaussians: ClassVar[bool] = False
+    may_be_far_off: ClassVar[bool] = False
+
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable, *, stiff: bool = False) -> System:
         """Build the system for the runs of a table, and determine how the simulator can be called.
@@ -107,7 +114,8 @@ class System:
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])
             if simulator.run is None:  # it is called for one recording after the other
-                table = table.take(max(table.rows_by_scan(), key=lambda rows: _n_filled_cells(table, rows)))
+                cells = [np.isfinite(values) for values in table.covariates.values()]
+                table = table.take(max(table.rows_by_scan(), key=lambda rows: sum(int(c[rows].sum()) for c in cells)))
             columns = columns_without_reading(simulator, table)
             try:
                 caller = Caller.from_trial_calls(
@@ -200,26 +208,6 @@ class System:
         return len(self.marginals)
 
     @property
-    def n_gaussians(self) -> int:
-        """0: it has no SSF."""
-        return 0
-
-    @property
-    def effective_n_gaussians(self) -> int:
-        """0: it has no SSF."""
-        return 0
-
-    @property
-    def ssf_in_words(self) -> str:
-        """Empty: it has no SSF."""
-        return ""
-
-    @property
-    def has_exchangeable_gaussians(self) -> bool:
-        """False: it has no Gaussians."""
-        return False
-
-    @property
     def nuisance_names(self) -> tuple[str, ...]:
         """Names of the parameters per run, `name[run]`, which apply to this table only."""
         return tuple(name for name in self.marginals if name not in self.simulator.parameters)
@@ -252,11 +240,6 @@ class System:
         """Whether predictions near a point cost little once it was predicted itself: for a law."""
         return self.caller is None
 
-    @property
-    def may_be_far_off(self) -> bool:
-        """False: effects are screened about its fit."""
-        return False
-
     def admits(self, effect: NamedEffect[Any]) -> bool:
         """Return whether an effect acts at a stage of this system: False for one on rates without a law."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None
@@ -272,10 +255,6 @@ class System:
     def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
         """Return the chain of the system with effects, ordered by stage; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
-
-
-def _n_filled_cells(table: RunTable, rows: IntArray) -> int:
-    return sum(int(np.isfinite(values[rows]).sum()) for values in table.covariates.values())
 
 
 def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:

@@ -470,9 +470,8 @@ def unused_name(name: str, taken: Iterable[str]) -> str:
 
 
 def _same_tables(first: RunTable, second: RunTable) -> bool:
-    if len(first) != len(second) or set(first.columns) != set(second.columns):
-        return False
-    return all(_equal_columns(values, second.columns[name]) for name, values in first.columns.items())
+    same_shape = len(first) == len(second) and first.columns.keys() == second.columns.keys()
+    return same_shape and all(_equal_columns(values, second.columns[name]) for name, values in first.columns.items())
 
 
 def _equal_columns(first: NDArray[Any], second: NDArray[Any]) -> bool:

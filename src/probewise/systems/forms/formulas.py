@@ -7,7 +7,7 @@ out of vocabulary and is reported as a formula.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,9 +86,13 @@ def formula_forms(about: ReferenceFit) -> Iterator[Form]:
     columns = _varying_columns_by_name(about)
     for name in columns:
         yield from _threshold_form(about, name)
-    yield from formula_forms_of_columns(about, columns)
+    for name, values in columns.items():
+        yield from _varying_influence_form(about, name, values)
+        yield from _dose_forms(about, name, values)
     if about.table.has_varying_time:
-        yield from formula_forms_in_time(about)
+        yield from _square_wave_form(about)
+        yield from _swept_wave_form(about)
+        yield from _double_settling_form(about)
     for state in about.states:
         yield from _rate_formula_forms(about, state)
         yield from _one_sided_rate_forms(about, state)
@@ -282,13 +286,6 @@ def _single_term_form(
     yield from about.scaled(form, guess)
 
 
-def formula_forms_in_time(about: ReferenceFit) -> Iterator[Form]:
-    """Yield proposals of a change of the reading in time: square wave, swept wave, two settlings."""
-    yield from _square_wave_form(about)
-    yield from _swept_wave_form(about)
-    yield from _double_settling_form(about)
-
-
 def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
     own, table, origin = about.system.simulator, about.table, time_origin(about.table)
@@ -406,16 +403,6 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
         expression=text,
     )
     yield from about.scaled(form, 1.0)
-
-
-def formula_forms_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
-    """Yield proposals that add to the reading: each column's influence, varying with the reading, and its dose.
-
-    The dose integrates abs(column - mean) or abs(column) from the start of the run; the change saturates with it.
-    """
-    for name, values in columns.items():
-        yield from _varying_influence_form(about, name, values)
-        yield from _dose_forms(about, name, values)
 
 
 def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:

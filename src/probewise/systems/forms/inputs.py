@@ -194,12 +194,6 @@ def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         )
 
 
-def _max_n_trial_frequencies(about: ReferenceFit) -> int:
-    if about.system.caller is None:
-        return max_n_trial_frequencies(len(about.table))
-    return _MOST_FREQUENCIES if about.system.predicts_in_bulk else _MOST_FREQUENCIES_CALLED
-
-
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     column = about.table.covariates[name]
     values = column[np.isfinite(column) & about.has_reading]  # others resolve no wave: it would fit any readings
@@ -211,9 +205,10 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * (c - origin) / theta[:, 1:2] + theta[:, 2:3]))
 
     act = _column_changer(name, add_wave)
-    frequencies = trial_frequencies(
-        np.sort(values), [np.arange(len(values))], _max_n_trial_frequencies(about), _ROWS_OF_A_WAVE, _LEAST_WAVES
-    )
+    most = _MOST_FREQUENCIES if about.system.predicts_in_bulk else _MOST_FREQUENCIES_CALLED
+    if about.system.caller is None:
+        most = max_n_trial_frequencies(len(about.table))
+    frequencies = trial_frequencies(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE, _LEAST_WAVES)
     form = WaveForm(
         name=f"periodic_error:{name}",
         stage=Stage.INPUT,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import cast
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from probewise._arrays import FloatArray, varies
 from probewise._words import unit_of_name, value_with_sd
 from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, ActInTime, Form, Say, flag
+from probewise.systems.forms.form import Act, ActInTime, Form, flag
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
@@ -122,7 +123,10 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
     for name, extra in about.system.simulator.extra.items():
         values = np.asarray(extra.prior.from_unit((np.arange(_N_VALUES) + 0.5) / _N_VALUES))
         values = values[values != extra.null]
-        act = _parameter_setter(name)
+
+        def act(value: Any, theta: FloatArray, table: RunTable, name: str = name) -> dict[str, FloatArray]:
+            return {**value, name: theta[:, :1]}
+
         rms = about.rms_change_in_sds(Stage.PARAMETER, act, values[:, None])
         seen = np.isfinite(rms) & (rms > _UNSEEN)
         if seen.any():
@@ -135,19 +139,10 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
                 act=act,
                 entries=values[seen][:, None, None],
                 amplitudes=(),
-                says=_sentence_writer(extra.says),
+                says=partial(_filled, extra.says),
                 absent={0: extra.null},
             )
 
 
-def _parameter_setter(name: str) -> Act:
-    """Return the function that sets a parameter of the simulator to the form's value."""
-
-    def act(value: Mapping[str, FloatArray], theta: FloatArray, table: object) -> dict[str, FloatArray]:
-        return {**value, name: theta[:, :1]}
-
-    return act
-
-
-def _sentence_writer(says: str) -> Say:
-    return lambda mean, sd: says.replace("{value}", value_with_sd(mean[0], sd[0], ""))
+def _filled(says: str, mean: FloatArray, sd: FloatArray) -> str:
+    return says.replace("{value}", value_with_sd(mean[0], sd[0], ""))

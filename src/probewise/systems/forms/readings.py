@@ -103,13 +103,13 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
         ("lag", lagged_readings, np.geomspace(0.02, 200.0, 33), f"{reading} lags with a time constant of"),
         ("delay", delayed_readings, np.geomspace(1e-3, 100.0, 41), f"{reading} is delayed by"),
     ):
-        prior = about.log_uniform_size_prior(Stage.LAG, _at_rows_alone(act), about.median_gap * tried)
+
+        def at_rows(value: FloatArray, theta: FloatArray, table: RunTable, act: Act = act) -> FloatArray:
+            return np.asarray(act(value, np.append(theta, np.zeros_like(theta), axis=1), table))
+
+        prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.median_gap * tried)
         if prior is not None:
             yield _with_smooth_variant(about, name, act, prior, says, unit)
-
-
-def _at_rows_alone(act: Act) -> Act:
-    return lambda value, theta, table: act(value, np.append(theta, np.zeros_like(theta), axis=1), table)
 
 
 def _with_smooth_variant(
@@ -350,12 +350,6 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     )
 
 
-def _expected_range_of_readings(about: ReferenceFit) -> tuple[float, float]:
-    """Return the least and the largest reading to be expected in the table, without noise."""
-    bent = _expected_readings_and_inliers(about)[0]
-    return float(bent.min()), float(bent.max())
-
-
 def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, BoolArray]:
     """Return the readings to be expected, (n_points,), and the mask of the readings that are no outliers from these.
 
@@ -378,7 +372,8 @@ def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, Boo
 
 
 def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
-    low, high = _expected_range_of_readings(about)
+    bent = _expected_readings_and_inliers(about)[0]
+    low, high = float(bent.min()), float(bent.max())
     if not low < high:
         return
 

@@ -139,7 +139,7 @@ class Form(NamedEffect[Any]):
     @property
     def relative_odds(self) -> float:
         """Prior odds of this one of several variants against the first."""
-        return math.prod(prior.odds for prior in self._marginals.values() if isinstance(prior, Fixed))
+        return math.prod((prior.odds for prior in self._marginals.values() if isinstance(prior, Fixed)), start=1.0)
 
     @property
     def _marginals(self) -> Mapping[str, Marginal]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -35,6 +34,9 @@ _LEAST_WAVES = 1.5  # in a column's range: half a period is seen again; any bend
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
 
+InWords = Callable[[str], str]
+"""Function of a size in words; returns a sentence."""
+
 Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
 """Function of a column (n_points,) or (n_samples, n_points), parameters and the table; returns the true column."""
 
@@ -58,43 +60,54 @@ def driving_columns(about: ReferenceFit) -> list[str]:
 
 def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
-    table, time = about.table, about.table.time
     for name in driving_columns(about):
-        values, unit = table.covariates[name], about.time_unit
-        spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
-        about_it = (covariate_of_column(name),)
+        yield from _forms_on_column(about, name)
+    table = about.table
+    if table.time is not None:
+        origin = time_origin(table)
+        act = _column_changer(table.time, _clock_scaler(origin))
+        says = "the true time is the recorded time times (1 + a), a ="
+        for form in _amplitude_form(about, "clock_drift", act, 1e-5, "1", lambda a: f"{says} {a}", "time"):
+            yield replace(form, counted_from=origin_in_words(table.time, origin, about.time_unit))
 
-        def amplitude(
-            kind: str, change: Change, guess: float, unit: str, says: str, name: str = name, about_it: Any = about_it
-        ) -> Iterator[Form]:
-            return _amplitude_form(about, f"{kind}:{name}", _column_changer(name, change), guess, unit, says, about_it)
 
-        def size(
-            kind: str, act: Act, most: float, unit: str, says: str, *before: str, name: str = name, it: Any = about_it
-        ) -> Iterator[Form]:
-            parameter = "tau_s" if kind == "input_delay" else "width"
-            return _log_uniform_form(about, f"{kind}:{name}", parameter, act, most, unit, says, (*before, *it))
-
-        says = f"the true {name} is the recorded {name}"
-        yield from amplitude("input_offset", _column_with_offset, 1e-4 * spread, name, f"{says} plus {{}}")
-        yield from amplitude("input_gain", _scaled_column, 1e-4, "1", f"{says} times (1 + a), a = {{}}")
-        yield from _clipped_column_form(about, name)
-        if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # if larger, it is an offset
-            act = _column_changer(name, _column_with_dead_zone)
-            yield from size("dead_zone", act, high - low, name, f"{name} has no effect within {{}} of 0")
-        if _moves_both_ways(values, table):
-            act = _column_changer(name, column_with_play)
-            yield from size("backlash", act, high - low, name, f"{name} has {{}} of play", "previous")
-        yield from _periodic_error_form(about, name)
-        if table.has_varying_time:
-            says = f"{name} acts with a delay of {{}} {unit}"
-            for form in size("input_delay", _column_delayer(about, name), about.duration, unit, says, "previous"):
-                yield replace(form, needs_rising_time=True)
-    if time is not None:
-        says, origin = "the true time is the recorded time times (1 + a), a = {}", time_origin(table)
-        clock = _column_changer(time, _clock_scaler(origin))
-        for form in _amplitude_form(about, "clock_drift", clock, 1e-5, "1", says, ("time",)):
-            yield replace(form, counted_from=origin_in_words(time, origin, about.time_unit))
+def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
+    values, unit, along = about.table.covariates[name], about.time_unit, covariate_of_column(name)
+    spread, span = float(np.nanstd(values)), float(np.nanmax(values)) - float(np.nanmin(values))
+    true = f"the true {name} is the recorded {name}"
+    act = _column_changer(name, _column_with_offset)
+    yield from _amplitude_form(
+        about, f"input_offset:{name}", act, 1e-4 * spread, name, lambda a: f"{true} plus {a}", along
+    )
+    act = _column_changer(name, _scaled_column)
+    yield from _amplitude_form(
+        about, f"input_gain:{name}", act, 1e-4, "1", lambda a: f"{true} times (1 + a), a = {a}", along
+    )
+    yield from _clipped_column_form(about, name)
+    if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * span:  # if larger, it is an offset
+        act = _column_changer(name, _column_with_dead_zone)
+        yield from _size_form(
+            about, f"dead_zone:{name}", act, span, name, lambda w: f"{name} has no effect within {w} of 0", along
+        )
+    if _moves_both_ways(values, about.table):
+        act = _column_changer(name, column_with_play)
+        yield from _size_form(
+            about, f"backlash:{name}", act, span, name, lambda w: f"{name} has {w} of play", "previous", along
+        )
+    yield from _periodic_error_form(about, name)
+    if about.table.has_varying_time:
+        act, says = _column_delayer(about, name), f"{name} acts with a delay of"
+        for form in _size_form(
+            about,
+            f"input_delay:{name}",
+            act,
+            about.duration,
+            unit,
+            lambda tau: f"{says} {tau} {unit}",
+            "previous",
+            along,
+        ):
+            yield replace(form, needs_rising_time=True)
 
 
 def _column_with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -125,42 +138,36 @@ def _column_delayer(about: ReferenceFit, name: str) -> Act:
 
 
 def _amplitude_form(
-    about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: str, covariates: tuple[str, ...]
+    about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: InWords, *along: str
 ) -> Iterator[Form]:
     form = Form(
         name,
         Stage.INPUT,
         {"a": AMPLITUDE},
         units=(unit,),
-        covariates=covariates,
+        covariates=along,
         act=act,
         entries=np.ones((1, 1, 1)),
-        says=lambda mean, sd: says.format(value_with_sd(mean[0], sd[0], "")),
+        says=lambda mean, sd: says(value_with_sd(mean[0], sd[0], "")),
     )
     yield from about.scaled(form, guess)
 
 
-def _log_uniform_form(
-    about: ReferenceFit,
-    name: str,
-    parameter: str,
-    act: Act,
-    most: float,
-    unit: str,
-    says: str,
-    covariates: tuple[str, ...],
+def _size_form(
+    about: ReferenceFit, name: str, act: Act, most: float, unit: str, says: InWords, *along: str
 ) -> Iterator[Form]:
+    """Yield a form of one size without a sign, log-uniform up to half of `most`; none if no size is plausible."""
     prior = about.log_uniform_size_prior(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
     if prior is not None:
         yield Form(
             name,
             Stage.INPUT,
-            {parameter: prior},
+            {"tau_s" if name.startswith("input_delay:") else "width": prior},
             units=(unit,),
-            covariates=covariates,
+            covariates=along,
             act=act,
             entries=np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None],
-            says=lambda mean, sd: says.format(value_with_sd(mean[0], sd[0], "")),
+            says=lambda mean, sd: says(value_with_sd(mean[0], sd[0], "")),
             amplitudes=(),
             absent={0: 0.0},
         )

@@ -5,25 +5,30 @@ import pytest
 
 from probewise.proof.systems.form import TrueSystem
 from probewise.proof.systems.forms import forms_of
-from probewise.proof.systems.kind import Law, Prior, SystemKind, SystemTable
+from probewise.proof.systems.kind import SystemKind, SystemTable
 from probewise.proof.systems.simulate import simulate_noise_free
 
 T = np.array([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0])
 
 
 def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
+    text = f"""
+reading, unit, time, run = "x", "m", "t_s", "run"
+parameters = {{"k": (0, 1)}}
+states = {{"x": {x0!r}}}
+hold = "{"linear" if linear else "previous"}"
+
+def rates(s, p, u):
+    return {{"x": u["u"] - p["k"] * s["x"]}}
+"""
     kind = SystemKind(
         name="by hand",
-        reading="x",
-        unit="m",
-        text="",
-        priors={"k": Prior("uniform", 0, 1)},
+        text=text,
         draw=lambda rng: {"k": k},
         design=lambda rng, n, regime: (T, {}),
         decimals={},
         drives=("u",),
         sd=0.01,
-        law=Law({"x": x0}, lambda s, p, u: {"x": u["u"] - p["k"] * s["x"]}, lambda s, p, u: s["x"], linear=linear),
     )
     u = np.zeros(len(T)) if u is None else np.asarray(u, dtype=float)
     warm = np.linspace(-1.0, 1.0, len(T) * n_runs)

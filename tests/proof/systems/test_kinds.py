@@ -1,4 +1,4 @@
-"""The owner's file and the world's own words for it are the same system."""
+"""The library and the world make the same of the owner's file; what a case is made of."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A kind of system: its simulator file, an independent implementation of its law, and its experimental design."""
+"""A kind of system: its simulator file, which the world reads too, and its experimental design."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from scipy.special import ndtri
@@ -157,16 +157,14 @@ class IrrelevantColumn:
 class SystemKind:
     """A kind of system.
 
+    What the simulator file states (parameters, reading, time, runs, and its formula or law) is taken from its text.
+
     Parameters
     ----------
     name
         Its name in a truth.
-    reading, unit
-        The predicted column, and its unit.
     text
         The simulator file as a user would provide it; `{noise}` stands for its line on noise.
-    priors
-        Priors as in the file, by parameter.
     draw
         Draws the true shared parameters.
     draw_run
@@ -180,44 +178,84 @@ class SystemKind:
         Columns that the law uses.
     sd
         Sd of a reading's white noise.
-    formula, law
-        The nominal model, one of the two; the other is None.
-    time, time_unit, run
-        Name of the time column, its unit, name of the run column; names are None if absent.
+    stated_law
+        The law of a file that integrates by itself.
     restarts_time
         Whether time restarts in each run.
     logged
         Irrelevant columns.
-    n_runs, per_run
-        Number of runs not held out, and the parameters with a value in each.
+    n_runs
+        Number of runs not held out.
     reading_decimals
         Decimals of a reading.
-    defines_states
-        Whether the simulator file defines states and rates; False: it integrates by itself.
     """
 
     name: str
-    reading: str
-    unit: str
     text: str
-    priors: Mapping[str, Prior]
     draw: Callable[[np.random.Generator], dict[str, float]]
     design: Callable[[np.random.Generator, int, float], tuple[FloatArray, Columns]]
     decimals: Mapping[str, int]
     drives: tuple[str, ...]
     sd: float
-    formula: Formula | None = None
-    law: Law | None = None
     draw_run: Callable[[np.random.Generator], dict[str, float]] = field(default=lambda rng: {})
-    time: str | None = "t_s"
-    time_unit: str = "s"
-    run: str | None = "run"
+    stated_law: Law | None = None
     restarts_time: bool = False
     logged: tuple[IrrelevantColumn, ...] = ()
     n_runs: int = 5
-    per_run: tuple[str, ...] = ()
     reading_decimals: int = 4
-    defines_states: bool = True
+
+    @cached_property
+    def _file(self) -> dict[str, Any]:
+        """What the simulator file defines, by name."""
+        names: dict[str, Any] = {}
+        exec(self.text.replace("{noise}\n", ""), names)
+        return names
+
+    @property
+    def reading(self) -> str:
+        """Name of the predicted column."""
+        return str(self._file["reading"])
+
+    @property
+    def time(self) -> str | None:
+        """Name of the time column, if any."""
+        return self._file.get("time")
+
+    @property
+    def run(self) -> str | None:
+        """Name of the column of runs, if any."""
+        return self._file.get("run")
+
+    @property
+    def per_run(self) -> tuple[str, ...]:
+        """Names of the parameters with a value in each run."""
+        return tuple(self._file.get("per_run", ()))
+
+    @cached_property
+    def priors(self) -> Mapping[str, Prior]:
+        """Priors by parameter."""
+        stated = self._file["parameters"].items()
+        return {name: Prior(*(prior if len(prior) == 3 else ("uniform", *prior))) for name, prior in stated}
+
+    @property
+    def defines_states(self) -> bool:
+        """Whether the simulator file defines states and rates; False: a formula, or it integrates by itself."""
+        return "rates" in self._file
+
+    @cached_property
+    def law(self) -> Law | None:
+        """The law in continuous time, if the system has one."""
+        if not self.defines_states:
+            return self.stated_law
+        start = self._file["states"]
+        first = next(iter(start))
+        read = self._file.get("observe", lambda s, p, u: s[first])
+        return Law(start, self._file["rates"], read, linear=self._file.get("hold") == "linear")
+
+    @property
+    def formula(self) -> Formula:
+        """The formula of a system without a law."""
+        return cast(Formula, self._file["simulate"])
 
     @property
     def shared_parameter_names(self) -> tuple[str, ...]:

@@ -9,7 +9,6 @@ from probewise.proof.systems.kind import (
     Columns,
     IrrelevantColumn,
     Law,
-    Prior,
     SystemKind,
     irregular_times,
     random_steps,
@@ -27,9 +26,6 @@ def _bath_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
 
 BATH = SystemKind(
     name="thermometer in a bath",
-    reading="probe_c",
-    unit="degC",
-    run="dip",
     text="""# A thermometer is dipped from room temperature into a warm bath.
 import numpy as np
 
@@ -43,17 +39,12 @@ def simulate(p, data):
     gone = np.exp(-data["t_s"] / p["tau_s"])
     return p["scale"] * data["bath_c"] * (1 - gone) + p["start_c"] * gone
 """,
-    priors={"tau_s": Prior("log", 3, 300), "start_c": Prior("normal", 21, 3), "scale": Prior("normal", 1.0, 0.1)},
-    per_run=("start_c",),
     draw=lambda rng: {"tau_s": float(rng.uniform(18, 45)), "scale": float(rng.normal(1.0, 0.01))},
     draw_run=lambda rng: {"start_c": float(rng.normal(21, 2))},
     design=_bath_design,
     decimals={"t_s": 2, "bath_c": 2},
     drives=("bath_c",),
     sd=0.05,
-    formula=lambda p, u: (
-        p["scale"] * u["bath_c"] * (1 - np.exp(-u["t_s"] / p["tau_s"])) + p["start_c"] * np.exp(-u["t_s"] / p["tau_s"])
-    ),
     restarts_time=True,
     logged=(
         IrrelevantColumn("room_c", 21.5, 0.8, 0.03, 2, 4.0),
@@ -71,11 +62,6 @@ def _cup_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
 
 CUP = SystemKind(
     name="cooling cup",
-    reading="tea_c",
-    unit="degC",
-    run="cup",
-    time="t_min",
-    time_unit="min",
     text="""# Tea cools in a cup, one cup after the other.
 from numpy import exp
 
@@ -90,15 +76,12 @@ controls = ["room_c"]
 def simulate(p, data):
     return data["room_c"] + (p["hot_c"] - data["room_c"]) * exp(-data["t_min"] / p["tau_min"])
 """,
-    priors={"tau_min": Prior("log", 5, 300), "hot_c": Prior("normal", 75, 15)},
-    per_run=("hot_c",),
     draw=lambda rng: {"tau_min": float(rng.uniform(25, 60))},
     draw_run=lambda rng: {"hot_c": float(rng.normal(76, 6))},
     design=_cup_design,
     decimals={"t_min": 2, "room_c": 2},
     drives=("room_c",),
     sd=0.12,
-    formula=lambda p, u: u["room_c"] + (p["hot_c"] - u["room_c"]) * np.exp(-u["t_min"] / p["tau_min"]),
     restarts_time=True,
     logged=(
         IrrelevantColumn("rh_pct", 50, 4, 0.4, 1),
@@ -117,10 +100,6 @@ def _photodiode_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Col
 
 PHOTODIODE = SystemKind(
     name="photodiode against distance",
-    reading="diode_mv",
-    unit="mV",
-    run="sweep",
-    time=None,
     text="""# A lamp on a rail is moved to and from a photodiode.
 reading, unit = "diode_mv", "mV"
 run = "sweep"
@@ -131,7 +110,6 @@ vectorized = True
 def simulate(p, data):
     return p["dark_mv"] + p["power"] / (data["dist_mm"] + p["behind_mm"]) ** 2
 """,
-    priors={"dark_mv": Prior("normal", 0, 5), "power": Prior("log", 1e4, 1e7), "behind_mm": Prior("uniform", 0, 30)},
     draw=lambda rng: {
         "dark_mv": float(rng.normal(0, 2)),
         "power": float(rng.uniform(2e5, 5e5)),
@@ -141,7 +119,6 @@ def simulate(p, data):
     decimals={"dist_mm": 2},
     drives=("dist_mm",),
     sd=0.4,
-    formula=lambda p, u: p["dark_mv"] + p["power"] / (u["dist_mm"] + p["behind_mm"]) ** 2,
     logged=(
         IrrelevantColumn("board_c", 27, 1.5, 0.05, 2, 6.0),
         IrrelevantColumn("rail_v", 5.0, 0.01, 0.002, 4),
@@ -161,9 +138,6 @@ def _flow_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
 
 FLOW = SystemKind(
     name="orifice flow meter",
-    reading="drop_kpa",
-    unit="kPa",
-    run="series",
     text="""# The pressure drop over an orifice grows as the square of the flow through it.
 reading, unit = "drop_kpa", "kPa"
 time, run = "t_s", "series"
@@ -174,13 +148,11 @@ controls = ["flow_lpm"]
 def simulate(p, data):
     return p["zero_kpa"] + p["k"] * data["flow_lpm"] ** 2
 """,
-    priors={"zero_kpa": Prior("normal", 0, 0.5), "k": Prior("log", 0.01, 1)},
     draw=lambda rng: {"zero_kpa": float(rng.normal(0, 0.2)), "k": float(rng.uniform(0.08, 0.2))},
     design=_flow_design,
     decimals={"t_s": 1, "flow_lpm": 3},
     drives=("flow_lpm",),
     sd=0.03,
-    formula=lambda p, u: p["zero_kpa"] + p["k"] * u["flow_lpm"] ** 2,
     logged=(
         IrrelevantColumn("water_c", 18, 1.5, 0.05, 2, 8.0),
         IrrelevantColumn("pump_v", 24, 0.1, 0.02, 3),
@@ -197,9 +169,6 @@ def _lens_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
 
 LENS = SystemKind(
     name="dispersion of a lens",
-    reading="focus_mm",
-    unit="mm",
-    run=None,
     text="""# The focal length of a lens against the wavelength (Cauchy).
 reading, unit = "focus_mm", "mm"
 time = "t_s"
@@ -210,13 +179,11 @@ def simulate(p, data):
     index = 1.504 + p["b_um2"] / (data["nm"] / 1000) ** 2
     return p["radius_mm"] / (2 * (index - 1))
 """,
-    priors={"radius_mm": Prior("normal", 100, 2), "b_um2": Prior("uniform", 0, 0.02)},
     draw=lambda rng: {"radius_mm": float(rng.normal(100, 0.5)), "b_um2": float(rng.uniform(0.003, 0.008))},
     design=_lens_design,
     decimals={"t_s": 1, "nm": 1},
     drives=("nm",),
     sd=0.01,
-    formula=lambda p, u: p["radius_mm"] / (2 * (1.504 + p["b_um2"] / (u["nm"] / 1000) ** 2 - 1)),
     logged=(
         IrrelevantColumn("glass_c", 22, 1.2, 0.03, 2, 7.0),
         IrrelevantColumn("lamp_w", 40, 0.3, 0.05, 2),
@@ -235,9 +202,6 @@ def _ph_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
 
 PH = SystemKind(
     name="pH probe",
-    reading="cell_mv",
-    unit="mV",
-    run="day",
     text="""# A glass electrode in buffers (Nernst).
 reading, unit = "cell_mv", "mV"
 time, run = "t_s", "day"
@@ -248,13 +212,11 @@ def simulate(p, data):
     kelvin = data["probe_c"] + 273.15
     return p["e0_mv"] - p["slope_mv"] * kelvin / 298.15 * (data["buffer_ph"] - 7)
 """,
-    priors={"e0_mv": Prior("normal", 0, 30), "slope_mv": Prior("normal", 58, 3)},
     draw=lambda rng: {"e0_mv": float(rng.normal(0, 12)), "slope_mv": float(rng.uniform(56, 60))},
     design=_ph_design,
     decimals={"t_s": 1, "buffer_ph": 3, "probe_c": 2},
     drives=("buffer_ph", "probe_c"),
     sd=0.5,
-    formula=lambda p, u: p["e0_mv"] - p["slope_mv"] * (u["probe_c"] + 273.15) / 298.15 * (u["buffer_ph"] - 7),
     logged=(IrrelevantColumn("salt_g_l", 3.0, 0.15, 0.02, 3), IrrelevantColumn("rh_pct", 48, 3, 0.3, 1)),
     n_runs=4,
     reading_decimals=3,
@@ -271,8 +233,6 @@ def _tank_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
 
 TANK = SystemKind(
     name="tank",
-    reading="level_cm",
-    unit="cm",
     text="""# Water runs into a tank through a valve and out at the bottom, in proportion to the level.
 import math
 
@@ -295,15 +255,13 @@ def simulate(p, data):
         out.append(level)
     return out
 """,
-    priors={"cm_per_v": Prior("log", 1, 50), "tau_s": Prior("log", 5, 500), "start_cm": Prior("uniform", 0, 40)},
-    per_run=("start_cm",),
     draw=lambda rng: {"cm_per_v": float(rng.uniform(5, 10)), "tau_s": float(rng.uniform(35, 90))},
     draw_run=lambda rng: {"start_cm": float(rng.uniform(5, 30))},
     design=_tank_design,
     decimals={"t_s": 2, "valve_v": 2},
     drives=("valve_v",),
     sd=0.04,
-    law=Law(
+    stated_law=Law(
         {"level": "start_cm"},
         lambda s, p, u: {"level": (p["cm_per_v"] * u["valve_v"] - s["level"]) / p["tau_s"]},
         lambda s, p, u: s["level"],
@@ -314,7 +272,6 @@ def simulate(p, data):
         IrrelevantColumn("supply_v", 12, 0.05, 0.01, 3),
     ),
     n_runs=4,
-    defines_states=False,
 )
 
 
@@ -326,9 +283,6 @@ def _filter_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns
 
 FILTER = SystemKind(
     name="RC filter of two stages",
-    reading="out_v",
-    unit="V",
-    run="burst",
     text="""# Two RC stages behind each other, with a buffer between them.
 reading, unit = "out_v", "V"
 time, run = "t_s", "burst"
@@ -343,12 +297,6 @@ def rates(s, p, u):
 def observe(s, p, u):
     return s["second"]
 """,
-    priors={
-        "gain": Prior("normal", 1.0, 0.1),
-        # Swapped, the two stages do the same: their owner knows which is the fast one.
-        "tau1_s": Prior("log", 0.0005, 0.008),
-        "tau2_s": Prior("log", 0.008, 0.1),
-    },
     draw=lambda rng: {
         "gain": float(rng.normal(1.0, 0.03)),
         "tau1_s": float(rng.uniform(0.003, 0.006)),
@@ -358,14 +306,6 @@ def observe(s, p, u):
     decimals={"t_s": 6, "in_v": 3},
     drives=("in_v",),
     sd=0.004,
-    law=Law(
-        {"first": 0.0, "second": 0.0},
-        lambda s, p, u: {
-            "first": (p["gain"] * u["in_v"] - s["first"]) / p["tau1_s"],
-            "second": (s["first"] - s["second"]) / p["tau2_s"],
-        },
-        lambda s, p, u: s["second"],
-    ),
     logged=(IrrelevantColumn("board_c", 30, 1.5, 0.04, 2, 8.0), IrrelevantColumn("rail_v", 12.0, 0.02, 0.004, 3)),
     n_runs=4,
     reading_decimals=5,
@@ -379,8 +319,6 @@ def _oscillator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Col
 
 OSCILLATOR = SystemKind(
     name="mass on a spring",
-    reading="x_mm",
-    unit="mm",
     text="""# A cart of 0.8 kg on a spring with a damper, pushed by a shaker.
 reading, unit = "x_mm", "mm"
 time, run = "t_s", "run"
@@ -396,20 +334,12 @@ def rates(s, p, u):
 def observe(s, p, u):
     return 1000 * s["x"]
 """,
-    priors={"k_n_m": Prior("log", 5, 500), "c_kg_s": Prior("log", 0.05, 5), "x0_m": Prior("normal", 0, 0.03)},
-    per_run=("x0_m",),
     draw=lambda rng: {"k_n_m": float(rng.uniform(25, 70)), "c_kg_s": float(rng.uniform(0.4, 1.2))},
     draw_run=lambda rng: {"x0_m": float(rng.normal(0, 0.03))},
     design=_oscillator_design,
     decimals={"t_s": 4, "force_n": 4},
     drives=("force_n",),
     sd=0.15,
-    law=Law(
-        {"x": "x0_m", "v": 0.0},
-        lambda s, p, u: {"x": s["v"], "v": (u["force_n"] - p["k_n_m"] * s["x"] - p["c_kg_s"] * s["v"]) / 0.8},
-        lambda s, p, u: 1000 * s["x"],
-        linear=True,
-    ),
     logged=(IrrelevantColumn("air_c", 22, 0.8, 0.03, 2, 5.0), IrrelevantColumn("mains_v", 230, 1.0, 0.3, 1)),
     n_runs=4,
     reading_decimals=3,
@@ -424,8 +354,6 @@ def _servo_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]
 
 SERVO = SystemKind(
     name="DC motor",
-    reading="angle_deg",
-    unit="deg",
     text="""# A DC motor with an encoder.
 reading, unit = "angle_deg", "deg"
 time, run = "t_s", "run"
@@ -437,17 +365,11 @@ states = {"angle": 0.0, "speed": 0.0}
 def rates(s, p, u):
     return {"angle": s["speed"], "speed": (p["deg_s_v"] * u["volts"] - s["speed"]) / p["tau_s"]}
 """,
-    priors={"deg_s_v": Prior("log", 5, 500), "tau_s": Prior("log", 0.01, 1)},
     draw=lambda rng: {"deg_s_v": float(rng.uniform(30, 70)), "tau_s": float(rng.uniform(0.08, 0.2))},
     design=_servo_design,
     decimals={"t_s": 4, "volts": 2},
     drives=("volts",),
     sd=0.8,
-    law=Law(
-        {"angle": 0.0, "speed": 0.0},
-        lambda s, p, u: {"angle": s["speed"], "speed": (p["deg_s_v"] * u["volts"] - s["speed"]) / p["tau_s"]},
-        lambda s, p, u: s["angle"],
-    ),
     logged=(
         IrrelevantColumn("case_c", 33, 2.5, 0.05, 2, 10.0),
         IrrelevantColumn("bus_v", 9.0, 0.05, 0.01, 3),
@@ -464,9 +386,6 @@ def _reactor_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Column
 
 REACTOR = SystemKind(
     name="two reactions in a row",
-    reading="absorbance",
-    unit="AU",
-    run="vial",
     text="""# A turns into B, B into C; B is seen in the spectrometer.
 reading, unit = "absorbance", "AU"
 time, run = "t_s", "vial"
@@ -482,23 +401,12 @@ def rates(s, p, u):
 def observe(s, p, u):
     return s["b"]
 """,
-    priors={
-        "k1_per_s": Prior("log", 0.0005, 0.5),
-        "k2_per_s": Prior("log", 0.0005, 0.5),
-        "dose": Prior("uniform", 0, 3),
-    },
-    per_run=("dose",),
     draw=lambda rng: {"k1_per_s": float(rng.uniform(0.018, 0.03)), "k2_per_s": float(rng.uniform(0.004, 0.008))},
     draw_run=lambda rng: {"dose": float(rng.uniform(0.7, 2.0))},
     design=_reactor_design,
     decimals={"t_s": 1},
     drives=(),
     sd=0.003,
-    law=Law(
-        {"a": "dose", "b": 0.0},
-        lambda s, p, u: {"a": -p["k1_per_s"] * s["a"], "b": p["k1_per_s"] * s["a"] - p["k2_per_s"] * s["b"]},
-        lambda s, p, u: s["b"],
-    ),
     restarts_time=True,
     logged=(
         IrrelevantColumn("jacket_c", 30, 0.7, 0.04, 2, 4.0),
@@ -516,11 +424,6 @@ def _predator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Colum
 
 PREDATOR = SystemKind(
     name="predator and prey",
-    reading="prey_per_ml",
-    unit="1/ml",
-    run="flask",
-    time="t_d",
-    time_unit="day",
     text="""# Paramecia are fed, and eaten by didinia.
 reading, unit = "prey_per_ml", "1/ml"
 time, time_unit, run = "t_d", "day", "flask"
@@ -533,7 +436,6 @@ def rates(s, p, u):
     born = p["grow_per_d"] * u["feed"] * s["prey"]
     return {"prey": born - caught, "hunters": 0.3 * caught - p["die_per_d"] * s["hunters"]}
 """,
-    priors={"grow_per_d": Prior("log", 0.05, 5), "eat": Prior("log", 0.005, 0.5), "die_per_d": Prior("log", 0.05, 5)},
     draw=lambda rng: {
         "grow_per_d": float(rng.uniform(0.5, 0.9)),
         "eat": float(rng.uniform(0.06, 0.1)),
@@ -543,14 +445,6 @@ def rates(s, p, u):
     decimals={"t_d": 3, "feed": 2},
     drives=("feed",),
     sd=0.3,
-    law=Law(
-        {"prey": 20.0, "hunters": 5.0},
-        lambda s, p, u: {
-            "prey": p["grow_per_d"] * u["feed"] * s["prey"] - p["eat"] * s["prey"] * s["hunters"],
-            "hunters": 0.3 * p["eat"] * s["prey"] * s["hunters"] - p["die_per_d"] * s["hunters"],
-        },
-        lambda s, p, u: s["prey"],
-    ),
     logged=(
         IrrelevantColumn("room_c", 21, 0.8, 0.04, 2, 5.0),
         IrrelevantColumn("oxygen_mg_l", 7.5, 0.3, 0.05, 2),

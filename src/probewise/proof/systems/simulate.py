@@ -446,7 +446,6 @@ def simulate_noise_free(
         states = solve_law(kind, rows, parameters, columns, inner)
         readings = np.asarray(kind.law.read(states, parameters, columns))
     else:
-        assert kind.formula is not None
         states, p = {}, dict(parameters)
         now = Instants.at_rows(rows)
         for form, numbers in inner:

@@ -18,6 +18,7 @@ from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
 from probewise.sensor import N_FREE_FORM, Stage
 from probewise.world import concealed as hidden
+from probewise.world import unlisted
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -345,7 +346,7 @@ def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "name"),
-    [(hidden.PlaceStep(-0.8, 1.4), "missing_tooth"), (hidden.StickSlip(0.5, 6.0, 0.3), "stick_slip")],
+    [(unlisted.PlaceStep(-0.8, 1.4), "missing_tooth"), (unlisted.StickSlip(0.5, 6.0, 0.3), "stick_slip")],
 )
 def test_a_jump_of_the_arm_is_no_wave_of_it(effect, name):
     """A step of the arm at one place is among the bases of places too: by that name or as one of those."""
@@ -370,7 +371,7 @@ def test_a_tone_that_slides_is_no_memory_of_the_noise():
 def test_a_rare_effect_is_named_and_its_repair_predicts():
     """The paper slips; the model that finds it moves the arm instead."""
     half_way_s = float(np.median(two_way_plan().time_s))
-    pushed = recording("two_way", hidden.SlippedPaper(1.5, half_way_s))
+    pushed = recording("two_way", unlisted.SlippedPaper(1.5, half_way_s))
     found = diagnose(pushed, rng=np.random.default_rng(0))
     document = strict(found)
     assert found.verdict == "named"

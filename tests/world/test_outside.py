@@ -9,7 +9,7 @@ import pytest
 from probewise.proof.sensors.effects import INSIDE, OUTSIDE
 from probewise.recordings import HalfPlane
 from probewise.world import Blob, World, gaussian_spot
-from probewise.world.concealed import (
+from probewise.world.unlisted import (
     AfterGlow,
     Chirp,
     CubicPositionError,

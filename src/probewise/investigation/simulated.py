@@ -11,8 +11,8 @@ import numpy as np
 from probewise.arm import Reading, readings_of_recording
 from probewise.errors import ParameterError, did_you_mean
 from probewise.recordings.plan import Plan
-from probewise.world import World, concealed
-from probewise.world.concealed import Concealed
+from probewise.world import World, concealed, unlisted
+from probewise.world.stages import Concealed
 
 NOTHING = "nothing"
 _LARGEST = 1e9  # largest magnitude of a parameter of an effect
@@ -68,7 +68,6 @@ def _parse_one_effect(text: str) -> Concealed:
 
 
 def _effect_classes_with_numeric_parameters() -> dict[str, Any]:
-    every: list[Any] = [getattr(concealed, name) for name in concealed.__all__]
-    named = [kind for kind in every if isinstance(getattr(kind, "name", None), str)]
-    of_numbers = [kind for kind in named if all(field.type == "float" for field in fields(kind))]
+    every = [kind for module in (concealed, unlisted) for kind in vars(module).values() if hasattr(kind, "stage")]
+    of_numbers = [kind for kind in every if all(field.type == "float" for field in fields(kind))]
     return {kind.name: kind for kind in of_numbers}

@@ -33,7 +33,8 @@ from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup
 from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import footprint_of
-from probewise.world.concealed import Disturbs, Quantisation
+from probewise.world.concealed import Quantisation
+from probewise.world.stages import Disturbs
 from probewise.world.world import World
 
 __all__ = ["RunCaseInRounds", "Task", "run_case", "run_cases", "run_challenge"]

@@ -18,16 +18,9 @@ from probewise.recordings.files import write_recording
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan, two_way_plan, with_jittered_times
 from probewise.recordings.shipping import SHIPPED
-from probewise.world.concealed import (
-    AmbientGradient,
-    Backlash,
-    Concealed,
-    CorrelatedNoise,
-    GainDrift,
-    Nonlinearity,
-    Saturation,
-)
+from probewise.world.concealed import AmbientGradient, Backlash, CorrelatedNoise, GainDrift, Nonlinearity, Saturation
 from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.stages import Concealed
 from probewise.world.world import World
 
 BLOB = Blob(share=1.0, center_mm=(0.0, 1.5), sd_mm=(4.0, 2.5), correlation=0.15)

@@ -12,7 +12,12 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
-from probewise.world.concealed.stages import (
+from probewise.world.edges import common_edge_normal, distance_to_nearest_edge
+from probewise.world.painting import Surface
+from probewise.world.rays import seen_white_fraction
+from probewise.world.rows import Rows
+from probewise.world.spots import Spot
+from probewise.world.stages import (
     STAGES,
     ChangesFootprint,
     ChangesQuantity,
@@ -22,11 +27,6 @@ from probewise.world.concealed.stages import (
     Retouches,
     Stage,
 )
-from probewise.world.edges import common_edge_normal, distance_to_nearest_edge
-from probewise.world.painting import Surface
-from probewise.world.rays import seen_white_fraction
-from probewise.world.rows import Rows
-from probewise.world.spots import Spot
 
 _Surfaces = Sequence[tuple[Surface, IntArray]]
 """Each surface with the rows read over it."""

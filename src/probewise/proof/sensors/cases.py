@@ -22,7 +22,7 @@ from probewise.proof.sensors.sizing import (
     region_of_effect,
 )
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.world.concealed import Concealed, Disturbs
+from probewise.world.stages import Concealed, Disturbs
 from probewise.world.world import World
 
 CaseKind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_order"]

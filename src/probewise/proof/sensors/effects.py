@@ -12,8 +12,8 @@ import numpy as np
 
 from probewise.recordings.patterns import Uniform
 from probewise.recordings.plan import Plan
-from probewise.world import concealed
-from probewise.world.concealed import Concealed
+from probewise.world import concealed, unlisted
+from probewise.world.stages import Concealed
 from probewise.world.world import World
 
 OfAmplitude: TypeAlias = Callable[[float], Concealed]
@@ -113,7 +113,7 @@ def make_draw_with_random_sign(make: OfAmplitude) -> Draw:
     return draw
 
 
-def _make_draw_with_random_direction(make: Callable[[float, float], concealed.Concealed]) -> Draw:
+def _make_draw_with_random_direction(make: Callable[[float, float], Concealed]) -> Draw:
     """Return `EffectSampler.draw` for a vector: direction within 60 degrees of +X or -X, length = amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -160,7 +160,7 @@ def _draw_scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAm
     return lambda a: concealed.ScanMisplacement(s * a, scan)
 
 
-def _make_draw_with_random_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
+def _make_draw_with_random_scans(make: Callable[[float, tuple[str, ...]], Concealed]) -> Draw:
     """Return `EffectSampler.draw` for an effect of random sign on a random scan or all scans at its orientation."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -280,37 +280,37 @@ PAIRABLE = tuple(name for name in SINGLES[: SINGLES.index("signal_dependent_nois
 
 def _draw_place_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, at_mm = draw_sign(rng), rng.uniform(-3, 3)
-    return lambda a: concealed.PlaceStep(s * a, at_mm)
+    return lambda a: unlisted.PlaceStep(s * a, at_mm)
 
 
 def _draw_stick_slip(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     period_mm, phase = draw_log_uniform(rng, 3.0, 8.0), rng.random()
-    return lambda a: concealed.StickSlip(a, period_mm, phase)
+    return lambda a: unlisted.StickSlip(a, period_mm, phase)
 
 
 def _draw_slipped_paper(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, at_s = draw_sign(rng), setup.start_s + rng.uniform(0.2, 0.8) * setup.duration_s
-    return lambda a: concealed.SlippedPaper(s * a, at_s)
+    return lambda a: unlisted.SlippedPaper(s * a, at_s)
 
 
 def _draw_ghost(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     dx_mm, dy_mm = draw_sign(rng) * rng.uniform(8, 20), rng.uniform(-5, 5)
-    return lambda a: concealed.Ghost(a, dx_mm, dy_mm)
+    return lambda a: unlisted.Ghost(a, dx_mm, dy_mm)
 
 
 def _draw_thermal_gain(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     phases = tuple(float(phase) for phase in rng.uniform(0, 2 * math.pi, 12))
-    return lambda a: concealed.ThermalGain(a, setup.duration_s, phases)
+    return lambda a: unlisted.ThermalGain(a, setup.duration_s, phases)
 
 
 def _draw_orientation_dependent_gain(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     phase = rng.uniform(0, 2 * math.pi)
-    return lambda a: concealed.OrientationDependentGain(a, phase)
+    return lambda a: unlisted.OrientationDependentGain(a, phase)
 
 
 def _draw_after_glow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     tau_s, level = draw_log_uniform(rng, 5.0, 20.0), (setup.world.black + setup.world.white) / 2
-    return lambda a: concealed.AfterGlow(a, tau_s, level)
+    return lambda a: unlisted.AfterGlow(a, tau_s, level)
 
 
 def _draw_chirp(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -318,20 +318,20 @@ def _draw_chirp(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     # By the end of the recording the frequency has grown eightfold.
     first_hz = draw_log_uniform(rng, 2.0, 6.0) / setup.duration_s
     rate = 7 * first_hz / setup.duration_s
-    return lambda a: concealed.Chirp(a, first_hz, rate, phase)
+    return lambda a: unlisted.Chirp(a, first_hz, rate, phase)
 
 
 OUTSIDE: Mapping[str, EffectSampler] = {
-    "bent_rail": EffectSampler(("place",), make_draw_with_random_sign(concealed.QuadraticPositionError), 0.5, 20.0),
-    "twisted_rail": EffectSampler(("place",), make_draw_with_random_sign(concealed.CubicPositionError), 0.5, 20.0),
+    "bent_rail": EffectSampler(("place",), make_draw_with_random_sign(unlisted.QuadraticPositionError), 0.5, 20.0),
+    "twisted_rail": EffectSampler(("place",), make_draw_with_random_sign(unlisted.CubicPositionError), 0.5, 20.0),
     "place_step": EffectSampler(("place",), _draw_place_step, 0.5, 10.0),
     "stick_slip": EffectSampler(("place",), _draw_stick_slip, 0.5, 8.0),
     "slipped_paper": EffectSampler(("time",), _draw_slipped_paper, 0.5, 10.0),
     "ghost": EffectSampler(("edge_distance",), _draw_ghost, 0.03, 0.5),
     "thermal_gain": EffectSampler(("time",), _draw_thermal_gain, 0.02, 0.5),
     "cross_talk": EffectSampler(("orientation",), _draw_orientation_dependent_gain, 0.03, 0.9),
-    "floor": EffectSampler(("level",), make_draw_without_random_parameters(concealed.DeadZone), 0.03, 0.6),
-    "peak_memory": EffectSampler(("level",), make_draw_without_random_parameters(concealed.PeakMemory), 0.05, 2.0),
+    "floor": EffectSampler(("level",), make_draw_without_random_parameters(unlisted.DeadZone), 0.03, 0.6),
+    "peak_memory": EffectSampler(("level",), make_draw_without_random_parameters(unlisted.PeakMemory), 0.05, 2.0),
     "after_glow": EffectSampler(("time",), _draw_after_glow, 1.0, 40.0),
     "chirp": EffectSampler(("time",), _draw_chirp, 0.3, 20.0),
 }

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from probewise.world.concealed import (
-    Concealed,
     CorrelatedNoise,
     Dropouts,
     HeavyTails,
@@ -17,6 +16,7 @@ from probewise.world.concealed import (
     SignalDependentNoise,
 )
 from probewise.world.spots import Blob, Spot, gaussian_spot, ridge_spot, ring_spot, tailed_spot
+from probewise.world.stages import Concealed
 from probewise.world.world import World
 
 _PIXEL_MM = 0.5  # resolution of the raster: an SSF may be constant over half a millimetre

@@ -19,21 +19,19 @@ from probewise.recordings.plan import Recording
 from probewise.world.concealed import (
     AlbedoPatch,
     AmbientStep,
-    Concealed,
     CorrelatedNoise,
-    Disturbs,
     Dropouts,
     EdgeShadow,
     Glint,
     HeightOffset,
     Outliers,
-    PlaceStep,
     Saturation,
     ScanAngleError,
     ScanMisplacement,
     SignalDependentNoise,
 )
-from probewise.world.concealed.stages import AFTER_VIEW
+from probewise.world.stages import AFTER_VIEW, Concealed, Disturbs
+from probewise.world.unlisted import PlaceStep
 from probewise.world.world import View
 
 NormAfterRefit: TypeAlias = Callable[[Recording, Recording], float]

@@ -10,8 +10,8 @@ from typing import ClassVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.concealed.stages import FootprintPart, Stage
 from probewise.world.rows import Rows
+from probewise.world.stages import FootprintPart, Stage
 
 
 @dataclass(frozen=True)

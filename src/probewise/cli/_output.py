@@ -89,18 +89,9 @@ class Drawings:
         inputs: Sequence[Path] = (),
         progress: Progress = silent,
     ) -> None:
-        """Draw figures and the page report.html into the directory of results, which are complete there.
+        """Draw figures, by name, and the page report.html into the directory of results, which are complete there.
 
-        Parameters
-        ----------
-        drawers
-            Functions that draw the figures, by file name.
-        page
-            Function that builds the HTML from the figures by name; b"" stands for one that could not be drawn.
-        inputs
-            Input files of this run, which nothing replaces.
-        progress
-            Told which drawing is being made.
+        `page` builds the HTML from the figures by name; b"" stands for one that could not be drawn.
         """
         kept = f"the results are in {self.out}, without figures and report"
         drawn: dict[str, bytes] = {}
@@ -323,13 +314,9 @@ def _new_names_of_kept(out: Path, names: Sequence[str]) -> dict[str, str]:
     Files of one stem get the same ending.
     """
     aside: dict[str, str] = {}
-    for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):
-        group = [Path(name) for name in names if Path(name).with_suffix("") == stem]
+    for stem in dict.fromkeys(name.removesuffix(Path(name).suffix) for name in names):
+        suffixes = [name.removeprefix(stem) for name in names if name.removesuffix(Path(name).suffix) == stem]
         endings = itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2)))
-        ending = next(e for e in endings if not any((out / _with_stem_ending(path, e)).exists() for path in group))
-        aside |= {path.as_posix(): _with_stem_ending(path, ending).as_posix() for path in group}
+        ending = next(e for e in endings if not any((out / (stem + e + suffix)).exists() for suffix in suffixes))
+        aside |= {stem + suffix: stem + ending + suffix for suffix in suffixes}
     return aside
-
-
-def _with_stem_ending(path: Path, ending: str) -> Path:
-    return path.with_name(f"{path.stem}{ending}{path.suffix}")

@@ -67,14 +67,9 @@ def raise_if_stopped() -> None:
 
 @contextlib.contextmanager
 def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> Iterator[None]:
-    """Add what is kept on disk to the final message, if a signal or a lost connection ends the block.
+    """Add what is kept on disk, in words, to the final message, if a signal or a lost connection ends the block.
 
-    Parameters
-    ----------
-    kept
-        Function that returns the text to add.
-    results
-        Whether the run is over and writes its results, so that file errors get the message too.
+    With `results` the run is over and writes its results: errors of files get the message too.
     """
     try:
         yield

@@ -67,6 +67,7 @@ def _run_demo(
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
     from probewise.cli._workers import worker_pool
+    from probewise.inquiry import ReadingEntropy
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
@@ -83,9 +84,15 @@ def _run_demo(
         diagnosing = pool.submit(_diagnose_shipped_recording, seed)
         calibration = _calibrate_shipped_recording(seed, arguments.full, pool)
         sensor = calibration.sensor
-        doubting = [pool.submit(search_with_saturating_sensor, sensor, trust, truth, seed) for trust in TRUSTS.values()]
-        starting = [pool.submit(search_from_reading_on_circle, sensor, model, truth, seed) for model in MODELS]
-        searching = [pool.submit(_search_from_empty_field, sensor, model, truth, seed) for model in MODELS]
+        seek, paper_rule = partial(search, sensor, truth, seed), ReadingEntropy()
+        doubting = [
+            pool.submit(seek, 7, trust=trust, saturating=True, max_readings=MAX_READINGS_DOUBT)
+            for trust in TRUSTS.values()
+        ]
+        starting = [
+            pool.submit(seek, 6, model=model, utility=paper_rule, max_readings=MAX_READINGS) for model in MODELS
+        ]
+        searching = [pool.submit(seek, 2, model=model, on_circle=False, max_readings=MAX_READINGS) for model in MODELS]
         parts: tuple[Future[Any], ...] = (diagnosing, *doubting, *starting, *searching)
         progress(doing, 1, 8)
         for done, future in enumerate(as_completed(parts), start=2):
@@ -207,21 +214,6 @@ def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calib
     )
 
 
-def _search_from_empty_field(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
-    """Search for the circle without a first reading on it."""
-    import numpy as np
-
-    from probewise.experiment import arm_over, experiment_for, run, surface_of
-    from probewise.scene import Field
-    from probewise.world.shipped import true_world as world_behind
-
-    field = Field()
-    experiment = experiment_for(sensor, hypothesised_circle(), field, model=model, n_live=N_LIVE_ROBOT)
-    surface = surface_of("circle", np.array(truth), field)
-    with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
-        return run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
-
-
 def _frame_png(search: RobotSearch, step: Step) -> bytes:
     """Draw the view of a search after a step; return a PNG."""
     from probewise._words import count_with_noun
@@ -240,26 +232,6 @@ def _frame_png(search: RobotSearch, step: Step) -> bytes:
     return png(ax, dpi=90)
 
 
-def search_from_reading_on_circle(
-    sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int
-) -> Exploration:
-    """Search for the circle by the paper's rule; the first reading, on the circle, is the same for all models."""
-    import numpy as np
-
-    from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
-    from probewise.inquiry import ReadingEntropy
-    from probewise.scene import Field
-    from probewise.world.shipped import true_world as world_behind
-
-    field = Field()
-    experiment = experiment_for(
-        sensor, hypothesised_circle(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy()
-    )
-    first, surface = random_pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
-    with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
-        return run_from_place(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
-
-
 def random_pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
     """Draw the pose of the first reading, uniformly within the circle; it is the same for all robots compared."""
     import numpy as np
@@ -272,31 +244,42 @@ def random_pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
     return Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
 
 
-def search_with_saturating_sensor(
-    sensor: FittedSensor, trust: float, truth: tuple[float, ...], seed: int
+def search(
+    sensor: FittedSensor,
+    truth: tuple[float, ...],
+    seed: int,
+    stream: int,
+    *,
+    max_readings: int,
+    on_circle: bool = True,
+    saturating: bool = False,
+    **options: Any,
 ) -> Exploration:
-    """Search for the circle, from a first reading on it, with a sensor that saturates, which its model leaves out.
+    """Search for the circle with a simulated arm and a model by the `options` of `experiment_for`.
 
-    `trust` is the robot's prior probability that the model leaves nothing out.
+    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. With `saturating` the
+    sensor saturates, which its model leaves out.
     """
     from dataclasses import replace
 
     import numpy as np
 
-    from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
+    from probewise.experiment import arm_over, experiment_for, run, run_from_place, surface_of
     from probewise.report.doubting_robot import SATURATION
     from probewise.scene import Field
     from probewise.world import Saturation
     from probewise.world.shipped import true_world as world_behind
 
-    field = Field()
-    experiment = experiment_for(sensor, hypothesised_circle(), field, n_live=N_LIVE_ROBOT, trust=trust)
-    world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
-    first, surface = random_pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
-    with arm_over(world, surface, field, seed=seed) as arm:
-        return run_from_place(
-            first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT
-        )
+    field, world = Field(), world_behind("paper")
+    if saturating:
+        world = replace(world, concealed=(Saturation(SATURATION),))
+    experiment = experiment_for(sensor, hypothesised_circle(), field, n_live=N_LIVE_ROBOT, **options)
+    rng = np.random.default_rng([seed, stream])
+    with arm_over(world, surface_of("circle", np.array(truth), field), field, seed=seed) as arm:
+        if not on_circle:
+            return run(arm, experiment, rng=rng, max_readings=max_readings)
+        first = random_pose_within_circle(truth, seed)
+        return run_from_place(first, arm, experiment, rng=rng, max_readings=max_readings)
 
 
 def _diagnose_shipped_recording(seed: int) -> Diagnosis:

@@ -19,20 +19,10 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, name
     """Replace the file at `path` by `content` atomically; its permissions stay.
 
     The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. Temporary
-    files that killed processes left are removed.
+    files that killed processes left are removed. If a person has `named` this very file, a symbolic link is followed,
+    and a device or a named pipe is written to; one that stands where a further file goes is replaced.
 
-    Parameters
-    ----------
-    path, content
-        The file and its content.
-    named
-        Whether a person has named this very file: then a symbolic link is followed, and a device or a named pipe is
-        written to. One that stands where a further file goes is replaced.
-
-    Raises
-    ------
-    FileError
-        If the folder does not exist or cannot be written to, `path` is a folder, or the disk is full.
+    Raises FileError if the folder does not exist or cannot be written to, `path` is a folder, or the disk is full.
     """
     path = Path(path)
     try:
@@ -68,13 +58,7 @@ def write_text_atomically(path: str | os.PathLike[str], text: str, *, named: boo
 
 
 def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:
-    """Write all of `content` to an open, unbuffered file and sync it to the disk; `path` is its name in messages.
-
-    Raises
-    ------
-    FileError
-        If it cannot be written or synced, as on a full disk.
-    """
+    """Write all of `content` to an open, unbuffered file and sync it to disk; FileError, of `path`, if that fails."""
     try:
         _write_all(file, content)
         os.fsync(file.fileno())

@@ -19,18 +19,8 @@ _NO_LOCKS = "flock not supported"  # newer versions of the library warn so, and 
 def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator[None]:
     """Hold an exclusive lock on a file or folder, by way of an empty lock file .NAME.lock beside it, which stays.
 
-    Parameters
-    ----------
-    path
-        The file or folder; it need not exist, but its folder must.
-    patience_s
-        Wait at most this long for another process.
-
-    Raises
-    ------
-    FileError
-        If another process holds the lock, the lock file is a symbolic link or cannot be written, or the file system has
-        no locks.
+    `path` need not exist, but its folder must. Raises FileError if another process holds the lock for longer than
+    `patience_s`, the lock file is a symbolic link or cannot be written, or the file system has no locks.
     """
     path = Path(path)
     file = path.with_name(f".{path.name}.lock")

@@ -38,46 +38,20 @@ _JIG_MM, _JIG_BASE_MM = 20.0, 40.0
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A rectangle to be printed at true scale: a pattern in its own frame, or a part of the field.
+    """A rectangle to be printed at true scale: a pattern in its own frame, or a part of the field; lengths in mm."""
 
-    Parameters
-    ----------
-    name
-        Name of the pattern, as prompts call it.
-    pattern
-        The pattern printed: albedo 0 is black, 1 white.
-    low_mm, high_mm
-        Lower left and upper right corner, in the pattern's frame.
-    lines
-        Instructions for the user.
-    outline_mm
-        Line to cut along, (n, 2), or None.
-    crosses_mm
-        Crosses to bring the sensor or a joint to, (n, 2), or None.
-    cross_names
-        Text beside each cross; empty: its number and place.
-    strokes_mm
-        Further lines, (n, 2) each.
-    words
-        Further texts, each with x and y (mm) of its left end before it.
-    frame
-        Origin of x and y, in words.
-    orientations_rad
-        Orientations of the sensor over the sheet.
-    """
-
-    name: str
-    pattern: Pattern
-    low_mm: tuple[float, float]
-    high_mm: tuple[float, float]
-    lines: tuple[str, ...] = ()
-    outline_mm: FloatArray | None = None
-    crosses_mm: FloatArray | None = None
-    cross_names: tuple[str, ...] = ()
-    strokes_mm: tuple[FloatArray, ...] = ()
-    words: tuple[tuple[float, float, str], ...] = ()
-    frame: str = "the pattern's origin"
-    orientations_rad: tuple[float, ...] = ()
+    name: str  # of the pattern, as prompts call it
+    pattern: Pattern  # albedo 0 is black, 1 white
+    low_mm: tuple[float, float]  # lower left corner, in the pattern's frame
+    high_mm: tuple[float, float]  # upper right corner
+    lines: tuple[str, ...] = ()  # instructions for the user
+    outline_mm: FloatArray | None = None  # line to cut along, (n, 2)
+    crosses_mm: FloatArray | None = None  # to bring the sensor or a joint to, (n, 2)
+    cross_names: tuple[str, ...] = ()  # text beside each cross; empty: its number and place
+    strokes_mm: tuple[FloatArray, ...] = ()  # further lines, (n, 2) each
+    words: tuple[tuple[float, float, str], ...] = ()  # further texts, each with x and y of its left end before it
+    frame: str = "the pattern's origin"  # origin of x and y, in words
+    orientations_rad: tuple[float, ...] = ()  # of the sensor over the sheet
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -87,26 +61,14 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Tile:
-    """The part of a sheet on one page.
+    """The part of a sheet on one page."""
 
-    Parameters
-    ----------
-    column, row
-        Counted from 0 at the lower left.
-    low_mm, high_mm
-        Its corners in the sheet's frame, where the page is cut.
-    page_mm
-        Width and height of the page.
-    beyond_mm
-        Width of the strips printed beyond the cut on the right and at the top, on which the neighbours are glued.
-    """
-
-    column: int
-    row: int
-    low_mm: tuple[float, float]
+    column: int  # from 0 at the left
+    row: int  # from 0 at the bottom
+    low_mm: tuple[float, float]  # corners in the sheet's frame, where the page is cut
     high_mm: tuple[float, float]
     page_mm: tuple[float, float]
-    beyond_mm: tuple[float, float]
+    beyond_mm: tuple[float, float]  # strips beyond the cut, on the right and at the top, for gluing the neighbours
 
     def on_page_mm(self, points_mm: FloatArray) -> FloatArray:
         """Convert points, (n, 2), from the sheet's frame to the page's, whose origin is its lower left corner."""
@@ -173,10 +135,8 @@ def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) ->
             turns = tuple(dict.fromkeys(np.radians(orientation_deg(plan)[rows]).tolist()))
         else:
             places = np.concatenate([places, _points_sheet_must_show(pattern)])
-        low = np.floor((places.min(axis=0) - AROUND_MM) / _ROUND_MM) * _ROUND_MM
-        high = np.ceil((places.max(axis=0) + AROUND_MM) / _ROUND_MM) * _ROUND_MM
         lines = (where_white_in_words(pattern),)
-        sheets.append(Sheet(name, pattern, _two_floats(low), _two_floats(high), lines, orientations_rad=turns))
+        sheets.append(Sheet(name, pattern, *_sheet_corners_around(places, AROUND_MM), lines, orientations_rad=turns))
     return tuple(sheets)
 
 
@@ -189,18 +149,9 @@ def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = N
 
 def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
     """Make the sheet of a white target of the given closed outline, (n, 2), to cut out and lay on a black field."""
-    low = np.floor((outline_mm.min(axis=0) - _ROUND_MM) / _ROUND_MM) * _ROUND_MM
-    high = np.ceil((outline_mm.max(axis=0) + _ROUND_MM) / _ROUND_MM) * _ROUND_MM
-    lines = ("white: cut it out along the line and lay it on the black field",)
-    return Sheet(
-        name,
-        Uniform(1.0),
-        _two_floats(low),
-        _two_floats(high),
-        lines,
-        outline_mm=outline_mm,
-        frame="the field's lower left corner",
-    )
+    lines, frame = ("white: cut it out along the line and lay it on the black field",), "the field's lower left corner"
+    corners = _sheet_corners_around(outline_mm, _ROUND_MM)
+    return Sheet(name, Uniform(1.0), *corners, lines, outline_mm=outline_mm, frame=frame)
 
 
 def marks_sheet(geometry: Geometry) -> Sheet:
@@ -305,13 +256,12 @@ def _sheet_corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tupl
 
 
 def _pages_across_and_up(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
-    width, height = page_mm[0] - LEFT_MM - RIGHT_MM, page_mm[1] - BOTTOM_MM - TOP_MM
-    w, h = sheet.size_mm
-    return _n_pages_along(w, width), _n_pages_along(h, height)
-
-
-def _n_pages_along(length_mm: float, room_mm: float) -> int:
-    return 1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
+    rooms_mm = page_mm[0] - LEFT_MM - RIGHT_MM, page_mm[1] - BOTTOM_MM - TOP_MM
+    n_across, n_up = (
+        1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
+        for length_mm, room_mm in zip(sheet.size_mm, rooms_mm, strict=True)
+    )
+    return n_across, n_up
 
 
 def _points_sheet_must_show(pattern: Pattern) -> FloatArray:

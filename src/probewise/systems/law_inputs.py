@@ -241,18 +241,16 @@ class LawInputs:
     """Parameters and columns of a law at the positions in runs: some held over a gap, some interpolated linearly.
 
     `constant`, `kept` and `moving` are parameters, `held` and `sloping` are columns: (1 or n_samples, n_places,
-    n_runs); a constant parameter has no axis of places. The rises are the changes over each gap of what is moving or
-    sloping, (1 or n_samples, n_places - 1, n_runs). `late` are the columns with a dead time.
+    n_runs); a constant parameter has no axis of places. With what is moving or sloping is its rise over each gap,
+    (1 or n_samples, n_places - 1, n_runs). `late` are the columns with a dead time.
     """
 
     places: RowsInRuns
-    constant: Mapping[str, Any]  # parameters
-    kept: Mapping[str, FloatArray]  # parameters
-    moving: Mapping[str, FloatArray]  # parameters
-    held: Mapping[str, NDArray[Any]]  # columns
-    sloping: Mapping[str, FloatArray]  # columns
-    rises_of_parameters: Mapping[str, FloatArray]
-    rises_of_columns: Mapping[str, FloatArray]
+    constant: Mapping[str, Any]
+    kept: Mapping[str, FloatArray]
+    moving: Mapping[str, Line]
+    held: Mapping[str, NDArray[Any]]
+    sloping: Mapping[str, Line]
     late: Mapping[str, LateColumn] = field(default_factory=dict)
     jumps: tuple[Jump, ...] = ()
 
@@ -274,8 +272,7 @@ class LawInputs:
         between = BetweenRows() if between is None else between
         constant: dict[str, Any] = {}
         kept: dict[str, FloatArray] = {}
-        moving: dict[str, FloatArray] = {}
-        rises_of_parameters: dict[str, FloatArray] = {}
+        moving: dict[str, Line] = {}
         for name, values in parameters.items():
             for jump in between.jumps:
                 if jump.parameter == name:  # it is added where it is, within a gap
@@ -285,34 +282,25 @@ class LawInputs:
             if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
                 constant[name] = own[:, 0]
             elif law.hold == "linear":
-                moving[name], rises_of_parameters[name] = own, np.diff(own, axis=1)
+                moving[name] = own, np.diff(own, axis=1)
             elif name in between.drifts:
-                moving[name], rises_of_parameters[name] = own, between.drifts[name][:, :, None] * places.gaps
+                moving[name] = own, between.drifts[name][:, :, None] * places.gaps
             else:
                 kept[name] = own
-        sloping: dict[str, FloatArray] = {}
+        sloping: dict[str, Line] = {}
         held: dict[str, NDArray[Any]] = {}
         for name, values in columns.items():
-            slopes = name == time or (law.hold == "linear" and values.dtype == np.float64)
-            (sloping if slopes else held)[name] = values_at_rows(values, rows)
+            own = values_at_rows(values, rows)
+            if name == time or (law.hold == "linear" and values.dtype == np.float64):
+                sloping[name] = own, np.diff(own, axis=1)
+            else:
+                held[name] = own
         timeline = Timeline(places)
         late = {
             name: LateColumn.of(timeline, columns[name], dead_time, linear=law.hold == "linear")
             for name, dead_time in between.dead_times.items()
         }
-        rises_of_columns = {name: np.diff(values, axis=1) for name, values in sloping.items()}
-        return cls(
-            places,
-            constant,
-            kept,
-            moving,
-            read_only_views(held),
-            sloping,
-            rises_of_parameters,
-            rises_of_columns,
-            late,
-            between.jumps,
-        )
+        return cls(places, constant, kept, moving, read_only_views(held), sloping, late, between.jumps)
 
     @property
     def has_breaks(self) -> bool:
@@ -323,9 +311,9 @@ class LawInputs:
         """Return parameters and columns in the gap between positions k and k + 1, with a column for each run."""
         return StepInputs(
             {**self.constant, **{name: v[:, k] for name, v in self.kept.items()}},
-            {name: (v[:, k], self.rises_of_parameters[name][:, k]) for name, v in self.moving.items()},
+            {name: (v[:, k], rise[:, k]) for name, (v, rise) in self.moving.items()},
             {name: v[:, k] for name, v in self.held.items()},
-            {name: (v[:, k], self.rises_of_columns[name][:, k]) for name, v in self.sloping.items()},
+            {name: (v[:, k], rise[:, k]) for name, (v, rise) in self.sloping.items()},
         )
 
     def of_steps(self, gap: IntArray) -> StepInputs:
@@ -334,18 +322,18 @@ class LawInputs:
         Their arrays have a column for each step and run, the runs of a step in turn.
         """
 
-        def flattened(values: Any) -> Any:
-            return values.reshape(len(values), -1)
+        def in_gaps(values: Any) -> Any:
+            return values[:, gap].reshape(len(values), -1)
 
-        def value_and_rise(values: FloatArray, rise: FloatArray) -> Line:
-            return flattened(values[:, gap]), flattened(rise[:, gap])
+        def lines_in_gaps(lines: Mapping[str, Line]) -> dict[str, Line]:
+            return {name: (in_gaps(values), in_gaps(rise)) for name, (values, rise) in lines.items()}
 
         constant = {name: np.tile(v, (1, len(gap))) if v.shape[1] > 1 else v for name, v in self.constant.items()}
         return StepInputs(
-            read_only_views({**constant, **{name: flattened(v[:, gap]) for name, v in self.kept.items()}}),
-            {name: value_and_rise(v, self.rises_of_parameters[name]) for name, v in self.moving.items()},
-            read_only_views({name: flattened(v[:, gap]) for name, v in self.held.items()}),
-            {name: value_and_rise(v, self.rises_of_columns[name]) for name, v in self.sloping.items()},
+            read_only_views({**constant, **{name: in_gaps(v) for name, v in self.kept.items()}}),
+            lines_in_gaps(self.moving),
+            read_only_views({name: in_gaps(v) for name, v in self.held.items()}),
+            lines_in_gaps(self.sloping),
         )
 
     def parts_of_steps(

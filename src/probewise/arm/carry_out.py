@@ -92,11 +92,13 @@ def carry_out(
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
     require_within_reach(reachable_places_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
-    row_measurer = _LegoRowMeasurer(arm) if isinstance(arm, LegoArm) else _OwnRowMeasurer(arm)
-    turns = row_measurer.hand_turns_rad(plan, places)
+    if isinstance(arm, LegoArm):
+        arm.turned_rad = 0.0
+    from_where = "where the geometry has it" if isinstance(arm, LegoArm) else "how it stands by itself"
+    turns = _turns_by_hand_rad(arm, plan, places)
     if (turns[:first] > _SAME_TURN_RAD).any():
         arm.mounted_rad = math.nan  # by hand, in an earlier session
-    does_not_matter = math.isnan(arm.mounted_rad) and not (row_measurer.by_hand and _orientation_matters(plan, turns))
+    does_not_matter = math.isnan(arm.mounted_rad) and (arm.turns or not _orientation_matters(plan, turns))
     lying = -1
     for row in range(first, len(plan)):
         if plan.pattern[row] != lying:
@@ -107,26 +109,21 @@ def carry_out(
             ask(RequestToPerson(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         turned = float(turns[row])
         if not does_not_matter and not abs(turned - arm.mounted_rad) <= _SAME_TURN_RAD:
-            text = f"turn the sensor on its mount to {math.degrees(turned):.4g} degrees, {row_measurer.from_where}"
+            text = (
+                f"turn the sensor on its mount to {math.degrees(turned):.4g} degrees, anticlockwise seen from above, "
+                f"from {from_where}"
+            )
             ask(RequestToPerson(text, turned_rad=turned))
             arm.mounted_rad = turned
-        x_mm, y_mm = places[row].tolist()
-        reading = row_measurer.measure_row(x_mm, y_mm, turned, plan, row)
+        reading = _measure_row(arm, places[row], turned, plan, row)
         there = _place_in_plan_frame_mm(reading, plan, row, origin_mm)
         yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
 
 
 def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], first: int = 0) -> float:
-    """Estimate the duration of a plan in seconds: travel, readings, and half a minute for each step by hand.
+    """Estimate a plan's duration in seconds, by arguments as of `carry_out`: travel, readings, half a minute by hand.
 
     Every change of the pattern or of the planned orientation counts as a step by hand, and so does the start.
-
-    Parameters
-    ----------
-    arm
-        The arm, entered.
-    plan, origin_mm, first
-        As for `carry_out`.
     """
     places = (np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm))[first:]
     turns, lying = plan.orientation_rad[first:], plan.pattern[first:]
@@ -149,49 +146,31 @@ def _place_in_plan_frame_mm(
     return round(reading.pose.x_mm - origin_mm[0], 3), round(reading.pose.y_mm - origin_mm[1], 3)
 
 
-class _LegoRowMeasurer:
-    """Helper of `carry_out` for the LEGO arm: the base turns the sensor, and a person adds turns by right angles."""
+def _turns_by_hand_rad(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan, places_mm: FloatArray) -> FloatArray:
+    """Return the angle to which a person turns the sensor for each row, (n_points,): 0 if the arm turns it itself.
 
-    from_where = "anticlockwise seen from above, from where the geometry has it"
-    by_hand = True
-
-    def __init__(self, arm: LegoArm) -> None:
-        self._arm = arm
-        arm.turned_rad = 0.0
-
-    def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
-        """Return the angle to which a person turns the sensor for each row, (n_points,): 0 to 3 right angles."""
-        off = plan.orientation_rad - self._arm.orientation_rad(places_mm)
+    The LEGO arm's base turns the sensor, and a person adds 0 to 3 right angles.
+    """
+    if arm.turns:
+        return np.zeros(len(plan))
+    off = plan.orientation_rad - arm.orientation_rad(places_mm)
+    if isinstance(arm, LegoArm):
         return np.asarray(np.rint(off / QUARTER_RAD) % 4 * QUARTER_RAD)
-
-    def measure_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Measure at a row's place with the sensor turned by hand; place and reading are in the lab frame."""
-        self._arm.turned_rad = turned_rad
-        standing = self._arm.orientation_rad(np.array([[x_mm, y_mm]]))
-        return self._arm.measure(Pose(x_mm, y_mm, float(standing[0])))
+    off = off % math.tau
+    return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
 
 
-class _OwnRowMeasurer:
-    """Helper of `carry_out` for a user's own instrument, which may turn the sensor itself, or the simulated arm."""
-
-    from_where = "anticlockwise seen from above, from how it stands by itself"
-
-    def __init__(self, arm: OwnInstrument | SimulatedArm) -> None:
-        self._arm = arm
-        self.by_hand = not arm.turns
-
-    def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
-        """Return the angle to which a person turns the sensor for each row, (n_points,): 0 if the instrument does."""
-        if not self.by_hand:
-            return np.zeros(len(plan))
-        off = (plan.orientation_rad - self._arm.orientation_rad(places_mm)) % math.tau
-        return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
-
-    def measure_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Measure at a row's place, orientation and, if possible, height; place and reading are in the lab frame."""
-        height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._arm.lifts else math.nan
-        up_mm = None if math.isnan(height_mm) else float(height_mm)
-        return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
+def _measure_row(
+    arm: LegoArm | OwnInstrument | SimulatedArm, place_mm: FloatArray, turned_rad: float, plan: Plan, row: int
+) -> Reading:
+    """Measure at a row's place, with its orientation and, if the arm can, its height, in the lab frame."""
+    x_mm, y_mm = place_mm.tolist()
+    if isinstance(arm, LegoArm):
+        arm.turned_rad = turned_rad
+        return arm.measure(Pose(x_mm, y_mm, float(arm.orientation_rad(place_mm[None, :])[0])))
+    height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if arm.lifts else math.nan
+    up_mm = None if math.isnan(height_mm) else float(height_mm)
+    return arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
 
 def _orientation_matters(plan: Plan, turns_rad: FloatArray) -> bool:
@@ -203,14 +182,8 @@ def _orientation_matters(plan: Plan, turns_rad: FloatArray) -> bool:
 def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
     """Build a recording of the plan's first rows, with the readings' own places, orientations, times and covariates.
 
-    A covariate that a reading lacks is the planned one, or NaN if none is planned. `Plan.sessions` is left out.
-
-    Parameters
-    ----------
-    plan
-        The plan.
-    readings
-        Readings of its first rows, one or more, as `carry_out` yields them.
+    `readings` are those of its first rows, one or more, as `carry_out` yields them. A covariate that a reading lacks is
+    the planned one, or NaN if none is planned. `Plan.sessions` is left out.
     """
     rows = plan.take(np.arange(len(readings)))
     names = sorted({name for reading in readings for name in reading.covariates})

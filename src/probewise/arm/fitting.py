@@ -103,26 +103,14 @@ class MarksDisagreeError(ProbewiseError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class FittedGeometry:
-    """A fitted geometry with its residuals and errors.
-
-    Parameters
-    ----------
-    geometry
-        The geometry, with its accuracy.
-    before, values, sds
-        Parameters before and after the fit, and their sds, (9,) in the order of `FITTED`; radians, mm.
-    residuals_mm
-        Mark minus fitted place and height, (n_marks, 3); NaN without a height.
-    p_value
-        Probability that marks of the accuracy `touch_mm` fit worse.
-    """
+    """A fitted geometry, with its accuracy, and its residuals and errors; parameters in the order of `FITTED`."""
 
     geometry: Geometry
-    before: FloatArray
-    values: FloatArray
+    before: FloatArray  # parameters before the fit, (9,); radians, mm
+    values: FloatArray  # parameters after the fit
     sds: FloatArray
-    residuals_mm: FloatArray
-    p_value: float
+    residuals_mm: FloatArray  # mark minus fitted place and height, (n_marks, 3); NaN without a height
+    p_value: float  # probability that marks of the accuracy `touch_mm` fit worse
 
     def summary(self) -> str:
         """Return a text table of each parameter's change and sd."""

@@ -26,31 +26,15 @@ ROOM_COUNTS = 110
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint and the motor that turns it.
+    """A joint and the motor that turns it."""
 
-    Parameters
-    ----------
-    port
-        Port of the motor, 0 to 2 for A to C.
-    gear_ratio
-        Turns of the motor per turn of the joint; negative if they turn in opposite directions.
-    home_rad
-        Angle at which the motor's counter is 0.
-    low_rad, high_rad
-        Limits of the angle.
-    play_rad
-        Backlash: range over which the joint is loose while its motor holds; 0 if its weight keeps it on one side.
-    stop_rad
-        Angle of a mechanical stop, at or beyond a limit, used to find home; None without one.
-    """
-
-    port: int
-    gear_ratio: float
-    home_rad: float
-    low_rad: float
+    port: int  # of the motor, 0 to 2 for A to C
+    gear_ratio: float  # turns of the motor per turn of the joint; negative if they turn in opposite directions
+    home_rad: float  # angle at which the motor's counter is 0
+    low_rad: float  # limits of the angle
     high_rad: float
-    play_rad: float = 0.0
-    stop_rad: float | None = None
+    play_rad: float = 0.0  # over which the joint is loose while its motor holds; 0 if its weight keeps it on one side
+    stop_rad: float | None = None  # angle of a mechanical stop, at or beyond a limit, used to find home
 
     def __post_init__(self) -> None:
         if self.port not in (0, 1, 2):
@@ -124,27 +108,13 @@ FIELD_STEPS = 12  # places along each side of the field at which errors are work
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of a geometry fitted to marks.
-
-    Parameters
-    ----------
-    marks
-        Number of marks.
-    place_sd_mm
-        Sd of the sensor's place along x and y, root mean square over the field.
-    height_sd_mm
-        Largest sd of the sensor's height over the field.
-    scale_sd
-        Sd of the ratio of true lengths on the field to lengths as the arm measures them.
-    covariance
-        Covariance of the errors of the nine fitted parameters (`arm.uncertainty.FITTED`): nine rows; radians, mm.
-    """
+    """Accuracy of a geometry fitted to a number of marks."""
 
     marks: int
-    place_sd_mm: float
-    height_sd_mm: float
-    scale_sd: float
-    covariance: tuple[tuple[float, ...], ...]
+    place_sd_mm: float  # of the sensor's place along x and y, root mean square over the field
+    height_sd_mm: float  # of the sensor's height, the largest over the field
+    scale_sd: float  # of the ratio of true lengths on the field to lengths as the arm measures them
+    covariance: tuple[tuple[float, ...], ...]  # of the errors of the parameters `FITTED`, nine rows; radians, mm
 
     def __post_init__(self) -> None:
         if self.marks < 1:

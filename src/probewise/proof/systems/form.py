@@ -18,6 +18,10 @@ Side: TypeAlias = Literal["input", "parameter", "rate", "reading"]
 Numbers: TypeAlias = Mapping[str, Any]
 """A form's parameters by name: (n_samples, 1), or floats."""
 
+OfAmplitude: TypeAlias = Callable[[float, dict[str, float]], dict[str, float]]
+Draw: TypeAlias = Callable[[np.random.Generator], dict[str, float]]
+StartValues: TypeAlias = Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
+
 Bank: TypeAlias = Sequence[Sequence[dict[str, float]]]
 """Template bank of a form: groups of settings that may be combined linearly."""
 
@@ -40,6 +44,12 @@ class Instants:
     def at_rows(cls, rows: SystemTable) -> Self:
         """Return the instants of all rows of a table."""
         return cls(rows.t[None, :], rows.time_since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
+
+
+def scaled_start_values(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+    """Return the first setting of a group; an amplitude "a" in it is multiplied by the first fitted coefficient."""
+    first = group[0]
+    return {**first, "a": first["a"] * float(amounts[0])} if "a" in first else dict(first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +102,14 @@ class Form:
     name: str
     side: Side
     act: Callable[..., Any]
-    of_amplitude: Callable[[float, dict[str, float]], dict[str, float]]
-    draw: Callable[[np.random.Generator], dict[str, float]]
     bank: Bank
-    start_values: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
     steps: Mapping[str, float]
     first: float
     limit: float
     covariates: tuple[str, ...]
+    of_amplitude: OfAmplitude = lambda a, drawn: {"a": a, **drawn}
+    draw: Draw = lambda rng: {}
+    start_values: StartValues = scaled_start_values
     signed: bool = True
     target: str = ""
     order: int = 0
@@ -188,21 +198,16 @@ class Modulation:
     """
 
     value_at: Callable[[Instants, Numbers], Any]
-    of_amplitude: Callable[[float, dict[str, float]], dict[str, float]]
-    draw: Callable[[np.random.Generator], dict[str, float]]
     bank: Callable[[float], Bank]
-    start_values: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
     steps: Callable[[float], Mapping[str, float]]
     covariates: tuple[str, ...]
     reach: float
+    of_amplitude: OfAmplitude = lambda a, drawn: {"a": a, **drawn}
+    draw: Draw = lambda rng: {}
+    start_values: StartValues = scaled_start_values
     uses: tuple[str, ...] = ()
     breaks: Callable[[Numbers], FloatArray] | None = None
     signed: bool = True
-
-
-def start_values_of_single_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Return the first setting of a group, with its amplitude "a" multiplied by the first fitted coefficient."""
-    return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
 def _amplitude_only_modulation(
@@ -210,10 +215,7 @@ def _amplitude_only_modulation(
 ) -> Modulation:
     return Modulation(
         value_at,
-        lambda a, drawn: {"a": a},
-        draw=lambda rng: {},
         bank=lambda a: [[{"a": a}]],
-        start_values=start_values_of_single_member,
         steps=lambda a: {"a": a},
         covariates=covariates,
         reach=reach,
@@ -245,10 +247,8 @@ def step_at_change_point(true: TrueSystem) -> Modulation:
 
     return Modulation(
         value_at,
-        lambda a, drawn: {"a": a, **drawn},
         draw=lambda rng: {at: true.random_time(rng)},
         bank=lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
-        start_values=start_values_of_single_member,
         steps=lambda a: {"a": a, at: 0.0},
         covariates=("time", str(true.table.time)) if timed else ("row",),
         reach=1.0,
@@ -271,7 +271,7 @@ def value_per_run(true: TrueSystem) -> Modulation:
 
     return Modulation(
         value_at,
-        lambda a, drawn: {name: a * drawn[name] for name in names},
+        of_amplitude=lambda a, drawn: {name: a * drawn[name] for name in names},
         draw=lambda rng: dict(zip(names, rng.standard_normal(n).tolist(), strict=True)),
         bank=lambda a: [[{name: a * (name == names[k]) for name in names} for k in present]],
         start_values=start_values,
@@ -298,7 +298,6 @@ def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
     slowest, fastest = 1.5 / rows.duration, 0.25 / rows.median_gap
     return Modulation(
         lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
-        lambda a, drawn: {"a": a, **drawn},
         draw=lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
         bank=lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
         start_values=start_values_of_wave,
@@ -315,10 +314,8 @@ def settling(true: TrueSystem) -> Modulation:
     taus = np.geomspace(true.table.median_gap, longest, 12)
     return Modulation(
         lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
-        lambda a, drawn: {"a": a, **drawn},
         draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
         bank=lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
-        start_values=start_values_of_single_member,
         steps=lambda a: {"a": a, "tau_s": 0.05 * longest},
         covariates=("time", "run", str(true.table.time)),
         reach=1.0,

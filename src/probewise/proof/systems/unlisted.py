@@ -13,7 +13,6 @@ from probewise.proof.systems.form import (
     Numbers,
     TrueSystem,
     draw_log_uniform,
-    start_values_of_single_member,
 )
 from probewise.proof.systems.forms import OFFSET, rate_term_form
 from probewise.proof.systems.kind import SystemTable
@@ -69,10 +68,8 @@ def _form_added_to_reading(
         f"strange_{name}",
         "reading",
         act=act,
-        of_amplitude=lambda a, more: {"a": a, **more},
         draw=lambda rng: dict(drawn or {}),
         bank=[[{"a": sd}]],
-        start_values=start_values_of_single_member,
         steps={"a": sd},
         first=sd,
         limit=1e4 * sd,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -59,8 +59,8 @@ class CleanSetup:
         return tuple(name for name, row in first.items() if turn[row] == turn[first[scan]])
 
 
-Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], OfAmplitude]
-"""Draws all parameters of an effect except its amplitude."""
+Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], Any]
+"""Draws one parameter of an effect."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,10 @@ class EffectSampler:
     ----------
     residual_covariates
         Names of the covariates along which its residual is visible.
-    draw
-        Function of a setup and a generator that draws all parameters but the amplitude: returns amplitude -> effect.
+    make
+        Function of the amplitude and the values that `draws` drew; returns the effect.
+    draws
+        Draw the parameters, one each, in this order.
     first
         First amplitude of the search for a size.
     limit
@@ -82,187 +84,155 @@ class EffectSampler:
     """
 
     residual_covariates: tuple[str, ...]
-    draw: Draw
+    make: Callable[..., Concealed]
+    draws: tuple[Draw, ...]
     first: float
     limit: float
     scalable: bool = True
 
-
-def draw_sign(rng: np.random.Generator) -> float:
-    """Draw +1.0 or -1.0, equally likely."""
-    return float(rng.choice([-1.0, 1.0]))
-
-
-def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number between `low` and `high` whose logarithm is uniform."""
-    return math.exp(rng.uniform(math.log(low), math.log(high)))
+    def draw(self, setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+        """Draw all parameters but the amplitude."""
+        drawn = [draw(setup, rng) for draw in self.draws]
+        return lambda amplitude: self.make(amplitude, *drawn)
 
 
-def make_draw_without_random_parameters(make: OfAmplitude) -> Draw:
-    """Return `EffectSampler.draw` for an effect whose only parameter is its amplitude: nothing is drawn."""
-    return lambda setup, rng: make
+def _one_of(*values: float) -> Draw:
+    return lambda setup, rng: float(rng.choice(values))
 
 
-def make_draw_with_random_sign(make: OfAmplitude) -> Draw:
-    """Return `EffectSampler.draw` for an effect of which only the sign of the amplitude is drawn."""
-
-    def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-        s = draw_sign(rng)
-        return lambda a: make(s * a)
-
-    return draw
+def _uniform(low: float, high: float) -> Draw:
+    return lambda setup, rng: rng.uniform(low, high)
 
 
-def _make_draw_with_random_direction(make: Callable[[float, float], Concealed]) -> Draw:
-    """Return `EffectSampler.draw` for a vector: direction within 60 degrees of +X or -X, length = amplitude."""
-
-    def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-        s, angle = draw_sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
-        return lambda a: make(s * a * math.cos(angle), s * a * math.sin(angle))
-
-    return draw
+def _log_uniform(low: float, high: float) -> Draw:
+    return lambda setup, rng: math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
-def _draw_ambient_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, at_s = draw_sign(rng), setup.start_s + rng.uniform(0.15, 0.85) * setup.duration_s
-    return lambda a: concealed.AmbientStep(s * a, at_s)
+def _log_uniform_up_to(low: float, high: Callable[[CleanSetup], float]) -> Draw:
+    return lambda setup, rng: math.exp(rng.uniform(math.log(low), math.log(high(setup))))
 
 
-def _draw_gain_drift(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, tau_s = draw_sign(rng), draw_log_uniform(rng, 60.0, setup.duration_s)
-    return lambda a: concealed.GainDrift(s * a, tau_s)
+def _moment(low: float, high: float) -> Draw:
+    """Draw a time between these shares of the recording, s."""
+    return lambda setup, rng: setup.start_s + rng.uniform(low, high) * setup.duration_s
 
 
-def _draw_flicker(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    alias_hz, phase = draw_log_uniform(rng, 0.01, setup.nyquist_hz), rng.uniform(0, 2 * math.pi)
-    return lambda a: concealed.Flicker(a, alias_hz, phase)
+def _edge_scan(setup: CleanSetup, rng: np.random.Generator) -> str:
+    return str(rng.choice(setup.edge_scan_names))
 
 
-def _draw_saturation(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    """Draw a saturation, sharp or rounded over one reading unit; amplitude: (white - level) / (white - black)."""
-    white, span = setup.world.white, setup.world.white - setup.world.black
-    softness = float(rng.choice([0.0, 1.0]))
-    return lambda a: concealed.Saturation(white - a * span, softness)
+def _edge_scans(setup: CleanSetup, rng: np.random.Generator) -> tuple[str, ...]:
+    """Draw a scan, or all scans at its orientation."""
+    scan = _edge_scan(setup, rng)
+    return setup.scans_at_orientation_of(scan) if rng.random() < 0.5 else (scan,)
 
 
-def _draw_position_scale(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, ratio = draw_sign(rng), rng.uniform(-1, 1)
-    return lambda a: concealed.PositionScale(s * a, ratio * a)
+def _duration_s(setup: CleanSetup, rng: np.random.Generator) -> float:
+    return setup.duration_s
 
 
-def _draw_periodic_position_error(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    period_mm, phase = draw_log_uniform(rng, 4.0, 25.0), rng.uniform(0, 2 * math.pi)
-    return lambda a: concealed.PeriodicPositionError(a, period_mm, phase)
+_SIGN, _PHASE = _one_of(-1.0, 1.0), _uniform(0, 2 * math.pi)
+_DIRECTION = (_SIGN, _uniform(-math.pi / 3, math.pi / 3))
+_SPOT = (_uniform(-40, 40), _uniform(-4, 4), _log_uniform(3.0, 10.0))  # x, y and sd of a stain or glint, mm
 
 
-def _draw_scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, scan = draw_sign(rng), str(rng.choice(setup.edge_scan_names))
-    return lambda a: concealed.ScanMisplacement(s * a, scan)
+def _signed(kind: Callable[..., Concealed]) -> Callable[..., Concealed]:
+    """Return the maker of an effect whose amplitude has a random sign."""
+    return lambda a, sign, *more: kind(sign * a, *more)
 
 
-def _make_draw_with_random_scans(make: Callable[[float, tuple[str, ...]], Concealed]) -> Draw:
-    """Return `EffectSampler.draw` for an effect of random sign on a random scan or all scans at its orientation."""
-
-    def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-        s, scan = draw_sign(rng), str(rng.choice(setup.edge_scan_names))
-        scans = setup.scans_at_orientation_of(scan) if rng.random() < 0.5 else (scan,)
-        return lambda a: make(s * a, scans)
-
-    return draw
+def _directed(kind: Callable[[float, float], Concealed]) -> Callable[..., Concealed]:
+    """Return the maker of a vector within 60 degrees of +X or -X, whose length is the amplitude."""
+    return lambda a, sign, angle: kind(sign * a * math.cos(angle), sign * a * math.sin(angle))
 
 
-def _draw_patch_place(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Draw x (-40 to 40), y (-4 to 4) and sd (3 to 10) of a stain or glint, all in mm."""
-    return rng.uniform(-40, 40), rng.uniform(-4, 4), draw_log_uniform(rng, 3.0, 10.0)
+def _saturation(a: float, levels: tuple[float, float], softness: float) -> Concealed:
+    """Saturate at a share `a` of the span below white, sharply or rounded over one reading unit."""
+    black, white = levels
+    return concealed.Saturation(white - a * (white - black), softness)
 
 
-def _draw_albedo_patch(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, (x, y, r) = draw_sign(rng), _draw_patch_place(rng)
-    return lambda a: concealed.AlbedoPatch(s * a, x, y, r)
+def _extra_gaussian(a: float, turn: float, sd_mm: float) -> Concealed:
+    return concealed.ExtraGaussian(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
 
 
-def _draw_glint(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    x, y, r = _draw_patch_place(rng)
-    return lambda a: concealed.Glint(a, x, y, r)
-
-
-def _draw_edge_shadow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    w = draw_log_uniform(rng, 2.0, 8.0)
-    return lambda a: concealed.EdgeShadow(a, w)
-
-
-def _draw_halo(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    r_mm = draw_log_uniform(rng, 12.0, 40.0)
-    return lambda a: concealed.Halo(a, r_mm)
-
-
-def _draw_extra_gaussian(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    turn, sd_mm = rng.uniform(0, 2 * math.pi), rng.uniform(1.5, 4.0)
-    return lambda a: concealed.ExtraGaussian(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
-
-
-def _draw_outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    share = draw_log_uniform(rng, 0.01, 0.05)
-    return lambda a: concealed.Outliers(share, a)
-
-
-def _draw_dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    """Draw the value of lost readings, 0 or 100, and their share: 0.5 to 5 times the amplitude (fixed at 0.01)."""
-    value, factor = float(rng.choice([0.0, 100.0])), draw_log_uniform(rng, 0.5, 5.0)
-    return lambda a: concealed.Dropouts(factor * a, value)
+def _chirp(a: float, phase: float, cycles: float, duration_s: float) -> Concealed:
+    """Let the frequency, `cycles` per recording at first, grow eightfold by its end."""
+    first_hz = cycles / duration_s
+    return unlisted.Chirp(a, first_hz, 7 * first_hz / duration_s, phase)
 
 
 INSIDE: Mapping[str, EffectSampler] = {
-    "ambient_gradient": EffectSampler(
-        ("place",), _make_draw_with_random_direction(concealed.AmbientGradient), 0.01, 2.0
+    "ambient_gradient": EffectSampler(("place",), _directed(concealed.AmbientGradient), _DIRECTION, 0.01, 2.0),
+    "ambient_step": EffectSampler(("time",), _signed(concealed.AmbientStep), (_SIGN, _moment(0.15, 0.85)), 0.5, 30.0),
+    "offset_drift": EffectSampler(("time",), _signed(concealed.OffsetDrift), (_SIGN,), 5.0, 500.0),
+    "gain_drift": EffectSampler(
+        ("time",),
+        _signed(concealed.GainDrift),
+        (_SIGN, _log_uniform_up_to(60.0, lambda setup: setup.duration_s)),
+        0.03,
+        0.9,
     ),
-    "ambient_step": EffectSampler(("time",), _draw_ambient_step, 0.5, 30.0),
-    "offset_drift": EffectSampler(("time",), make_draw_with_random_sign(concealed.OffsetDrift), 5.0, 500.0),
-    "gain_drift": EffectSampler(("time",), _draw_gain_drift, 0.03, 0.9),
-    "battery_sag": EffectSampler(("battery_mv",), make_draw_with_random_sign(concealed.BatterySag), 0.5, 10.0),
-    "flicker": EffectSampler(("time",), _draw_flicker, 0.3, 20.0),
-    "saturation": EffectSampler(("level",), _draw_saturation, 0.05, 0.9),
+    "battery_sag": EffectSampler(("battery_mv",), _signed(concealed.BatterySag), (_SIGN,), 0.5, 10.0),
+    "flicker": EffectSampler(
+        ("time",), concealed.Flicker, (_log_uniform_up_to(0.01, lambda setup: setup.nyquist_hz), _PHASE), 0.3, 20.0
+    ),
+    "saturation": EffectSampler(
+        ("level",),
+        _saturation,
+        (lambda setup, rng: (setup.world.black, setup.world.white), _one_of(0.0, 1.0)),
+        0.05,
+        0.9,
+    ),
     "nonlinearity": EffectSampler(
-        ("level",), make_draw_with_random_sign(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5
+        ("level",), _signed(lambda a: concealed.Nonlinearity(math.exp(a))), (_SIGN,), 0.1, 1.5
     ),
-    "quantisation": EffectSampler(("lattice",), make_draw_without_random_parameters(concealed.Quantisation), 1.0, 20.0),
-    "hysteresis": EffectSampler(("direction",), make_draw_with_random_sign(concealed.Hysteresis), 0.3, 20.0),
-    "lag": EffectSampler(("slope", "direction"), make_draw_without_random_parameters(concealed.Lag), 0.5, 20.0),
-    "backlash": EffectSampler(
-        ("slope", "direction"), make_draw_without_random_parameters(concealed.Backlash), 0.5, 15.0
+    "quantisation": EffectSampler(("lattice",), concealed.Quantisation, (), 1.0, 20.0),
+    "hysteresis": EffectSampler(("direction",), _signed(concealed.Hysteresis), (_SIGN,), 0.3, 20.0),
+    "lag": EffectSampler(("slope", "direction"), concealed.Lag, (), 0.5, 20.0),
+    "backlash": EffectSampler(("slope", "direction"), concealed.Backlash, (), 0.5, 15.0),
+    "position_scale": EffectSampler(
+        ("place",),
+        lambda a, sign, ratio: concealed.PositionScale(sign * a, ratio * a),
+        (_SIGN, _uniform(-1, 1)),
+        0.02,
+        0.4,
     ),
-    "position_scale": EffectSampler(("place",), _draw_position_scale, 0.02, 0.4),
-    "periodic_position_error": EffectSampler(("place",), _draw_periodic_position_error, 0.3, 10.0),
-    "edge_misplacement": EffectSampler(("slope",), make_draw_with_random_sign(concealed.EdgeMisplacement), 0.3, 8.0),
-    "scan_misplacement": EffectSampler(("slope", "scan"), _draw_scan_misplacement, 0.3, 8.0),
+    "periodic_position_error": EffectSampler(
+        ("place",), concealed.PeriodicPositionError, (_log_uniform(4.0, 25.0), _PHASE), 0.3, 10.0
+    ),
+    "edge_misplacement": EffectSampler(("slope",), _signed(concealed.EdgeMisplacement), (_SIGN,), 0.3, 8.0),
+    "scan_misplacement": EffectSampler(
+        ("slope", "scan"), _signed(concealed.ScanMisplacement), (_SIGN, _edge_scan), 0.3, 8.0
+    ),
     "scan_angle_error": EffectSampler(
-        ("scan", "orientation"), _make_draw_with_random_scans(concealed.ScanAngleError), 5.0, 45.0
+        ("scan", "orientation"), _signed(concealed.ScanAngleError), (_SIGN, _edge_scans), 5.0, 45.0
     ),
-    "orientation_error": EffectSampler(
-        ("orientation",), make_draw_with_random_sign(concealed.OrientationError), 5.0, 45.0
+    "orientation_error": EffectSampler(("orientation",), _signed(concealed.OrientationError), (_SIGN,), 5.0, 45.0),
+    "sensor_tilt": EffectSampler(("orientation", "slope"), _directed(concealed.SensorTilt), _DIRECTION, 0.3, 8.0),
+    "height_gradient": EffectSampler(("place",), _signed(concealed.HeightGradient), (_SIGN,), 0.01, 0.12),
+    "height_offset": EffectSampler(("scan",), _signed(concealed.HeightOffset), (_SIGN, _edge_scans), 0.3, 8.0),
+    "albedo_gradient": EffectSampler(("place",), _directed(concealed.AlbedoGradient), _DIRECTION, 5e-4, 0.012),
+    "albedo_patch": EffectSampler(("place",), _signed(concealed.AlbedoPatch), (_SIGN, *_SPOT), 0.05, 1.0),
+    "edge_blur": EffectSampler(("edge_distance",), concealed.EdgeBlur, (), 1.0, 8.0),
+    "edge_shadow": EffectSampler(("edge_distance",), concealed.EdgeShadow, (_log_uniform(2.0, 8.0),), 0.02, 0.6),
+    "halo": EffectSampler(("edge_distance",), concealed.Halo, (_log_uniform(12.0, 40.0),), 0.05, 0.6),
+    "glint": EffectSampler(("place",), concealed.Glint, _SPOT, 1.0, 40.0),
+    "ssf_order": EffectSampler(("edge_distance",), _extra_gaussian, (_PHASE, _uniform(1.5, 4.0)), 0.05, 0.5),
+    "signal_dependent_noise": EffectSampler(("level",), concealed.SignalDependentNoise, (), 1.0, 100.0),
+    "correlated_noise": EffectSampler(("scan",), concealed.CorrelatedNoise, (), 0.3, 0.95),
+    "outliers": EffectSampler(
+        (), lambda a, share: concealed.Outliers(share, a), (_log_uniform(0.01, 0.05),), 5.0, 30.0
     ),
-    "sensor_tilt": EffectSampler(
-        ("orientation", "slope"), _make_draw_with_random_direction(concealed.SensorTilt), 0.3, 8.0
+    # The share of lost readings is half to five times the amplitude, which is fixed.
+    "dropouts": EffectSampler(
+        (),
+        lambda a, value, factor: concealed.Dropouts(factor * a, value),
+        (_one_of(0.0, 100.0), _log_uniform(0.5, 5.0)),
+        0.01,
+        0.01,
+        scalable=False,
     ),
-    "height_gradient": EffectSampler(("place",), make_draw_with_random_sign(concealed.HeightGradient), 0.01, 0.12),
-    "height_offset": EffectSampler(("scan",), _make_draw_with_random_scans(concealed.HeightOffset), 0.3, 8.0),
-    "albedo_gradient": EffectSampler(
-        ("place",), _make_draw_with_random_direction(concealed.AlbedoGradient), 5e-4, 0.012
-    ),
-    "albedo_patch": EffectSampler(("place",), _draw_albedo_patch, 0.05, 1.0),
-    "edge_blur": EffectSampler(("edge_distance",), make_draw_without_random_parameters(concealed.EdgeBlur), 1.0, 8.0),
-    "edge_shadow": EffectSampler(("edge_distance",), _draw_edge_shadow, 0.02, 0.6),
-    "halo": EffectSampler(("edge_distance",), _draw_halo, 0.05, 0.6),
-    "glint": EffectSampler(("place",), _draw_glint, 1.0, 40.0),
-    "ssf_order": EffectSampler(("edge_distance",), _draw_extra_gaussian, 0.05, 0.5),
-    "signal_dependent_noise": EffectSampler(
-        ("level",), make_draw_without_random_parameters(concealed.SignalDependentNoise), 1.0, 100.0
-    ),
-    "correlated_noise": EffectSampler(
-        ("scan",), make_draw_without_random_parameters(concealed.CorrelatedNoise), 0.3, 0.95
-    ),
-    "outliers": EffectSampler((), _draw_outliers, 5.0, 30.0),
-    "dropouts": EffectSampler((), _draw_dropouts, 0.01, 0.01, scalable=False),
 }
 """Samplers of the vocabulary's effects by name, in the order of the diagnosis page, section 2."""
 
@@ -277,61 +247,36 @@ SINGLES = tuple(name for name in INSIDE if name not in NEEDS_SENSOR | NO_PHYSICS
 PAIRABLE = tuple(name for name in SINGLES[: SINGLES.index("signal_dependent_noise")] if name != "quantisation")
 """Effects on the mean of the readings, for which a pair has a cosine."""
 
-
-def _draw_place_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, at_mm = draw_sign(rng), rng.uniform(-3, 3)
-    return lambda a: unlisted.PlaceStep(s * a, at_mm)
-
-
-def _draw_stick_slip(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    period_mm, phase = draw_log_uniform(rng, 3.0, 8.0), rng.random()
-    return lambda a: unlisted.StickSlip(a, period_mm, phase)
-
-
-def _draw_slipped_paper(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, at_s = draw_sign(rng), setup.start_s + rng.uniform(0.2, 0.8) * setup.duration_s
-    return lambda a: unlisted.SlippedPaper(s * a, at_s)
-
-
-def _draw_ghost(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    dx_mm, dy_mm = draw_sign(rng) * rng.uniform(8, 20), rng.uniform(-5, 5)
-    return lambda a: unlisted.Ghost(a, dx_mm, dy_mm)
-
-
-def _draw_thermal_gain(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    phases = tuple(float(phase) for phase in rng.uniform(0, 2 * math.pi, 12))
-    return lambda a: unlisted.ThermalGain(a, setup.duration_s, phases)
-
-
-def _draw_orientation_dependent_gain(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    phase = rng.uniform(0, 2 * math.pi)
-    return lambda a: unlisted.OrientationDependentGain(a, phase)
-
-
-def _draw_after_glow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    tau_s, level = draw_log_uniform(rng, 5.0, 20.0), (setup.world.black + setup.world.white) / 2
-    return lambda a: unlisted.AfterGlow(a, tau_s, level)
-
-
-def _draw_chirp(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    phase = rng.uniform(0, 2 * math.pi)
-    # By the end of the recording the frequency has grown eightfold.
-    first_hz = draw_log_uniform(rng, 2.0, 6.0) / setup.duration_s
-    rate = 7 * first_hz / setup.duration_s
-    return lambda a: unlisted.Chirp(a, first_hz, rate, phase)
-
-
 OUTSIDE: Mapping[str, EffectSampler] = {
-    "bent_rail": EffectSampler(("place",), make_draw_with_random_sign(unlisted.QuadraticPositionError), 0.5, 20.0),
-    "twisted_rail": EffectSampler(("place",), make_draw_with_random_sign(unlisted.CubicPositionError), 0.5, 20.0),
-    "place_step": EffectSampler(("place",), _draw_place_step, 0.5, 10.0),
-    "stick_slip": EffectSampler(("place",), _draw_stick_slip, 0.5, 8.0),
-    "slipped_paper": EffectSampler(("time",), _draw_slipped_paper, 0.5, 10.0),
-    "ghost": EffectSampler(("edge_distance",), _draw_ghost, 0.03, 0.5),
-    "thermal_gain": EffectSampler(("time",), _draw_thermal_gain, 0.02, 0.5),
-    "cross_talk": EffectSampler(("orientation",), _draw_orientation_dependent_gain, 0.03, 0.9),
-    "floor": EffectSampler(("level",), make_draw_without_random_parameters(unlisted.DeadZone), 0.03, 0.6),
-    "peak_memory": EffectSampler(("level",), make_draw_without_random_parameters(unlisted.PeakMemory), 0.05, 2.0),
-    "after_glow": EffectSampler(("time",), _draw_after_glow, 1.0, 40.0),
-    "chirp": EffectSampler(("time",), _draw_chirp, 0.3, 20.0),
+    "bent_rail": EffectSampler(("place",), _signed(unlisted.QuadraticPositionError), (_SIGN,), 0.5, 20.0),
+    "twisted_rail": EffectSampler(("place",), _signed(unlisted.CubicPositionError), (_SIGN,), 0.5, 20.0),
+    "place_step": EffectSampler(("place",), _signed(unlisted.PlaceStep), (_SIGN, _uniform(-3, 3)), 0.5, 10.0),
+    "stick_slip": EffectSampler(("place",), unlisted.StickSlip, (_log_uniform(3.0, 8.0), _uniform(0, 1)), 0.5, 8.0),
+    "slipped_paper": EffectSampler(("time",), _signed(unlisted.SlippedPaper), (_SIGN, _moment(0.2, 0.8)), 0.5, 10.0),
+    "ghost": EffectSampler(
+        ("edge_distance",),
+        lambda a, sign, dx_mm, dy_mm: unlisted.Ghost(a, sign * dx_mm, dy_mm),
+        (_SIGN, _uniform(8, 20), _uniform(-5, 5)),
+        0.03,
+        0.5,
+    ),
+    "thermal_gain": EffectSampler(
+        ("time",),
+        unlisted.ThermalGain,
+        (_duration_s, lambda setup, rng: tuple(float(phase) for phase in rng.uniform(0, 2 * math.pi, 12))),
+        0.02,
+        0.5,
+    ),
+    "cross_talk": EffectSampler(("orientation",), unlisted.OrientationDependentGain, (_PHASE,), 0.03, 0.9),
+    "floor": EffectSampler(("level",), unlisted.DeadZone, (), 0.03, 0.6),
+    "peak_memory": EffectSampler(("level",), unlisted.PeakMemory, (), 0.05, 2.0),
+    "after_glow": EffectSampler(
+        ("time",),
+        unlisted.AfterGlow,
+        (_log_uniform(5.0, 20.0), lambda setup, rng: (setup.world.black + setup.world.white) / 2),
+        1.0,
+        40.0,
+    ),
+    "chirp": EffectSampler(("time",), _chirp, (_PHASE, _log_uniform(2.0, 6.0), _duration_s), 0.3, 20.0),
 }
+"""Samplers of effects outside the vocabulary."""

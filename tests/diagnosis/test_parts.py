@@ -199,7 +199,7 @@ def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, 
     found = Fit(model, z, model.predict(z[None, :])[0], np.zeros(len(plan)), np.zeros((len(plan), 7)), 1.0, 0.0)
     effect = VOCABULARY[name].for_extent(EXTENT).with_fewer_variants()
     whole = templates_of_effect(found, effect, usable)
-    monkeypatch.setattr("probewise.diagnosis.templates._AT_ONCE", 5 * len(plan))
+    monkeypatch.setattr("probewise.diagnosis.templates.AT_ONCE", 5 * len(plan))
     few = templates_of_effect(found, effect, usable, most=7)
     assert (len(few.columns), len(few.choice)) == (7, 7)
     at = np.linspace(0, len(whole.columns) - 1, 7).round().astype(int)

@@ -191,8 +191,11 @@ class NatsInOneRun(ReadingsWithEffects):
 
 
 ALIAS_COSINE = 0.9
-_LAMBDA = 8.0  # size of an effect at which it is detected for certain
-_LEAST_SHARE = 0.05  # least share of its change of the readings that counts for its lambda, whatever a fit absorbs
+LAMBDA = 8.0
+"""Size of an effect at which it is detected for certain, and at which a plan is judged."""
+
+LEAST_SHARE = 0.05
+"""Least share of an effect's change of the readings that counts as its own, whatever a fit absorbs."""
 
 
 @dataclass(frozen=True)
@@ -349,6 +352,6 @@ def _collinear_amounts(problem: Linearised, readings: ReadingsWithEffects, *name
     left, _, right = np.linalg.svd(first.T @ second)
     out = []
     for name, values, own in zip(names, (of_first @ left[:, 0], of_second @ right[0]), columns, strict=True):
-        seen = max(1.0, _LEAST_SHARE * float(np.linalg.norm(own @ values)))
-        out.append(Amounts(name, values * (_LAMBDA / seen)))
+        seen = max(1.0, LEAST_SHARE * float(np.linalg.norm(own @ values)))
+        out.append(Amounts(name, values * (LAMBDA / seen)))
     return out

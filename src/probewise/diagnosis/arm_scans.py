@@ -16,6 +16,7 @@ from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_READINGS
+from probewise.diagnosis.held_out import LEAST_ROWS
 from probewise.diagnosis.joining import join_plans, last_known_value
 from probewise.effects.reference import median_gap_s, orientation_deg
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
@@ -92,7 +93,6 @@ def _scan_started_at(scan: Scan, start_s: float) -> Scan:
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))
 
 
-_LEAST_ROWS = 8
 _MOST_SCANS = 6
 _NEAR = 26  # readings of an excerpt around an edge
 _TURN_DEG = 45.0
@@ -129,9 +129,9 @@ def excerpts_of_scan(
         scan is longer.
     """
     out = []
-    for stride in [s for s in strides if len(scan[::s]) >= _LEAST_ROWS] or [1]:
+    for stride in [s for s in strides if len(scan[::s]) >= LEAST_ROWS] or [1]:
         rows = scan[::stride][:MOST_READINGS]
-        if rows.size >= _LEAST_ROWS:
+        if rows.size >= LEAST_ROWS:
             words = _WORDS.get(stride, f" (every {stride}th reading, {stride} times as fast)")
             if len(scan[::stride]) > MOST_READINGS:
                 words += f", {MOST_READINGS} readings from its start"
@@ -239,7 +239,7 @@ def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
     seen: dict[tuple[object, ...], IntArray] = {}
     turned_deg = orientation_deg(plan)
     for rows in plan.rows_by_scan():
-        if rows.size < _LEAST_ROWS or not plan.direction_of_motion[rows].any():
+        if rows.size < LEAST_ROWS or not plan.direction_of_motion[rows].any():
             continue
         places = ((round(float(plan.x_mm[r]), 3), round(float(plan.y_mm[r]), 3)) for r in (rows[0], rows[-1]))
         key = (int(plan.pattern[rows[0]]), round(float(turned_deg[rows[0]]), 2), *sorted(places))

@@ -20,6 +20,7 @@ from probewise._arrays import FloatArray, IntArray, own_arithmetic, read_only_fl
 from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
+from probewise.diagnosis.aliases import LAMBDA, LEAST_SHARE
 from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.arm_scans import Scan, candidate_scans, scan_started_after, target_swaps
 from probewise.diagnosis.diagnosis import Diagnosis
@@ -45,10 +46,8 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
 from probewise.sensor import Stage, is_free_form
 
-LAMBDA = 8.0  # size of an effect at which a plan is judged
 LEAST_NATS = 3.0  # least evidence that separates two effects
 ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which the evidence is LEAST_NATS
-LEAST_SHARE = 0.05  # least share of an effect's template that the sensor's parameters must not absorb
 _MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
 
 

@@ -20,7 +20,7 @@ from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_sa
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.verdict import Hypothesis, Judged
+from probewise.diagnosis.verdict import N_DRAWS, Hypothesis, Judged
 from probewise.diagnosis.words import p_in_words, substitute_reading_unit
 from probewise.effects import NamedEffect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
@@ -30,7 +30,6 @@ from probewise.recordings.plan import Plan
 _LEAST_PROBABILITY = 1e-3
 _IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
 _STANDS_BESIDE = 0.5  # conditional probability from which an effect counts as beside the unknown one
-_N_DRAWS = 999
 
 
 @dataclass(frozen=True)
@@ -226,11 +225,11 @@ def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, 
     prepared, after = searched.prepared, best.problem
     steps, before = n_rows_since_previous_usable(prepared.recording), previous_usable(prepared.recording)
     own = after.residual[: after.n_points, None]
-    null = after.draw_null_residuals(_N_DRAWS, rng=rng)[: after.n_points]
+    null = after.draw_null_residuals(N_DRAWS, rng=rng)[: after.n_points]
     joined = noise_statistics(np.concatenate([own, null], axis=1), steps, best.fit.found.predicted, before=before)
     center, spread = joined[:, 1:].mean(axis=1), joined[:, 1:].std(axis=1)
     worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)
-    p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + _N_DRAWS)
+    p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + N_DRAWS)
     unit = prepared.recording.plan.instrumentation.unit
     parameters = [_parameter_found("sd", unit, samples.noise_sd)]
     nuisances = []

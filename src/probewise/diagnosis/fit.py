@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.effects import NamedEffect
 from probewise.effects.priors import SharedScalePrior
 from probewise.recordings.plan import Plan, Recording
@@ -145,8 +145,12 @@ def effect_coordinates(effect: NamedEffect[Any], values: FloatArray) -> FloatArr
     return np.clip(ndtri(effect.prior.to_unit_cube(values)), -FARTHEST + 0.5, FARTHEST - 0.5)
 
 
-_STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
-_AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
+DIFFERENCE = 1e-5
+"""Step of a coordinate for forward differences: predictions are smooth to about 1e-12."""
+
+AT_ONCE = 300_000
+"""Predictions per batch, to fit a processor's cache."""
+
 _AS_EXPECTED = 0.5  # of the gain to second order, from which a step without damping is taken without trying others
 _FARTHEST_CHANGE = 1e6  # in largest predictions: beyond it squares overflow, and a law without the effect has run away
 _IMPOSSIBLE_CHANGE = 1e3  # least change, in noise sds, of a row whose reading is impossible without the effect
@@ -157,7 +161,7 @@ _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 def difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return z and points one small step along each coordinate, (n_params + 1, n_params), and the signed steps."""
     # Steps point inwards, to stay within the bounds.
-    steps = np.where(z > 0, -_STEP, _STEP)
+    steps = np.where(z > 0, -DIFFERENCE, DIFFERENCE)
     return np.concatenate([z[None, :], z + np.diag(steps)]), steps
 
 
@@ -334,7 +338,7 @@ def fit_each_start(
     walks = [_fit_coroutine(model, recording, start, law, max_steps, tolerance, hopeless_above) for start in starts]
     at_once = 1
     if model.sensor.predicts_in_bulk:
-        at_once = max(_AT_ONCE // (len(_DAMPINGS) * (model.n_params + 1) * len(recording.readings)), 1)
+        at_once = max(AT_ONCE // (len(_DAMPINGS) * (model.n_params + 1) * len(recording.readings)), 1)
     found: dict[int, Fit] = {}
     for first in range(0, len(walks), at_once):
         asked = {k: next(walks[k]) for k in range(first, min(first + at_once, len(walks)))}
@@ -471,5 +475,5 @@ def residual_degrees_of_freedom(slopes: FloatArray, sd: float, n_kept: int) -> f
     n_kept
         Number of readings that are not lost; the slopes of the others are 0.
     """
-    squares = np.linalg.svd(slopes / max(sd, 1e-150), compute_uv=False) ** 2
+    squares = np.linalg.svd(slopes / max(sd, LEAST_SCALE), compute_uv=False) ** 2
     return max(n_kept - float(np.sum(squares / (1 + squares))), 1.0)

@@ -23,7 +23,9 @@ MOST_PARTS = 10
 Parts = tuple[IntArray, tuple[str, ...]]
 """Part number of each usable reading, (n_usable,), and the names of the parts."""
 
-_BLOCKS = 5
+N_BLOCKS = 5
+"""Number of parts of readings that have no scans or runs."""
+
 _NO_SLOPE = 1e-6  # of a parameter's slope on its own readings: so little on others is rounding of predictions
 _HARDLY_TOLD = 0.5  # variance of a coordinate given the other parts, of 1 before them
 
@@ -82,7 +84,7 @@ def partition_into_blocks(recording: Recording) -> Parts:
     but it can between known readings; a block is long enough that its middle is not adjacent to known readings.
     """
     block = np.arange(int(recording.usable.sum())) // LEAST_ROWS
-    return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
+    return block % N_BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(N_BLOCKS))
 
 
 def mean_gain_over_parts(

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps
+from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.effects import HeavyTailedPrior, NamedEffect
 from probewise.effects.priors import SharedScalePrior
@@ -35,7 +35,7 @@ from probewise.sensor.stages import effects_with_columns
 
 _STRAIGHT = 0.2  # sd of a coordinate within which its value is as good as linear in it
 _SWEEPS = 10
-_STEP = 1e-6
+_STEP = 1e-6  # of a coordinate, for central differences of priors
 _ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly may fail to be positive
 
 
@@ -251,7 +251,6 @@ _REACH = 10.0  # of the grid to either side of the fit, in sds of Laplace's appr
 _WIDER = 3.0  # factor on the reach until both ends of the grid are improbable
 _IMPROBABLE = 10.0  # nats below the best node
 _N_NODES = 161
-_GRID_STEP = 1e-5  # for differences
 _BLOCK = 2_000_000  # numbers in memory for one block of nodes
 
 
@@ -336,7 +335,7 @@ class ConditionallyLinearDensity:
         own = _number_without(at, amplitude.at[0])
         x = found.z[rest]
         x[own] = amplitude.values(found.z[None, list(amplitude.at)])[0, 0]
-        moved = x + np.concatenate([np.zeros((1, len(x))), _GRID_STEP * np.eye(len(x))])
+        moved = x + np.concatenate([np.zeros((1, len(x))), DIFFERENCE * np.eye(len(x))])
         points = np.tile(_inserted(moved, at, amplitude), (len(nodes), 1, 1))
         points[:, :, at] = nodes[:, None]
         sigma = law.likeliest_sigma(law(found.residuals)[:, None])
@@ -441,7 +440,7 @@ def _quadratic_log_likelihood(
         at_x, sigmas = whitened[:, 0].T, np.broadcast_to(sigma, n)
         height = -law.minus_log_likelihood(at_x, sigmas)
         normal = law.normal_pseudo_residuals(at_x, sigmas).T
-        slopes = (whitened[:, :1] - whitened[:, 1:]) / (_GRID_STEP * sd)
+        slopes = (whitened[:, :1] - whitened[:, 1:]) / (DIFFERENCE * sd)
         curvature, gradient = slopes @ slopes.transpose(0, 2, 1), np.einsum("nij,nj->ni", slopes, normal) / sd
     height = height - gradient @ x - 0.5 * np.einsum("i,nij,j->n", x, curvature, x)
     return height, gradient + curvature @ x, curvature

@@ -137,7 +137,11 @@ def _tabulated_log_information() -> FloatArray:
 
 
 _EM_STEPS = 12
-_LEAST = 1e-150  # least scale, for readings that are exactly as predicted
+MAD_OF_NORMAL = 0.6745
+"""Median absolute deviation of a standard normal, by which a robust sd is estimated."""
+
+LEAST_SCALE = 1e-150
+"""Least sd, for readings that are exactly as predicted."""
 
 
 def order_by_scan(recording: Recording) -> IntArray:
@@ -479,17 +483,19 @@ class Tail:
         """Return the most likely sigma, (k,), by EM; `n_points` rows count, the others (lost readings) are 0."""
         if self.is_normal:
             return np.asarray(
-                np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), max(floor, _LEAST))
+                np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), max(floor, LEAST_SCALE))
             )
         squares = whitened**2
         if start is None:  # start from the interquartile range of the readings not lost, which is robust to the tail
             middle = len(whitened) - n_points // 2 - 1
-            sigma = np.maximum(np.partition(np.abs(whitened), middle, axis=0)[middle] / 0.6745, floor) + _LEAST
+            sigma = (
+                np.maximum(np.partition(np.abs(whitened), middle, axis=0)[middle] / MAD_OF_NORMAL, floor) + LEAST_SCALE
+            )
         else:
             sigma = start
         for _ in range(_EM_STEPS if start is None else 3):
             weighed = self._relative_precisions(squares / sigma**2) * squares
-            sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + _LEAST
+            sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + LEAST_SCALE
         return np.asarray(sigma)
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:

@@ -22,7 +22,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded, solveh
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_law import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +190,8 @@ def with_known_wide_readings(law: NoiseLaw, residuals: FloatArray) -> NoiseLaw:
         if k:
             sigma = math.sqrt(max(float(np.mean((weight * (residuals - smoothed) * residuals)[kept])), 0.0))
         else:  # whatever some outlying readings are
-            sigma = float(np.median(np.abs(apart / np.sqrt(beside + own))[kept])) / 0.6745
-        sigma = max(sigma, law.sigma_floor, _SMALLEST * float(np.abs(apart).max()), 1e-150)
+            sigma = float(np.median(np.abs(apart / np.sqrt(beside + own))[kept])) / MAD_OF_NORMAL
+        sigma = max(sigma, law.sigma_floor, _SMALLEST * float(np.abs(apart).max()), LEAST_SCALE)
         apart /= sigma
         log_narrow = np.log1p(-law.share) + _log_density(apart, beside + own)
         log_wide = np.log(law.share) + _log_density(apart, beside + own * law.times**2)

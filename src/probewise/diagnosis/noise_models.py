@@ -11,6 +11,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise_law import (
+    MAD_OF_NORMAL,
     NoiseLaw,
     RoundedNormal,
     n_rows_since_previous_usable,
@@ -130,7 +131,7 @@ class NoiseModel:
         residuals = (self._usable_readings - predicted) / self.recording.relative_sd[self.recording.usable]
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
         free = residuals[~self._censored] if self._censored.any() else residuals
-        sd = max(float(np.median(np.abs(free))) / 0.6745, self._rounding_step / math.sqrt(12))
+        sd = max(float(np.median(np.abs(free))) / MAD_OF_NORMAL, self._rounding_step / math.sqrt(12))
         return residuals, sd or 1.0
 
     def _noise_parameters_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
@@ -293,4 +294,4 @@ def rough_sd(recording: Recording) -> float:
         bends = np.round(bends / step) * step
         first, last = np.searchsorted(bends, bends, "left"), np.searchsorted(bends, bends, "right")
         bends = bends + step * ((np.arange(len(bends)) - first + 0.5) / (last - first) - 0.5)
-    return float(np.median(np.abs(bends))) / (0.6745 * math.sqrt(6)) if inner.size else 0.0
+    return float(np.median(np.abs(bends))) / (MAD_OF_NORMAL * math.sqrt(6)) if inner.size else 0.0

@@ -18,7 +18,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
-from probewise.diagnosis.noise_law import NoiseLaw, Tail, white_noise_of_recording
+from probewise.diagnosis.noise_law import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw, Tail, white_noise_of_recording
 from probewise.diagnosis.templates import log_mean_exp
 from probewise.effects.noise import LARGEST_SIZE, MOST_OUTLYING, Dropouts
 from probewise.inference import sd_floor
@@ -114,7 +114,7 @@ def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float = _BY_CHANCE) ->
     out, kept = list[int](), law.kept > 0
     with np.errstate(all="ignore"):
         for _ in range(int(MOST_OUTLYING * kept.sum())):
-            basis, singular, _ = np.linalg.svd(slopes[kept] / max(found.sd, 1e-150), full_matrices=False)
+            basis, singular, _ = np.linalg.svd(slopes[kept] / max(found.sd, LEAST_SCALE), full_matrices=False)
             own = basis * np.sqrt(singular**2 / (1 + singular**2))
             left = residual[kept] - basis @ (basis.T @ residual[kept])
             free = int(kept.sum()) - slopes.shape[1] - 1
@@ -155,7 +155,9 @@ def find_lost_readings(
     """
     law, usable = white_noise_of_recording(recording), np.flatnonzero(recording.usable)
     n_most, size = int(MOST_OUTLYING * len(usable)), np.abs(law(first.residuals))
-    may_be_bent = float(np.sqrt(np.mean(size**2))) > _BENT * sd or size.max() > LARGEST_SIZE * np.median(size) / 0.6745
+    may_be_bent = (
+        float(np.sqrt(np.mean(size**2))) > _BENT * sd or size.max() > LARGEST_SIZE * np.median(size) / MAD_OF_NORMAL
+    )
     if not may_be_bent and not improbable_rows(first, law).size:
         return None
     found = _least_trimmed_fit(model, recording, [first.z, *starts], law, n_most)
@@ -169,7 +171,7 @@ def find_lost_readings(
     kept = recording.with_readings(
         np.where(np.isin(np.arange(len(recording)), usable[~aside]), recording.readings, np.nan)
     )
-    sd = max(float(min(spread)) / 0.6745, sd_floor(kept))
+    sd = max(float(min(spread)) / MAD_OF_NORMAL, sd_floor(kept))
     slopes = known(found.slopes) / sd
     told = np.linalg.solve(slopes.T @ slopes + np.eye(slopes.shape[1]), (found.slopes / law.sd[:, None] / sd).T)
     unknown = np.sqrt(1 + np.einsum("ij,ji->i", found.slopes / law.sd[:, None] / sd, told))

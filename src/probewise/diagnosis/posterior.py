@@ -24,7 +24,7 @@ from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit
 from probewise.diagnosis.hypothesis_problem import HypothesisProblem, log_likelihood_marginal_over_sigma
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.profiled import ProfiledDensity
 from probewise.errors import NotConvergedError
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
@@ -248,7 +248,7 @@ def surrogate_log_density(
     heavy-tailed noise, residuals are replaced by pseudo-residuals. Minus infinity beyond six prior sds.
     """
     residual = law(readings - quadratic.center)[:, None]
-    residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
+    residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), LEAST_SCALE))
     # In orthonormal axes of the space that residual and changes span, or of all readings if these are fewer.
     _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
     normal = law.without_tail_or_rounding()
@@ -330,14 +330,14 @@ class _Laplace:
         law = noise.likeliest_law
         whitened, turned = law(found.residuals)[:, None], law(found.slopes)
         sigma = law.likeliest_sigma(whitened)
-        sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), 1e-150)
+        sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), LEAST_SCALE)
         curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
         # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps
         # leave the SSF's geometry unchanged, which speeds up vectorised predictions.
         order = np.roll(np.arange(len(found.z)), -found.model.sensor.n_params)
         at, steps = np.ix_(order, order), np.empty_like(curvature)
         steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
-        normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, 1e-150))[:, 0]
+        normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, LEAST_SCALE))[:, 0]
         return cls(found, recording, law, sd, turned / sd, normal / sd, steps)
 
     @cached_property

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.fit import FARTHEST, Fit
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit
+from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.nested.weights import n_effective, resampled_rows
 from probewise.recordings.plan import Recording
 
@@ -25,7 +25,6 @@ _NODES = np.arange(-8.0, 8.5)  # of a slice, in sds of the Laplace approximation
 _STEPS = 3  # of the fit in each slice, in each of these rounds
 _ROUNDS = 2
 _FAR = 30.0  # nats below the best slice: no further ones
-_STEP = 1e-5  # of a coordinate, for differences
 _FREEDOM = 6  # of a Student-t within each slice: no weight is large in its tails
 _N_CELLS = 400
 _INDEPENDENT = 0.25  # least effective sample size, as a share of the samples wanted
@@ -62,7 +61,7 @@ class ProfiledDensity:
         None if there is no such coordinate, or none whose slices can be fitted.
         """
         slopes = law(found.slopes)
-        sd = max(law.likeliest_sigma_of(found.residuals), 1e-150) / np.sqrt(law.fisher_information)
+        sd = max(law.likeliest_sigma_of(found.residuals), LEAST_SCALE) / np.sqrt(law.fisher_information)
         covariance = np.linalg.inv(slopes.T @ slopes / sd**2 + np.eye(len(found.z)))
         tried = [
             cls._of_coordinate(found, law, recording, at, covariance, float(sd)) for at in _nonlinear_coordinates(found)
@@ -91,14 +90,14 @@ class ProfiledDensity:
 
             The slopes are those by the other n_params - 1 coordinates; the last row is the residuals.
             """
-            near = z[:, None, :] + _STEP * np.concatenate([np.zeros((1, len(rest))) @ eye[rest], eye[rest]])
+            near = z[:, None, :] + DIFFERENCE * np.concatenate([np.zeros((1, len(rest))) @ eye[rest], eye[rest]])
             predicted = found.model.predict(near.reshape(-1, z.shape[1]))[:, usable]
             with np.errstate(all="ignore"):  # of predictions that ran away: impossible below
                 whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
                 sigma = law.likeliest_sigma(whitened[:, 0].T)
                 height = -law.minus_log_likelihood(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
                 normal = law.normal_pseudo_residuals(whitened[:, 0].T, sigma).T
-                joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
+                joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / DIFFERENCE, normal[:, None]], axis=1)
             possible = np.isfinite(height) & np.isfinite(joined).all(axis=(1, 2))
             return np.where(possible, height, -np.inf), np.where(possible[:, None, None], joined, 0.0)
 

@@ -10,7 +10,8 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, own_arithmetic
-from probewise.diagnosis.audit import LAMBDA, EffectAudit, ExpectedSensor, PlanAudit, PlanTemplates, audits_and_cosines
+from probewise.diagnosis.aliases import LAMBDA
+from probewise.diagnosis.audit import EffectAudit, ExpectedSensor, PlanAudit, PlanTemplates, audits_and_cosines
 from probewise.diagnosis.simulator_rows import ON_NOISE, SimulatorApparatus
 from probewise.effects import NUISANCES, NamedEffect, name_of_first_copy
 from probewise.effects.noise import NoisePerRun

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Words
 from probewise.diagnosis.fit import Fit, Model, Null
-from probewise.diagnosis.held_out import LEAST_ROWS, Parts
+from probewise.diagnosis.held_out import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.words import join_names
@@ -252,7 +252,6 @@ CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some
 # table as of a short one.
 _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
-_N_BLOCKS = 5
 _MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
 # Prior odds of one, two, three effects on the mean, and of white noise beside them. A second effect is as likely as a
@@ -440,8 +439,8 @@ class SimulatorApparatus(Apparatus):
         if np.sum(np.bincount(run) >= LEAST_ROWS) > 1:
             return run, table.scan_names
         n = int(usable.sum())
-        part = np.minimum(np.arange(n) * _N_BLOCKS // max(n, 1), _N_BLOCKS - 1)
-        return part, tuple(f"part {k + 1} of {_N_BLOCKS}" for k in range(_N_BLOCKS))
+        part = np.minimum(np.arange(n) * N_BLOCKS // max(n, 1), N_BLOCKS - 1)
+        return part, tuple(f"part {k + 1} of {N_BLOCKS}" for k in range(N_BLOCKS))
 
     def coordinates_of_new_run(self, model: Model) -> IntArray:
         """Return the indices of the parameters per run, and of the effects' values per run, (n_coordinates,)."""

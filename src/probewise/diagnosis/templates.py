@@ -25,7 +25,7 @@ from probewise.diagnosis.evidence import (
     block_log_bayes_factors,
     scale_and_project,
 )
-from probewise.diagnosis.fit import Fit, effect_values
+from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.prior_odds import Names
 from probewise.effects import NamedEffect
@@ -178,7 +178,6 @@ _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and
 _ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none if it is insignificant,
 _LAST_DIGITS = 1e-12  # or, whatever the noise, no larger than rounding of predictions that are smooth to this share
 _INSIGNIFICANT = 0.01  # noise sds; readings by the epoch vary by less than `_ROUNDING`
-_AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +281,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
     change = np.zeros((n_rows, len(usable)))  # of all rows of a long plan it may be gigabytes
-    step = max(_AT_ONCE // len(there), 1)
+    step = max(AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):
         rows = slice(first, min(first + step, n_rows))
         n = rows.stop - first

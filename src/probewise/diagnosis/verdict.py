@@ -10,6 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.aliases import Alias, aliases_with_separating_plans
+from probewise.diagnosis.apparatus import SETTLED
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.prior_odds import Names
@@ -123,8 +124,6 @@ def probabilities_beside(shared: Names, probabilities: Mapping[Names, float]) ->
 
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
-
-_CREDIBLE = 0.95
 
 
 @dataclass(frozen=True)
@@ -433,7 +432,7 @@ def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
         out.append(hypothesis.label)
         held += hypothesis.probability
-        if held >= _CREDIBLE:
+        if held >= SETTLED:
             break
     return tuple(out)
 

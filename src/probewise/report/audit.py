@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 
 from probewise._words import count_with_noun
 from probewise.diagnosis import PlanAudit
-from probewise.diagnosis.audit import ALIAS, LAMBDA, LEAST_NATS
+from probewise.diagnosis.aliases import LAMBDA
+from probewise.diagnosis.audit import ALIAS, LEAST_NATS
 from probewise.effects import spoken_name
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table

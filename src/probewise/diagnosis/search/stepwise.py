@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model, Null, fit_each_start
-from probewise.diagnosis.noise_law import NoiseLaw, white_noise_of_recording
+from probewise.diagnosis.noise_law import MAD_OF_NORMAL, NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.constants import (
@@ -367,7 +367,7 @@ def noise_sd_about_given_null(prepared: Prepared) -> float:
     with np.errstate(all="ignore"):  # of a start from which the model runs away
         residuals = np.abs(readings - model.predict(z[None, :])[0, rows])
     relative_sd = recording.relative_sd[rows]
-    median = float(np.median(residuals[relative_sd <= np.quantile(relative_sd, _MOST_EXACT)])) / 0.6745
+    median = float(np.median(residuals[relative_sd <= np.quantile(relative_sd, _MOST_EXACT)])) / MAD_OF_NORMAL
     free = max(len(rows) - model.n_params, 1)
     # Readings that are all as predicted still have the sd of rounding.
     return max(median, step / math.sqrt(12)) * math.sqrt(len(rows) / free) if math.isfinite(median) else math.inf

@@ -1,4 +1,6 @@
-"""Probabilities from hand-made evidences."""
+"""The result of a search: what counts under which name."""
+
+from __future__ import annotations
 
 import math
 from dataclasses import replace
@@ -96,3 +98,141 @@ def test_too_few_readings_leave_no_second_copy_of_an_effect_alone():
     by_mean = searched.posterior.marginal_over_noise
     assert set(by_mean) == {(), ("unknown",), ("lag",), ("wave",)}
     assert sum(by_mean.values()) == pytest.approx(1.0)
+
+
+def _fit(**log_z):
+    """Fit under noise models, by name; white is the plain one."""
+    evidence = {
+        () if noise == "white" else tuple(noise.split("__")): SimpleNamespace(log_z=z) for noise, z in log_z.items()
+    }
+    return SimpleNamespace(evidence=evidence, log_z=max(log_z.values()))
+
+
+def _evidences(unknown, *, mean=None, formula=-50.0, **null):
+    fits = {(0, ()): _fit(white=-413.0, **null)}
+    fits |= {(0, names): _fit(white=z) for names, z in (mean or {}).items()}
+    fits[0, ("formula:reading:y:t^2",)] = _fit(white=-413.0 + formula)
+    return Evidences(fits, unknown={(0, (), ()): unknown})
+
+
+@pytest.mark.parametrize(
+    ("evidences", "expected"),
+    [
+        (_evidences(-398.0, correlated_noise=-397.0), True),
+        (_evidences(-396.0, correlated_noise=-397.0), False),
+        (_evidences(-398.0, mean={("lag",): -390.0}), True),
+        (_evidences(-398.0, mean={("lag", "offset_drift"): -390.0}), False),
+        (_evidences(-398.0, correlated_noise__outliers=-390.0), False),
+        (_evidences(-398.0, drifting_noise=-390.0), False),
+        (_evidences(-398.0, correlated_noise=-397.0, formula=20.0), False),
+    ],
+    ids=["noise", "unknown", "mean", "pair", "two faults", "no name of a noise", "formula"],
+)
+def test_a_single_name_explains_more_than_what_has_none_or_does_not(evidences, expected):
+    assert evidences.one_name_outweighs_unnamed() is expected
+
+
+FORMULA = "formula:reading:temp_c:a while |(t / period + phase) mod 1| < share / 2"
+
+
+def of(log_z):
+    """Evidences of fits by their names, of which nothing has 0."""
+    return Evidences({(0, names): SimpleNamespace(log_z=value) for names, value in {(): 0.0, **log_z}.items()})
+
+
+@pytest.mark.parametrize(
+    ("wave", "known"),
+    [(91.0, ("interference",)), (89.0, ("unknown",))],
+    ids=["nine tenths of its gain", "less than nine tenths"],
+)
+def test_a_formula_counts_as_the_one_effect_that_explains_nearly_as_much(wave, known):
+    evidences = of({("interference",): wave, ("offset_drift",): 3.0, (FORMULA,): 100.0})
+    shares = evidences.reported_shares((FORMULA,))
+    assert max(shares, key=shares.get) == known
+    assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_two_names_together_stand_in_for_a_formula_that_the_readings_cannot_tell_from_them():
+    """Exact twins, drag and a square law of a state that keeps its sign, share its probability: neither leads."""
+    drag, square, third = (tuple(sorted(("depends", name))) for name in ("drag", "quadratic", "settling"))
+    evidences = of({("depends",): 55.0, drag: 98.0, square: 98.0, third: 96.0, (FORMULA,): 100.0})
+    shares = evidences.reported_shares((FORMULA,))
+    assert shares == {drag: pytest.approx(0.5), square: pytest.approx(0.5)}
+    assert of({drag: 96.0, (FORMULA,): 100.0}).reported_shares((FORMULA,)) == {("unknown",): 1.0}
+
+
+@pytest.mark.parametrize(("named", "known"), [(51.0, ("offset_drift",)), (49.0, ("unknown",))])
+def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named, known):
+    evidences = of({("offset_drift",): named, (FORMULA, "offset_drift"): 100.0})
+    assert evidences.reported_shares((FORMULA, "offset_drift")) == {known: 1.0}
+
+
+def test_names_stay_and_the_unknown_stays():
+    evidences = of({("interference",): 5.0})
+    assert evidences.reported_shares(("interference",)) == {("interference",): 1.0}
+    assert evidences.reported_shares(("unknown",)) == {("unknown",): 1.0}
+    assert evidences.reported_shares(()) == {(): 1.0}
+
+
+def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formulas_alone():
+    def fit(log_z, *names):
+        evidence = {("outliers",): SimpleNamespace(log_z=log_z)}
+        return SimpleNamespace(names=names, n_gaussians=0, evidence=evidence)
+
+    square = "formula:reading:temp_c:t^2"
+    alone, more, best = fit(5.0, "lag"), fit(7.0, square, "lag"), fit(8.0, FORMULA, "lag")
+    others = fit(20.0, "lag", "settling"), fit(30.0, FORMULA), fit(40.0, FORMULA, "lag", "settling")
+    evidences = Evidences({(0, tuple(sorted(each.names))): each for each in (alone, more, best, *others)})
+    assert evidences.best_formula_beside(alone, ("outliers",)) is best
+    assert evidences.best_formula_beside(others[2], ("outliers",)) is None
+
+
+@pytest.mark.parametrize(
+    ("named", "stays"),
+    [(16.0, True), (14.0, False)],
+    ids=["over half of all that is explained", "less than half"],
+)
+def test_a_name_stays_if_it_explains_more_than_all_that_has_no_name(named, stays):
+    """A gradient of 14 nats, a reflection that adds 10 and an unknown effect that adds 6: 14 of 30 have a name."""
+    white: tuple[str, ...] = ()
+    of_names = {(): 0.0, ("albedo_gradient",): named, ("albedo_gradient", "reflection"): 24.0}
+    fits = {(2, names): SimpleNamespace(evidence={white: SimpleNamespace(log_z=z)}) for names, z in of_names.items()}
+    evidences = Evidences(fits, unknown={(2, ("albedo_gradient", "reflection"), white): 30.0})
+    assert evidences.named_outweigh_unknown(2, ("albedo_gradient", "reflection"), white) is stays
+
+
+def test_a_name_stands_beside_what_is_unknown_in_its_share_of_the_evidence():
+    """Two hypotheses, nothing named and `lag`, whose evidence and prior odds make them as one to three."""
+    prior = PriorOdds()
+    more = math.log(3.0) + prior.log_prior_with_unknown(()) - prior.log_prior_with_unknown(("lag",))
+    unknown = {(0, (), ()): 10.0, (0, ("lag",), ()): 10.0 + more}
+    searched = SimpleNamespace(evidences=Evidences({}, unknown=unknown), prior=prior, certain=())
+    assert Searched.effect_probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
+
+
+def test_each_order_of_the_ssf_counts_with_its_own_evidence():
+    """A second order 20 nats behind, in which `lag` alone is likely, changes nothing."""
+    prior = PriorOdds()
+    more = math.log(3.0) + prior.log_prior_with_unknown(()) - prior.log_prior_with_unknown(("lag",))
+    unknown = {(1, (), ()): 10.0, (1, ("lag",), ()): 10.0 + more, (2, (), ()): -40.0, (2, ("lag",), ()): -10.0}
+    searched = SimpleNamespace(evidences=Evidences({}, unknown=unknown), prior=prior, certain=())
+    assert Searched.effect_probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
+
+
+def test_nothing_stands_beside_what_was_not_weighed():
+    searched = SimpleNamespace(evidences=Evidences({}), prior=PriorOdds(), certain=())
+    assert Searched.effect_probabilities_given_unknown(searched) == {}
+
+
+def test_what_is_unknown_has_a_noise_too():
+    """Of the unknown half, four parts in five have outliers; those of the named half do not count."""
+    probabilities = {
+        (("unknown",), ("outliers",)): 0.3,
+        (("unknown",), ()): 0.1,
+        (("arm_knock",), ("correlated_noise", "outliers")): 0.1,
+        (("lag",), ("correlated_noise",)): 0.5,
+    }
+    fits = {(0, ()): SimpleNamespace(log_z=0.0), (0, ("arm_knock",)): SimpleNamespace(log_z=9.0)}
+    searched = SimpleNamespace(evidences=Evidences(fits), posterior=SimpleNamespace(probabilities=probabilities))
+    beside = Searched.noise_probabilities_given_unknown(searched)
+    assert beside == pytest.approx({"outliers": 0.8, "correlated_noise": 0.2})

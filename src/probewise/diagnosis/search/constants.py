@@ -19,11 +19,11 @@ STEERING = 3.0
 
 # Forward selection.
 
-# Nats behind the best so far: about a fit that one effect has bent screening is so far off. It was `STEERING` before,
-# and singles that screening did not favour were lost; no figure was kept.
+# Nats behind the best so far: about a fit that one effect has bent screening is so far off, and within `STEERING` alone
+# singles that screening did not favour were lost.
 REFITTED_WITHIN = 6.0
 BEAM = 8  # combinations that are refitted at each size above one
-SINGLES = 6  # effects that are refitted alone; the width of the beam, three, before: no figure was kept
+SINGLES = 6  # effects that are refitted alone; a bound on cost
 # Effects that lead under plain noise, refitted about the null as it is fitted then, where noise with memory leads. Two
 # tanks of which one overflows: about the fit beside a walk the overflow lacked 68 nats, about the plain fit it led.
 LEADING_PLAINLY = 3
@@ -42,7 +42,7 @@ HOPELESS = 40.0
 FAR_FROM_NULL = 100.0
 REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
 # Effects that pairs are screened of, the best alone. A difference of two columns may explain what neither does. Of the
-# best twelve, as before, it was found in none of 6 recordings with seven other columns; of the best sixty in all.
+# best twelve it was found in none of 6 recordings with seven other columns; of the best sixty in all.
 PAIRED = 60
 MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
 # Share of a template that a null leaves, below which a large effect may show in another way than to first order. The

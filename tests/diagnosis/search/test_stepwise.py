@@ -1,0 +1,192 @@
+"""Stepwise selection of effects, and pruning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from probewise.calibration import read_sensor, write_sensor
+from probewise.diagnosis import Diagnosis, diagnose
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.search.search import UnknownEffects, prune_out_of_vocabulary, search
+from probewise.diagnosis.sensors import sensor_from_samples
+from probewise.experiment import experiment_for
+from probewise.proof.null_refit import NullRefit
+from probewise.proof.sensors.cases import Case, draw_case
+from probewise.scene import Circle, Field
+from probewise.systems import Noise, Simulator, table_for
+
+
+def diagnosed(number: int) -> tuple[Case, Diagnosis]:
+    case = draw_case(20270101, number, norm_after_refit=NullRefit())
+    return case, diagnose(case.recording, rng=np.random.default_rng(number))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "number",
+    [
+        # Beside a ceiling a step of the light looked better than a drift by three nats, and is worse by eight.
+        1630,
+        # Something unknown led beside an SSF of free form, at which no name had been tried.
+        1656,
+        # Which scan hangs higher was chosen while that stood for a drift too.
+        pytest.param(344, marks=pytest.mark.slow),
+        # A third off in scale looks like nothing to first order, so that a turned mounting stood for both.
+        pytest.param(3104, marks=pytest.mark.slow),
+    ],
+)
+def test_the_right_name_gets_a_fair_fit(number):
+    case, found = diagnosed(number)
+    assert found.verdict == "named"
+    assert found.combination == case.truth.combination
+
+
+@pytest.mark.slow
+def test_a_prediction_leaves_open_what_a_clean_verdict_does(tmp_path):
+    """A scale of position that was missed, at one in ten, is in the model; a new pattern may lie where it matters."""
+    case, found = diagnosed(2670)
+    assert found.verdict == "clean"
+    share = 1 - found.repaired.absent["position_scale"].mean()
+    assert 0.02 < share < 0.5
+    assert not np.any(found.repaired.effect_samples("position_scale")[found.repaired.absent["position_scale"]])
+
+    sensor = found.repaired.fitted_sensor(case.recording, rng=np.random.default_rng(1))
+    write_sensor(sensor, tmp_path / "sensor.json")
+    read = read_sensor(tmp_path / "sensor.json")
+    np.testing.assert_array_equal(read.absent["position_scale"], found.repaired.absent["position_scale"])
+    assert f"position_scale in {share:.0%} of them" in read.summary()
+
+    # Whoever needs one sensor takes the most probable, and not a mean that is true of neither.
+    plain, leading = found.null.fitted_sensor(case.recording, rng=np.random.default_rng(1)), read.with_leading_effects()
+    assert leading.effects == ()
+    assert leading.names == plain.names
+    assert leading.mean()["I_max"] == pytest.approx(plain.mean()["I_max"], abs=0.5 * plain.sd()["I_max"])
+    posed = experiment_for(read, Circle(), Field())
+    assert not posed.model.effects
+    known, of_plain = sensor_from_samples(read), sensor_from_samples(plain)
+    sds = [np.sqrt(np.diag(s.factor @ s.factor.T)) for s in (known, of_plain)]
+    assert np.all(sds[0] < 1.5 * sds[1])
+
+
+N_ROWS = 160
+SD = 0.01
+LINE = Simulator(
+    reading="y",
+    unit="V",
+    parameters={"offset": (-5, 10), "gain": (0, 1)},
+    simulate=lambda p, u: p["offset"] + p["gain"] * u["x"],
+    time="t_s",
+    noise=Noise(sd=SD),
+)
+
+
+def _readings_and_columns(rng, *, slow, amplitude):
+    """A heat flux: the reading grows with the difference of two temperatures, which rise and fall together."""
+    common = np.cumsum(rng.normal(0, 0.2, N_ROWS))
+    own = np.cumsum(rng.normal(0, 0.1, N_ROWS)) if slow else rng.normal(0, 0.1, N_ROWS)
+    room, wall, x = 20 + common, 18 + common + own, rng.normal(size=N_ROWS)
+    y = 3 + 0.2 * x + amplitude * (wall - room) + SD * rng.normal(size=N_ROWS)
+    return {"t_s": np.arange(float(N_ROWS)), "x": x, "room_c": room, "wall_c": wall, "y": y}, own
+
+
+def _probability_of_both_columns(columns):
+    found = search(prepare_system(LINE, table_for(LINE, columns)))
+    both = {"room_c", "wall_c"}
+    return sum(
+        p for names, p in found.posterior.marginal_over_noise.items() if both == {n.split(":")[-1] for n in names}
+    )
+
+
+def test_a_difference_of_two_columns_is_found_where_neither_column_explains_anything():
+    columns, _ = _readings_and_columns(np.random.default_rng(1), slow=False, amplitude=0.1)
+    assert _probability_of_both_columns(columns) > 0.9
+
+
+@pytest.mark.slow
+def test_it_is_found_where_a_walk_of_the_noise_hides_it_and_seven_other_columns_explain_more_alone():
+    rng = np.random.default_rng(4)
+    columns, own = _readings_and_columns(rng, slow=True, amplitude=0.05)
+    others = {f"column_{k}": own + np.cumsum(rng.normal(0, 0.12, N_ROWS)) for k in range(7)}
+    assert _probability_of_both_columns(columns | others) > 0.9
+
+
+N = 50
+NAME, PUSH = ("sensor_tilt",), ("arm_knock",)
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """As much of a candidate as is asked here: its names, its log evidence, what it leaves of every reading."""
+
+    names: tuple[str, ...]
+    log_z: float
+    left: float = 0.0
+    log_share: float = 0.0
+    n_gaussians: int = 1
+    weights: dict = field(default_factory=dict)
+    law = white_noise(N)
+
+    @property
+    def evidence(self):
+        return {(): SimpleNamespace(log_z=self.log_z)}
+
+    @property
+    def log_z_by_noise(self):
+        return {(): self.log_z}
+
+    whitened_sd = 1.0
+
+    @property
+    def found(self):
+        return SimpleNamespace(residuals=np.full(N, self.left))
+
+    def with_variant_factor_and_weights(self, log_share, _):
+        return replace(self, log_z=self.log_z + log_share - self.log_share, log_share=log_share)
+
+
+NOISES = SimpleNamespace(average_log_evidence=lambda log_z: log_z.get((), -np.inf))
+
+
+def by_key(*candidates):
+    return {(c.n_gaussians, c.names): c for c in candidates}
+
+
+@pytest.mark.parametrize(("ahead", "believed"), [(-1.0, -1.0), (2.0, 0.0), (4.0, 4.0)])
+def test_what_is_ahead_of_a_name_by_less_than_the_readings_tell_is_believed_no_more(ahead, believed):
+    stay, pruned = prune_out_of_vocabulary(
+        by_key(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0)), NOISES
+    )
+    assert stay[1, PUSH].log_z == pytest.approx(believed)
+    assert stay[1, NAME].log_z == 0.0
+    assert pruned == set()
+
+
+def test_what_predicts_the_same_as_a_name_is_left_out():
+    """Half of the squared distance is 50 * 0.3^2 / 2, less than three nats."""
+    stay, pruned = prune_out_of_vocabulary(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
+    assert pruned == {PUSH}
+    assert (1, PUSH) not in stay
+
+
+def test_two_names_do_not_speak_for_one_effect_without():
+    stay, _ = prune_out_of_vocabulary(
+        by_key(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1)), NOISES
+    )
+    assert stay[1, PUSH].log_z == 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "beside", "speaks"),
+    [(-1.0, 0.0, True), (-1.0, 2.5, False), (-4.0, -4.0, False)],
+    ids=["as much, and nothing left", "something left", "far behind"],
+)
+def test_a_name_speaks_for_bases_that_explain_no_more_and_find_nothing_beside_it(name, beside, speaks):
+    unknown = UnknownEffects(None, None, (), NOISES, lambda worth: 0.0, {(1, (), ()): 0.0, (1, NAME, ()): beside})
+    unknown.drop_superfluous([Held((), -50.0), Held(NAME, name)])
+    assert ((1, (), ()) not in unknown.log_z) == speaks
+    assert (1, NAME, ()) in unknown.log_z

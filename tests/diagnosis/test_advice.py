@@ -1,0 +1,467 @@
+"""The next readings."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from heater import ABOUT, TABLE
+from mixtures import fixed_mixture
+from scipy.stats import multivariate_normal
+
+from probewise.diagnosis import TO_SEPARATE, diagnose_system
+from probewise.diagnosis.advice import (
+    PredictiveNormal,
+    Rival,
+    choose_next_measurement,
+    is_settled,
+    measurement_separating_rivals,
+    mutual_information_lower_bound,
+    slopes_split_by_run,
+)
+from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, rows_by_command
+from probewise.diagnosis.arm_scans import (
+    candidate_scans,
+    excerpts_of_scan,
+    plan_of_alternatives,
+    plan_of_sequence,
+    scan_started_after,
+    target_swaps,
+)
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.locate import Place
+from probewise.diagnosis.sensors import default_sensor
+from probewise.diagnosis.simulator_rows import SimulatorApparatus
+from probewise.effects import VOCABULARY, Extent
+from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, write_plan
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FixedLevels
+from probewise.systems import Noise, RunTable, Simulator
+from probewise.systems.forms import bind_forms
+
+SPOT = fixed_mixture(np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0]))  # a Gaussian of sd 5 mm
+
+
+def predictives(seed: int, apart: float) -> list[PredictiveNormal]:
+    rng = np.random.default_rng(seed)
+    return [PredictiveNormal(apart * rng.standard_normal(4), 0.7 * rng.standard_normal((4, 2))) for _ in range(3)]
+
+
+def by_sampling(of: list[PredictiveNormal], weights: np.ndarray, n: int = 40_000) -> float:
+    """The mutual information itself: the mean log ratio of the true density to the mixture's."""
+    rng = np.random.default_rng(3)
+    laws = [multivariate_normal(o.mean, np.eye(4) + o.factor @ o.factor.T) for o in of]
+    total = 0.0
+    for law, weight in zip(laws, weights, strict=True):
+        y = law.rvs(n, random_state=rng)
+        densities = np.stack([w * other.pdf(y) for other, w in zip(laws, weights, strict=True)])
+        total += weight * float(np.mean(law.logpdf(y) - np.log(densities.sum(axis=0))))
+    return total
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.5, 1.5, 3.0, 8.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
+    weights = np.array([0.5, 0.3, 0.2])
+    bound, true = (f(predictives(seed, apart), weights) for f in (mutual_information_lower_bound, by_sampling))
+    entropy = float(-np.sum(weights * np.log(weights)))
+    assert 0.4 * true - 0.02 < bound < true + 0.02
+    assert bound <= entropy + 1e-12
+    if apart == 8.0:
+        assert bound == pytest.approx(entropy, abs=0.02)
+
+
+def test_the_same_predictions_tell_nothing():
+    one = predictives(0, 1.0)[0]
+    assert mutual_information_lower_bound([one, one, one], np.full(3, 1 / 3)) == pytest.approx(0.0, abs=1e-12)
+
+
+def rival(name: str, probability: float, settings: list[float], plan: Plan) -> Rival:
+    extent = Extent(10.0, 60.0, plan)
+    sensor = default_sensor(extent, 1)
+    effect = VOCABULARY[name].for_extent(extent)
+    model = Model(sensor, (effect,), plan)
+    z = np.concatenate([np.zeros(sensor.n_params), model.z_of_last_effect(np.array([settings]))[0]])
+    return Rival(name.replace("_", " "), model, z, 0.01 * np.eye(len(z)), probability)
+
+
+@pytest.mark.parametrize(
+    "rivals",
+    [
+        {"edge_misplacement": [0.4], "sensor_tilt": [-0.4, 0.0]},
+        {"edge_misplacement": [0.4], "sensor_tilt": [-0.4, 0.0], "backlash": [-0.8]},
+        {"height_gradient": [0.01], "albedo_gradient": [-0.0014, 0.0]},
+    ],
+)
+def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
+    plan = paper_plan()
+    asked = measurement_separating_rivals(
+        [rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan, LightSensorApparatus()
+    )
+    assert asked is not None
+    assert len(asked.plan) <= MOST_READINGS
+    assert {asked.plan.pattern_names[k] for k in asked.plan.pattern} - plan.patterns.keys()
+    assert asked.expected_log_bayes_factor > 3
+    assert asked.between == tuple(name.replace("_", " ") for name in rivals)
+    assert len(set(asked.plan.scan_names)) == len(asked.plan.scan_names)
+    assert (np.diff(asked.plan.time_s) > 0).all()
+    assert asked.plan.time_s[0] > plan.time_s[-1]
+    # What is asked for can be written, read by whoever carries it out, and predicted.
+    write_plan(asked.plan, tmp_path / "next_plan.csv")
+    read = read_plan(tmp_path / "next_plan.csv")
+    assert read.patterns == {name: asked.plan.patterns[name] for name in read.patterns}
+    np.testing.assert_allclose(read.x_mm, asked.plan.x_mm, atol=1e-9)
+
+
+def test_readings_separate_hypotheses_into_classes():
+    """Of three, two predict the same: these are in one class, and what is promised is to tell it from the third."""
+    plan = paper_plan()
+    lag, play = rival("lag", 0.4, [0.5], plan), rival("backlash", 0.2, [0.84], plan)
+    same = replace(play, model=replace(play.model, effects=(replace(play.model.effects[0]),)))
+    object.__setattr__(same.model.effects[0], "name", "twin")
+    asked = measurement_separating_rivals([lag, play, same], 0.4, plan, LightSensorApparatus())
+    assert asked is not None
+    assert asked.classes_among(asked.effects) == [[0], [1, 2]]
+    assert asked.classes_among([("backlash",), ("twin",)]) == [[1, 2]]
+    assert asked.classes_among([("lag",), ("twin",)]) == [[0], [2]]
+    assert asked.classes_among([("lag",), ("glint",)]) == [[0]]
+    apart = np.array([asked.nats[0, 1:].min(), asked.nats[1, 0], asked.nats[2, 0]])
+    assert asked.expected_log_bayes_factor == pytest.approx(asked.probabilities @ apart)
+    assert apart.min() > 3
+    both = measurement_separating_rivals([play, same], 0.4, plan, LightSensorApparatus())
+    assert both is None or both.expected_log_bayes_factor == pytest.approx(0.0, abs=1e-6)
+
+
+def test_lag_against_backlash_wants_the_other_way():
+    plan = paper_plan()
+    lag, play = rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)
+    asked = measurement_separating_rivals([lag, play], 0.4, plan, LightSensorApparatus())
+    assert asked is not None
+    assert "backwards" in asked.description or "forth and back" in asked.description
+
+
+def test_a_plan_that_moves_nowhere_has_no_next_scan():
+    plan = paper_plan().take(np.arange(404, 408))
+    rivals = [rival("hysteresis", 0.5, [0.5], paper_plan()), rival("lag", 0.5, [0.5], paper_plan())]
+    assert (
+        measurement_separating_rivals(
+            [replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan, LightSensorApparatus()
+        )
+        is None
+    )
+
+
+def read_by(plan: Plan) -> np.ndarray:
+    chain = Chain(SPOT, FixedLevels(0.0, 1.0), KnownScene(plan.patterns), ())
+    return chain.predict(np.empty((1, 0)), plan)[0]
+
+
+def laid(plan: Plan, scan: str) -> Plan:
+    return next(command.plan for command in target_swaps(plan) if command.plan.scan_names == (scan,))
+
+
+def test_a_sheet_turned_half_round_swaps_black_and_white():
+    plan = paper_plan()
+    turned = laid(plan, "boundary_half_round_4")
+    at = np.searchsorted(plan.x_mm[:101], turned.x_mm)
+    np.testing.assert_allclose(read_by(turned), 1 - read_by(plan)[:101][at], atol=1e-12)
+
+
+@pytest.mark.parametrize("edge", [HalfPlane(0.0, 7.0), HalfPlane(0.4, -3.0, inside=0.2, outside=0.9)])
+def test_a_sheet_turned_by_a_quarter_reads_the_same_along_the_other_axis(edge):
+    """A round spot cannot tell that both were turned."""
+    plan = replace(paper_plan(), y_mm=paper_plan().y_mm + 4.0)
+    plan = replace(plan, patterns={**plan.patterns, "boundary": edge})
+    turned = laid(plan, "boundary_quarter_4")
+    at = np.arange(0, 101, 4)
+    assert np.ptp(turned.x_mm) == pytest.approx(0.0, abs=1e-12)
+    (pattern,) = (turned.patterns[name] for name, _ in turned.rows_by_pattern())
+    assert pattern.normal_rad == pytest.approx(edge.normal_rad + math.pi / 2)
+    np.testing.assert_allclose(read_by(turned), read_by(plan)[at], atol=1e-12)
+
+
+def test_a_sheet_moved_aside_reads_the_same_as_far_aside():
+    plan = paper_plan()
+    moved = laid(plan, "boundary_by_30_mm_near")
+    back = replace(moved, x_mm=moved.x_mm - 30.0, patterns={**moved.patterns, "boundary_by_30_mm": HalfPlane(0.0, 0.0)})
+    np.testing.assert_allclose(read_by(moved), read_by(back), atol=1e-12)
+    # The readings around the edge: it is among them, and not at their end.
+    assert moved.x_mm[5] < 30.0 < moved.x_mm[-6]
+
+
+def test_along_an_edge_there_is_nothing_to_lay_otherwise():
+    plan = paper_plan()
+    along = replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(math.pi / 2, 0.0)})
+    assert {command.kind for command in target_swaps(along)} == {"lay", "across"}
+    assert all("boundary" not in command.description for command in target_swaps(along))
+    # Of several edges the first that a scan goes across.
+    names = (*plan.pattern_names, "upright")
+    under = np.where(plan.scan == 1, len(names) - 1, plan.pattern)
+    patterns = {**along.patterns, "upright": HalfPlane(0.0, 0.0)}
+    second = replace(along, pattern=under, pattern_names=names, patterns=patterns)
+    assert any("turn pattern upright by 180 degrees" in command.description for command in target_swaps(second))
+
+
+def test_short_scans_are_taken_whole():
+    plan = paper_plan().take(np.arange(45, 57))
+    assert {command.kind for command in candidate_scans(plan, strides=(2, 4))} == {
+        "repeat",
+        "reverse",
+        "respeed",
+        "rotate",
+    }
+    assert all(len(command.plan) == 12 for command in candidate_scans(plan, strides=(2, 4)))
+    tiny = replace(plan, x_mm=plan.x_mm / 10)
+    assert not any(re.search("by -?0 mm", command.description) for command in target_swaps(tiny))
+
+
+def test_a_name_that_is_taken_stands_for_something_else():
+    plan = paper_plan()
+    grey = replace(plan, pattern_names=(*plan.pattern_names, "plain_white"))
+    grey = replace(grey, patterns={**plan.patterns, "plain_white": Uniform(0.8)})
+    white = next(command.plan for command in target_swaps(grey) if command.description == "scan a plain white surface")
+    ((name, _),) = white.rows_by_pattern()
+    assert (white.patterns[name], white.patterns["plain_white"]) == (Uniform(1.0), Uniform(0.8))
+
+
+def test_excerpts_hold_the_step_and_every_so_many_readings():
+    scan = np.arange(100, 201)
+    level = np.where(np.arange(101) < 60, 10.0, 50.0) + np.linspace(0, 1, 101)
+    every, fourth, near = excerpts_of_scan(scan, strides=(1, 4), level=level)
+    assert len(every.rows) == 101
+    assert fourth.rows[:3].tolist() == [100, 104, 108]
+    assert near.rows[0] <= 159 < 160 <= near.rows[-1]
+    assert len(excerpts_of_scan(scan, strides=(1, 4), level=np.ones(101))) == 2  # nothing changes anywhere
+
+
+def test_a_scan_over_a_new_sheet_takes_longer():
+    plan = paper_plan()
+    again = next(c for c in candidate_scans(plan, strides=(4,)) if c.kind == "repeat")
+    new = next(c for c in target_swaps(plan) if c.plan.scan_names == ("boundary_half_round_4",))
+    assert new.minutes == pytest.approx(again.minutes + 1.0)
+    # In turn, or behind a plan: what the minutes say passes before the first reading.
+    end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))
+    later = scan_started_after(new, plan).plan
+    assert later.time_s[-1] - end_s == pytest.approx(60.0 * new.minutes)
+    both = plan_of_sequence([again, new], plan)
+    assert both.time_s[-1] - end_s == pytest.approx(60.0 * (again.minutes + new.minutes))
+    assert both.time_s[-1] - both.time_s[len(again.plan)] == pytest.approx(lasts_s)
+
+
+def test_a_battery_is_expected_to_stay_as_it_was():
+    plan = paper_plan()
+    everywhere, rows = plan_of_alternatives(candidate_scans(plan)[:3], plan), rows_by_command(candidate_scans(plan)[:3])
+    assert [len(own) for own in rows] == [101, 101, 102]
+    assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
+    asked = measurement_separating_rivals(
+        [rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensorApparatus()
+    )
+    assert asked is not None
+    assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
+    gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
+    after = replace(plan, covariates={"battery_mv": gone, "never_mv": np.full(len(plan), np.nan)})
+    everywhere = plan_of_alternatives(candidate_scans(plan)[:3], after)
+    assert set(everywhere.covariates) == {"battery_mv"}
+    assert (everywhere.covariates["battery_mv"] == gone[-2]).all()
+
+
+def test_readings_without_noise_leave_a_number_beside_values_that_a_new_run_does_not_know():
+    """Slopes by an unknown value of 1e11 noise sds: a covariance of 1 + 1e22 is singular in floating-point numbers."""
+    slopes = 1e11 * np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 1e-3]])
+    first, second = (PredictiveNormal(mean, slopes) for mean in (np.zeros(3), 1e11 * np.array([0.0, 1.0, 0.0])))
+    nats = mutual_information_lower_bound([first, second], np.array([0.5, 0.5]))
+    assert nats == pytest.approx(np.log(2))  # two readings that must be equal are not
+
+
+def searched(probabilities, plan, fits):
+    """What a search has found: the probability of each combination on the mean, and refits of some of them."""
+    apparatus = LightSensorApparatus()
+    recording = Recording(plan, np.zeros(len(plan)))
+    prepared = SimpleNamespace(recording=recording, everything=recording, apparatus=apparatus, effects={})
+    return SimpleNamespace(
+        prepared=prepared,
+        certain=(),
+        posterior=SimpleNamespace(marginal_over_noise=probabilities),
+        best_refit_of=lambda names, certain: fits.get(names),
+    )
+
+
+def refit(name: str, settings: list[float], plan: Plan) -> SimpleNamespace:
+    own = rival(name, 0.0, settings, plan)
+    found = SimpleNamespace(model=own.model, z=own.z, slopes=np.eye(len(plan))[:, : len(own.z)])
+    return SimpleNamespace(names=(name,), found=found, whitened_sd=0.4)
+
+
+@pytest.mark.parametrize(
+    ("lag", "play", "advised"),
+    [(0.5, 0.5, True), (0.93, 0.07, True), (0.984, 0.016, False), (0.02, 0.98, False)],
+)
+def test_readings_are_advised_only_where_a_question_is_open(lag, play, advised):
+    """They would tell a lag from backlash by many nats, whatever their probabilities."""
+    plan = paper_plan()
+    fits = {("lag",): refit("lag", [0.5], plan), ("backlash",): refit("backlash", [0.84], plan)}
+    found = searched({("lag",): lag, ("backlash",): play}, plan, fits)
+    asked = choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None, is_unknown=False)
+    assert is_settled(found) is not advised
+    assert (asked is not None) is advised
+    assert asked is None or asked.expected_log_bayes_factor >= ENOUGH_NATS
+
+
+def test_aliases_that_no_reading_tells_apart_leave_nothing_to_advise():
+    plan = paper_plan()
+    fits = {("lag",): refit("lag", [0.5], plan), ("twin",): refit("lag", [0.5], plan)}
+    fits["twin",].names = ("twin",)
+    found = searched({("lag",): 0.49, ("twin",): 0.49, (): 0.02}, plan, fits)
+    assert choose_next_measurement(found, refit("lag", [0.0], plan), unknown_shows_in=None, is_unknown=False) is None
+
+
+def test_the_next_readings_of_an_unknown_effect_go_where_its_residuals_lie():
+    plan = paper_plan()
+    scan = plan.scan_names[1]
+    x = plan.x_mm.copy()
+    inside = plan.scan == 1
+    shown = Place(
+        "place",
+        scan,
+        float(x[inside].min()),
+        float(x[inside].max()),
+        1e-9,
+        9.0,
+        np.array([0.0, 999.0]),
+        np.full(2, 0.8),
+        np.full(2, 0.1),
+        values=np.where(inside, x, np.nan),
+    )
+    null = refit("lag", [0.0], plan)
+    found = searched({("unknown",): 1.0}, plan, {})
+    asked = choose_next_measurement(found, null, unknown_shows_in=shown, is_unknown=True)
+    assert asked is not None
+    assert f"scan {scan} " in asked.description + " "
+    faint = replace(shown, curve_mean=np.full(2, 1e-3))
+    assert choose_next_measurement(found, null, unknown_shows_in=faint, is_unknown=True) is None
+
+
+APPARATUS = SimulatorApparatus(ABOUT)
+NULL = Model(cast(Any, ABOUT.system), (), cast(Any, TABLE))
+OFFSETS = NULL.with_effect(cast(Any, bind_forms(ABOUT)["offset_per_run"]))
+PLAN = APPARATUS.plan_of_alternatives(APPARATUS.candidate_measurements(cast(Any, TABLE))[:2], cast(Any, TABLE))
+FIRST = np.flatnonzero(PLAN.scan == 0)
+
+
+def rival_of_new_runs(model: Model, z: np.ndarray, root: float = 1e-9) -> Rival:
+    return Rival("a", model, z, root * np.eye(len(z)), 0.5, APPARATUS.coordinates_of_new_run(model))
+
+
+def test_a_new_run_begins_where_the_prior_says():
+    """`start_c` has the prior sd 5, and one value in all rows of a run; the other run has another."""
+    spread = rival_of_new_runs(NULL, ABOUT.z).predictive_distribution(PLAN, 0.05).covariance - np.eye(len(PLAN))
+    np.testing.assert_allclose(spread[np.ix_(FIRST, FIRST)], (5 / 0.05) ** 2, rtol=1e-3)
+    np.testing.assert_allclose(np.delete(spread[FIRST], FIRST, axis=1), 0.0, atol=1e-3)
+
+
+def test_the_values_of_recorded_runs_tell_nothing_of_a_new_one():
+    """Rivals that start recorded runs differently, and agree on all else, differ in no run yet to be recorded."""
+    other = ABOUT.z + np.array([0.0, 0.0, 0.2, 0.2, 0.2])  # by a degree, twenty noise sds
+    rivals = [rival_of_new_runs(NULL, ABOUT.z), rival_of_new_runs(NULL, other)]
+    asked = measurement_separating_rivals(rivals, 0.05, cast(Any, TABLE), APPARATUS)
+    assert asked is None or asked.expected_log_bayes_factor < 0.5
+    known = [replace(r, of_run=np.zeros(0, dtype=np.int64)) for r in rivals]
+    would = measurement_separating_rivals(known, 0.05, cast(Any, TABLE), APPARATUS)
+    assert would is not None
+    assert would.expected_log_bayes_factor > 100
+
+
+def test_the_gain_of_the_heater_tells_as_much_as_a_run_with_its_own_start_can():
+    """By a second route: the start is fitted to the new run, by least squares with its prior."""
+    other = ABOUT.z + np.array([0.3, 0.0, 0.4, -0.3, 0.2])
+    rivals = [rival_of_new_runs(NULL, ABOUT.z), rival_of_new_runs(NULL, other)]
+    asked = measurement_separating_rivals(rivals, 0.05, cast(Any, TABLE), APPARATUS)
+    assert asked is not None
+    table = cast(Any, asked.plan)
+    apart = np.subtract(*(NULL.predict(z[None, :], asked.plan)[0] for z in (other, ABOUT.z))) / 0.05
+    left = 0.0
+    for rows in table.rows_by_scan():
+        ones = np.append(np.full(len(rows), 5 / 0.05), 1.0)
+        own = np.append(apart[rows], 0.0)
+        left += float(np.sum((own - ones * (ones @ own) / (ones @ ones)) ** 2))
+    assert asked.expected_log_bayes_factor == pytest.approx(left / 2, rel=0.02)
+
+
+def test_an_effect_with_a_value_per_run_has_another_one_in_a_new_run():
+    of_run = APPARATUS.coordinates_of_new_run(OFFSETS)
+    np.testing.assert_array_equal(of_run, [2, 3, 4, 5, 6, 7])
+    z = np.append(ABOUT.z, [1.0, -0.5, 0.2])
+    _, slopes = OFFSETS.predict_and_differentiate(z, PLAN)
+    shared, own = slopes_split_by_run(slopes, of_run, PLAN)
+    assert not shared[:, of_run].any()
+    assert (np.count_nonzero(own[FIRST], axis=0) > 0).sum() >= 2  # its start and its offset
+    np.testing.assert_allclose(own.sum(axis=1), slopes[:, of_run].sum(axis=1))
+
+
+def simulate(p, data):
+    return p["off"] + p["slope"] * data["x"]
+
+
+SIMULATOR = Simulator(
+    reading="y_v",
+    unit="V",
+    run="day",
+    parameters={"slope": (-10, 10), "off": ("normal", 0, 10)},
+    per_run=("off",),
+    noise=Noise(sd=0.1),
+    simulate=simulate,
+)
+
+
+def table() -> RunTable:
+    """Three days of twelve readings, which the temperature shifts: so does an offset that depends on it."""
+    rng = np.random.default_rng(3)
+    x, temp_c = rng.uniform(0, 3, 36), 20 + 2 * rng.standard_normal(36)
+    y_v = np.repeat([1.0, 1.3, 0.7], 12) + 2 * x + 0.3 * (temp_c - 20) + 0.1 * rng.standard_normal(36)
+    return RunTable({"day": np.repeat(["a", "b", "c"], 12), "x": x, "temp_c": temp_c, "y_v": y_v}, run="day")
+
+
+COMPARED: list[Rival] = []
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    def compare(rivals, *rest):
+        COMPARED.extend(rivals)
+        return measurement_separating_rivals(rivals, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("probewise.diagnosis.advice.measurement_separating_rivals", compare)
+        return diagnose_system(SIMULATOR, table(), rng=np.random.default_rng(1))
+
+
+def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so(diagnosis):
+    nothing = diagnosis.apparatus.words.settles_nothing
+    assert diagnosis.verdict == "cannot_tell"
+    assert TO_SEPARATE not in diagnosis.reason
+    for name in ("off that depends on temp_c", "readings that depend on temp_c"):
+        assert f"{name} (0.49)" in diagnosis.reason
+    assert diagnosis.reason.endswith(f"; {nothing}.")
+    assert diagnosis.next_measurement is None
+
+
+def test_aliases_promise_no_readings_where_the_fit_absorbs_all_that_they_change(diagnosis):
+    aliases = {alias.effects: alias for alias in diagnosis.judged.aliases}
+    absorbed = [("depends:off:temp_c", "sensitivity:temp_c"), ("differs:slope", "input_gain:x")]
+    for effects in absorbed:
+        assert (aliases[effects].settle_by, aliases[effects].readings) == (
+            diagnosis.apparatus.words.settles_nothing,
+            0,
+        )
+
+
+def test_the_offset_of_a_new_day_is_not_known_to_any_rival(diagnosis):
+    assert len(COMPARED) > 1
+    for rival in COMPARED:
+        assert {*rival.of_run} >= {1, 2, 3}

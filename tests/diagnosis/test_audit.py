@@ -1,0 +1,233 @@
+"""Audit of a plan."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mixtures import fixed_mixture
+
+from probewise.diagnosis import audit_plan, join
+from probewise.diagnosis.arm_scans import candidate_scans
+from probewise.diagnosis.audit import ExpectedSensor, PlanTemplates, ProjectedTemplates, _curing_step_by_effect
+from probewise.diagnosis.joining import join_plans
+from probewise.diagnosis.sensors import default_sensor
+from probewise.effects import Extent
+from probewise.effects.optics import EdgeMisplacement
+from probewise.effects.pose import Backlash
+from probewise.errors import ParameterError
+from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan
+from probewise.recordings.plan import Plan
+from probewise.scene import KnownScene
+from probewise.sensor import Chain, FixedLevels, FreeLevels, FreeMixture
+
+SPOT = np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0])  # a Gaussian of sd 5 mm
+TWO = {"backlash": Backlash, "edge_misplacement": EdgeMisplacement}
+
+
+def thinned(plan: Plan, step: int = 4) -> Plan:
+    return plan.take(np.arange(0, len(plan), step))
+
+
+def sights_of(plan: Plan):
+    """The surviving share of backlash and its cosine to an edge that lies elsewhere, by `ProjectedTemplates`."""
+    sensor = default_sensor(Extent(10.0, 60.0, plan), 1)
+    expected = ExpectedSensor(sensor, np.full(sensor.n_params, 0.1), (10.0, 60.0), 0.5)
+    seen = ProjectedTemplates.of(PlanTemplates.of(expected, plan, TWO), np.arange(len(plan)))
+    share, like = seen.detectable_shares_and_cosines()["backlash"]
+    return expected, share, like["edge_misplacement"], seen
+
+
+def by_least_squares(plan: Plan, expected: ExpectedSensor) -> tuple[float, float]:
+    """The same two numbers from predictions of plain chains and ordinary least squares."""
+    z, sensor = expected.z, expected.null
+
+    def predict(effects, theta):
+        chain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns), effects)
+        return chain.predict(theta, plan)[0] / expected.sd
+
+    def own(z):
+        return predict((), sensor.theta(z[None, :]))
+
+    step = 1e-5
+    slopes = np.stack([(own(z + step * e) - own(z - step * e)) / (2 * step) for e in np.eye(len(z))], axis=1)
+    design = np.concatenate([slopes, np.eye(len(z))])
+    left, raw = [], []
+    for kind in (Backlash, EdgeMisplacement):
+        theta = np.concatenate([sensor.theta(z[None, :]), [[1e-3]]], axis=1)
+        trace = predict((kind(),), theta) - own(z)
+        padded = np.concatenate([trace, np.zeros(len(z))])
+        left.append(padded - design @ np.linalg.lstsq(design, padded, rcond=None)[0])
+        raw.append(np.linalg.norm(trace))
+    cosine = abs(left[0] @ left[1]) / (np.linalg.norm(left[0]) * np.linalg.norm(left[1]))
+    return float(np.linalg.norm(left[0]) / raw[0]), float(cosine)
+
+
+@pytest.mark.parametrize("plan", [thinned(paper_plan()), thinned(two_way_plan(), 8)])
+def test_share_and_cosine_are_those_of_least_squares(plan):
+    expected, share, cosine, _ = sights_of(plan)
+    np.testing.assert_allclose((share, cosine), by_least_squares(plan, expected), rtol=0.02, atol=1e-3)
+
+
+def test_the_smallest_size_leaves_lambda_eight():
+    """A trace of that size, from the chain, has length 8 once the fit has taken its part."""
+    plan = thinned(two_way_plan(), 8)
+    expected, share, _, seen = sights_of(plan)
+    (width_mm,) = seen.smallest_detectable_amplitudes(seen.laid.built["backlash"])
+    theta = expected.null.theta(expected.z[None, :])
+    plain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
+    with_play = plain.with_effects(Backlash())
+    trace = with_play.predict(np.concatenate([theta, [[width_mm]]], axis=1), plan) - plain.predict(theta, plan)
+    assert share * np.linalg.norm(trace) / expected.sd == pytest.approx(8.0, rel=0.05)
+
+
+def test_going_both_ways_tells_play_from_an_edge_that_lies_elsewhere():
+    assert sights_of(thinned(paper_plan()))[2] > 0.999
+    assert sights_of(thinned(two_way_plan(), 8))[2] < 0.1
+
+
+@pytest.mark.slow
+def test_what_a_cure_claims_is_seen_after_all_of_it():
+    audit = audit_plan(thinned(paper_plan()))
+    before, after = ({e.name: e.detectability for e in effects} for effects in (audit.effects, audit.after))
+    cured = [name for cure in audit.cures for name in cure.cured]
+    assert {"lag", "backlash"} & set(cured)
+    assert all(before[name] != "fine" and after[name] == "fine" for name in cured)
+    assert audit.cures[-1].cured
+    assert audit.cure_plan is not None
+    assert len(audit.cure_plan) == audit.extra_readings
+    said = audit.summary()
+    assert len(said.splitlines()) <= 25
+    assert max(map(len, said.splitlines())) <= 130
+    assert all(effect.name in said for effect in audit.effects)
+
+
+def test_what_a_step_behind_the_last_cure_spoils_is_cured_all_the_same():
+    """Of three scans the second cures two effects for good but one, which the third, that cures nothing, spoils."""
+    detectability = {"lag": "aaff", "tilt": "aafa", "halo": "afaa", "glint": "ffff", "edge": "aaaa"}
+    words = {"a": "aliased", "f": "fine"}
+    steps = [[SimpleNamespace(name=n, detectability=words[of[k]]) for n, of in detectability.items()] for k in range(4)]
+    assert _curing_step_by_effect(steps) == {"lag": 2, "tilt": 2}
+    assert _curing_step_by_effect(steps[:1]) == {}
+
+
+@pytest.mark.slow
+def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():
+    """A sensor that looks beside itself, and an edge that lies elsewhere."""
+    audit = audit_plan(paper_plan())
+    cured = {name: cure.kind for cure in audit.cures for name in cure.cured}
+    assert cured["sensor_tilt"] == cured["edge_misplacement"] == "lay"
+    assert cured["backlash"] == "respeed"
+    assert audit.extra_readings <= 150
+    plan = audit.cure_plan
+    assert plan is not None
+    assert {name for name, _ in plan.rows_by_pattern()} <= plan.patterns.keys()
+
+
+@pytest.mark.slow
+def test_a_flat_surface_shows_no_edge():
+    plan = thinned(paper_plan())
+    flat = replace(plan, patterns=dict.fromkeys(plan.patterns, Uniform(1.0)))
+    detectability = {effect.name: effect.detectability for effect in audit_plan(flat).effects}
+    assert detectability["backlash"] == detectability["edge_misplacement"] == "invisible"
+    assert detectability["ambient_gradient"] != "invisible"
+
+
+def test_only_what_the_apparatus_can_command_is_asked_for():
+    plan = paper_plan()
+    kinds = {command.kind for command in candidate_scans(plan)}
+    assert kinds == {"repeat", "reverse", "respeed", "rotate"}
+    able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led", "height_mm")))
+    assert {command.kind for command in candidate_scans(able)} == {"repeat", "reverse", "respeed", "relight", "raise"}
+
+
+def test_a_commanded_height_widens_the_footprint_and_dims_the_signal():
+    """Far from the edge the signal falls with the square of the height; across it the slope does with its cube."""
+    plan = paper_plan().take(np.arange(101))
+    high = replace(plan, covariates={"height_mm": np.full(101, 28.0)})
+    chain = Chain(fixed_mixture(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
+    usual, raised = (chain.predict(np.empty((1, 0)), p)[0] - 10.0 for p in (plan, high))
+    assert raised[-1] == pytest.approx(usual[-1] / 4)
+    middle = slice(49, 52)
+    assert np.ptp(raised[middle]) == pytest.approx(np.ptp(usual[middle]) / 8, rel=0.02)
+
+
+def test_without_the_led_only_what_is_no_signal_is_read():
+    plan = paper_plan().take(np.arange(101))
+    dark = replace(plan, covariates={"led": np.r_[np.zeros(50), np.full(51, np.nan)]})
+    chain = Chain(fixed_mixture(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
+    usual, unlit = (chain.predict(np.empty((1, 0)), p)[0] for p in (plan, dark))
+    assert (unlit[:50] == 10.0).all()
+    np.testing.assert_array_equal(unlit[50:], usual[50:])
+
+
+def test_readings_that_are_set_behind_a_plan_keep_its_battery_and_say_what_was_commanded():
+    plan = paper_plan()
+    able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led",)))
+    dark = next(command.plan for command in candidate_scans(able) if command.kind == "relight")
+    both = join_plans([able, dark])
+    assert both.covariates["battery_mv"][-1] == plan.covariates["battery_mv"][-1]
+    assert np.isnan(both.covariates["led"][: len(plan)]).all()
+    assert (both.covariates["led"][len(plan) :] == 0).all()
+    assert both.scan_names[-1] == dark.scan_names[0]
+    gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
+    both = join_plans([replace(able, covariates={"battery_mv": gone}), dark])
+    assert (both.covariates["battery_mv"][len(plan) :] == gone[-2]).all()
+
+
+def test_a_plan_over_other_patterns_keeps_them_behind_another():
+    plan = paper_plan()
+    quadrants, edge = plan.take(np.arange(404, 408)), plan.take(np.arange(101))
+    other = replace(edge, pattern_names=("tile",), pattern=np.zeros(101, dtype=int), patterns={"tile": Uniform(0.3)})
+    both = join_plans([quadrants, other])
+    assert [name for name, _ in both.rows_by_pattern()] == [*(f"quadrant_{k}" for k in "abcd"), "tile"]
+    assert both.patterns["tile"] == Uniform(0.3)
+    assert {both.pattern_names[k] for k in both.pattern[4:]} == {"tile"}
+
+
+def test_a_plan_over_a_pattern_that_is_not_described_is_refused():
+    plan = paper_plan()
+    with pytest.raises(ParameterError, match="quadrant_a"):
+        audit_plan(replace(plan, patterns={k: v for k, v in plan.patterns.items() if k != "quadrant_a"}))
+
+
+def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():
+    plan = thinned(two_way_plan(), 8)
+    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
+    theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 58.0, 11.0])
+    samples = theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8))
+    sensor = SimpleNamespace(names=names, samples=samples)
+    audit = audit_plan(plan, sensor=sensor, effects={"backlash": Backlash})
+    assert audit.effects[0].detectability == "fine"
+    assert "noise 0.47 LEGO" in audit.assumed
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_an_audit_does_not_depend_on_the_unit_of_the_readings(calibrated):
+    """A photodiode of 10 to 60 pA, in picoamperes and in amperes."""
+    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
+    theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 10.0, 60.0])
+    samples = theta * (1 + 1e-3 * np.random.default_rng(0).standard_normal((500, 8)))
+    shares = []
+    for unit in (1.0, 1e-12):
+        plan = thinned(two_way_plan(), 8)
+        plan = replace(plan, instrumentation=replace(plan.instrumentation, min=0.0, max=100 * unit, step=None))
+        in_unit = SimpleNamespace(names=names, samples=samples * np.array([1.0] * 6 + [unit] * 2))
+        audit = audit_plan(plan, sensor=in_unit if calibrated else None, effects=TWO)
+        shares.append([effect.share for effect in audit.effects])
+        assert (
+            f"noise {(0.5 if calibrated else 0.8) * unit:.3g} " in audit.assumed
+        )  # a hundredth of the span between the levels
+    np.testing.assert_allclose(shares[1], shares[0], rtol=1e-4)
+
+
+def test_a_recording_joined_with_one_in_the_dark_is_lit_where_it_does_not_say():
+    plan = paper_plan().take(np.arange(30))
+    usual = Recording(plan, np.full(30, 20.0))
+    dark = Recording(replace(plan, covariates={"led": np.zeros(30)}), np.full(30, 10.0))
+    joined = join([usual, dark]).plan
+    assert np.isnan(joined.covariates["led"][:30]).all()
+    assert (joined.covariates["led"][30:] == 0).all()
+    assert (joined.covariates["battery_mv"][30:] == joined.covariates["battery_mv"][29]).all()  # nobody commands it

@@ -1,0 +1,131 @@
+"""The gain of a repair, and the correction where it has no name."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from probewise.diagnosis import diagnose
+from probewise.diagnosis.best_repair import correct_by_best_basis
+from probewise.diagnosis.evidence import SCALES, Linearised
+from probewise.diagnosis.held_out import partition_into_blocks
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.templates import TemplateBank
+from probewise.recordings import Recording, two_way_plan
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
+
+PLAN = two_way_plan()
+SD = 0.45
+
+
+@pytest.mark.slow
+def test_two_bumps_in_time_are_both_repaired():
+    """No other scan tells of what is local in time; readings on both sides of a block do."""
+    world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
+    rng = np.random.default_rng(3)
+    bumps = sum(sign * np.exp(-0.5 * ((PLAN.time_s - at) / 60) ** 2) for sign, at in ((1, 500), (-1, 1400)))
+    found = diagnose(
+        Recording(PLAN, world.expected_readings(PLAN) + SD * rng.standard_normal(len(PLAN)) + bumps), rng=rng
+    )
+    assert found.verdict == "unknown"
+    gain = found.improvement
+    assert gain.rms_before > 1.2 * SD
+    assert gain.rms_after == pytest.approx(SD, rel=0.05)
+    assert gain.p_value_after > 0.01
+    assert gain.heldout_log_density_per_reading > 5 * gain.heldout_sd > 0
+    assert all("block" in name for name, _ in gain.heldout_by_scan)
+    change = found.repair.before.residuals - found.repair.after.residuals
+    assert np.corrcoef(change, bumps)[0, 1] > 0.9
+
+
+def test_blocks_are_kept_back_whole_and_every_reading_once():
+    readings = np.ones(len(PLAN))
+    readings[:3] = np.nan
+    part, names = partition_into_blocks(Recording(PLAN, readings))
+    assert len(part) == len(PLAN) - 3
+    assert sorted(np.unique(part)) == list(range(len(names)))
+    ends = np.flatnonzero(np.diff(part)) + 1
+    assert (np.diff(ends) == 8).all()
+
+
+_N = 120
+_BUMP = np.exp(-0.5 * ((np.arange(_N) - 60) / 15) ** 2)
+_PARTS = (np.arange(_N) // 8) % 5
+
+
+def _corrected(law, noise):
+    """Return the correction of a fitted constant by the bump, which the readings contain once."""
+    residuals = _BUMP + noise
+    found = SimpleNamespace(slopes=10 * np.ones((_N, 1)), residuals=residuals, z=np.zeros(1), sd=0.1)
+    problem = Linearised.of(found, law)
+    bank = TemplateBank.of([_BUMP[:, None]], ["time"], _N)
+    return found, problem, correct_by_best_basis(found, problem, bank, _PARTS)
+
+
+def _mixed_sds():
+    return np.where(np.arange(_N) % 4 == 1, 30.0, 1.0)
+
+
+def _law(**more):
+    given = {"sd": np.ones(_N), "carry": np.zeros(_N), "lost": np.zeros(_N, dtype=bool), **more}
+    return NoiseLaw(**given)
+
+
+def test_readings_with_an_sd_of_their_own_count_by_it():
+    noise = 0.1 * np.random.default_rng(1).standard_normal(_N)
+    _, _, plain = _corrected(_law(), noise)
+    _, _, mixed = _corrected(_law(sd=_mixed_sds()), _mixed_sds() * noise)
+    np.testing.assert_allclose(mixed.change, plain.change, atol=0.1)
+    assert np.abs(mixed.change - _BUMP).max() < 0.15
+    assert mixed.held_out.per_reading > 4 * mixed.held_out.sd
+
+
+def test_lost_readings_do_not_count():
+    rng, lost = np.random.default_rng(2), np.zeros(_N, dtype=bool)
+    lost[[5, 40, 62, 90]] = True
+    noise = 0.1 * rng.standard_normal(_N)
+    _, _, found = _corrected(_law(lost=lost), np.where(lost, -50.0, noise))
+    _, _, elsewhere = _corrected(_law(lost=lost), np.where(lost, 70.0, noise))
+    assert np.abs(found.change - _BUMP).max() < 0.1
+    np.testing.assert_allclose(found.change, elsewhere.change)
+    assert found.held_out == elsewhere.held_out
+    assert found.held_out.per_reading > 4 * found.held_out.sd
+
+
+@pytest.mark.parametrize("kind", ["walk", "sd"])
+def test_the_gain_is_that_of_the_conditional_densities(kind):
+    """Route two: dense normals, with the scale of the amplitude and of the noise that the first route states."""
+    law = _law(walk=np.full(_N, 0.04)) if kind == "walk" else _law(sd=_mixed_sds())
+    at = np.arange(_N)
+    shape = np.diag(law.sd**2) + (0.04 * (1 + np.minimum.outer(at, at)) if kind == "walk" else 0.0)
+    noise = 0.1 * np.linalg.cholesky(shape) @ np.random.default_rng(3).standard_normal(_N)
+    found, problem, corrected = _corrected(law, noise)
+
+    def log_density(columns, out):
+        design = np.concatenate([found.slopes, columns], axis=1)
+        prior = np.diag([1.0, *[(problem.sd * SCALES[5]) ** 2] * columns.shape[1]])
+        kept = np.flatnonzero(~out)
+        precision = np.linalg.inv(shape[np.ix_(kept, kept)])
+        amount = np.linalg.solve(
+            design[kept].T @ precision @ design[kept] + problem.sd**2 * np.linalg.inv(prior),
+            design[kept].T @ precision @ found.residuals[kept],
+        )
+        left = found.residuals[kept] - design[kept] @ amount
+        sigma_2 = left @ precision @ left / (len(kept) - design.shape[1])
+        spread = np.linalg.inv(design[kept].T @ precision @ design[kept] / problem.sd**2 + np.linalg.inv(prior))
+        gain = shape[np.ix_(out, kept)] @ precision
+        rows = design[out] - gain @ design[kept]
+        mean = design[out] @ amount + gain @ left
+        covariance = sigma_2 * (shape[np.ix_(out, out)] - gain @ shape[np.ix_(kept, out)]) + rows @ spread @ rows.T
+        if kind == "sd":  # independent readings, each by itself
+            covariance = np.diag(np.diag(covariance))
+        return multivariate_normal(mean, covariance).logpdf(found.residuals[out])
+
+    plain = np.zeros((_N, 0))
+    columns = _BUMP[:, None] / np.sqrt(np.mean(_BUMP**2))
+    expected = sum(log_density(columns, out) - log_density(plain, out) for out in np.equal.outer(range(5), _PARTS)) / _N
+    assert corrected.held_out.per_reading == pytest.approx(expected, rel=2e-3)

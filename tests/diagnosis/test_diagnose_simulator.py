@@ -1,0 +1,381 @@
+"""Diagnosis of a simulator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.special import ndtri
+from scipy.stats import multivariate_normal
+
+from probewise.diagnosis import audit_system, diagnose_system, repaired_of
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import log_probability_effects_detectable
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.templates import templates_of_effect
+from probewise.effects import Extent
+from probewise.effects.noise import Dropouts
+from probewise.systems import Law, Noise, Simulator, predict_system, table_for
+
+_N, _SD, _STEP, _WAVE = 150, 0.1, 0.05, 0.25
+
+
+def _covariance(step, sd):
+    at = np.arange(_N)
+    return step**2 * (1 + np.minimum.outer(at, at)) + sd**2 * np.eye(_N)
+
+
+def _recorded():
+    rng, t = np.random.default_rng(3), np.arange(_N, dtype=float)
+    walk = _STEP * np.cumsum(rng.standard_normal(_N))
+    return t, 20 + 0.01 * t + _WAVE * np.sin(0.6 * t + 1) + walk + _SD * rng.standard_normal(_N)
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    t, y = _recorded()
+    line = Simulator(
+        "y", "degC", {"a": (0, 50), "b": (-1, 1)}, simulate=lambda p, u: p["a"] + p["b"] * u["t_s"], time="t_s",
+        vectorized=True,
+    )  # fmt: skip
+    return diagnose_system(line, {"t_s": t, "y": y}, rng=np.random.default_rng(1))
+
+
+def _log_density_given_the_rest(readings, columns):
+    """Return the mean, over readings, of log densities of a fifth given the rest, of a linear model with wide priors.
+
+    The step of its walk and the sd of its noise are the likeliest.
+    """
+
+    def log_density(log_noise, rows):
+        every = 1e4 * columns @ columns.T + _covariance(*np.exp(log_noise))
+        return multivariate_normal(np.zeros(len(rows)), every[np.ix_(rows, rows)]).logpdf(readings[rows])
+
+    rows = np.arange(_N)
+    noise = minimize(lambda x: -log_density(x, rows), np.log([_STEP, _SD]), method="Nelder-Mead").x
+    parts = [np.setdiff1d(rows, part) for part in np.array_split(rows, 5)]
+    return sum(log_density(noise, rows) - log_density(noise, kept) for kept in parts) / _N
+
+
+def test_the_gain_on_held_out_parts_is_that_of_the_conditional_densities(diagnosis):
+    """It was 0.54 instead of 0.37 where no reading beside them told of the walk, and below 0 for longer walks."""
+    t, y = _recorded()
+    assert diagnosis.combination == ("interference", "random_walk")
+    line = np.stack([np.ones(_N), t / _N], axis=1)
+    right = np.concatenate([line, np.sin(0.6 * t)[:, None], np.cos(0.6 * t)[:, None]], axis=1)
+    expected = _log_density_given_the_rest(y, right) - _log_density_given_the_rest(y, line)
+    gain = diagnosis.improvement
+    assert gain.heldout_log_density_per_reading == pytest.approx(expected, rel=0.1)
+    assert gain.heldout_log_density_per_reading > 4 * gain.heldout_sd
+
+
+def test_residuals_count_from_the_walk_and_the_lines_contain_it(diagnosis):
+    y = _recorded()[1]
+    gain, repair = diagnosis.improvement, diagnosis.repair
+    assert 0.7 * _SD < gain.rms_after < 1.1 * _SD < gain.rms_before
+    for shown, rms in ((repair.before, gain.rms_before), (repair.after, gain.rms_after)):
+        assert shown.has_walk
+        np.testing.assert_allclose(shown.readings_with_walk + shown.residuals, y)
+        assert np.sqrt(np.mean(shown.residuals**2)) == pytest.approx(rms)
+        assert abs(shown.residuals.mean()) < _SD / 2
+
+
+def test_rows_after_the_recording_have_the_whole_walk_in_their_sd(diagnosis):
+    """As the guide says: predictions look at no reading, and the walk counts from the recording's first row."""
+    t = np.arange(_N, _N + 30, dtype=float)
+    later = predict_system(repaired_of(diagnosis), {"t_s": t}, rng=np.random.default_rng(2))
+    samples = diagnosis.repaired
+    step = samples.noise_sd * samples.effect_samples("random_walk")[:, 0]
+    law = np.var(samples.chain.predict(samples.theta, diagnosis.recording.plan)[:, -1])
+    expected = np.sqrt(np.mean(samples.noise_sd**2) + np.mean(step**2) * (t + 1) + law)
+    np.testing.assert_allclose(later.sd, expected, rtol=0.1)
+
+
+MASS, VISCOUS, DRY, OFFSET = 95.0, 200.0, 20.0, -3.0  # kg, N s/m, N, N
+GAP, SD, N_ROWS, FINE = 0.05, 1e-4, 200, 1e-4  # s, m, rows, s
+
+
+@pytest.fixture(scope="module")
+def positioning():
+    """A drive with dry friction and an offset of its force, moved in a loop; small explicit steps."""
+    q = v = 0.0
+    time, force, position = GAP * np.arange(N_ROWS), [], []
+    for t in time:
+        wanted = 0.12 * math.sin(2 * math.pi * t / 5) + 0.05 * math.sin(2 * math.pi * t / 1.9)
+        push = 1500.0 * (wanted - q) - 100.0 * v
+        force.append(push)
+        position.append(q)
+        for _ in range(round(GAP / FINE)):
+            v += FINE * (push - VISCOUS * v - DRY * math.tanh(v / 1e-5) - OFFSET) / MASS
+            q += FINE * v
+    noise = np.random.default_rng(4).normal(0.0, SD, N_ROWS)
+    return {"t_s": time, "force_n": np.array(force), "q_m": np.array(position) + noise}
+
+
+@pytest.mark.single_case
+@pytest.mark.slow
+def test_friction_and_an_offset_are_found_in_a_positioning_system_that_runs_away_without_them(positioning):
+    bare = Simulator(
+        "q_m",
+        "m",
+        {"mass": ("log", 20, 500), "viscous": ("log", 20, 1000)},
+        law=Law(
+            {"q": 0.0, "v": 0.0},
+            lambda s, p, u: {"q": s["v"], "v": (u["force_n"] - p["viscous"] * s["v"]) / p["mass"]},
+        ),
+        time="t_s",
+    )
+    found = diagnose_system(bare, positioning, rng=np.random.default_rng(1))
+    # A constant term of the rate and an offset of the force are the same thing.
+    named = {effect.name: effect.parameters[0] for effect in found.effects}
+    leading = {name for hypothesis in found.hypotheses[:2] for name in hypothesis.effects}
+    assert leading == {"friction:v", "forcing:v", "input_offset:force_n"}
+    friction, offset = named["friction:v"], named["input_offset:force_n"]
+    assert friction.mean == pytest.approx(DRY / MASS, abs=4 * friction.sd)
+    assert offset.mean == pytest.approx(-OFFSET, abs=4 * offset.sd)
+    assert found.improvement.rms_before > 100 * SD
+    assert found.improvement.rms_after < 1.2 * SD
+
+
+N, SD_OF_IMPOSSIBLE = 50, 0.02
+X = np.sort(np.random.default_rng(2).uniform(-0.4, 1.45, N))
+Y = 2 * np.sqrt(1 - (X - 0.5) ** 2) + SD_OF_IMPOSSIBLE * np.random.default_rng(3).normal(size=N)
+TABLE = {"x": X, "y": Y}
+DOME = Simulator(  # a dome whose position was recorded 0.5 too large: beyond the radius there is no height
+    "y",
+    "V",
+    {"height": (0, 5), "radius": ("log", 0.5, 5)},
+    simulate=lambda p, u: p["height"] * np.sqrt(1 - (u["x"] / p["radius"]) ** 2),
+    vectorized=True,
+)
+
+
+@pytest.fixture(scope="module")
+def diagnosis_of_impossible():
+    return diagnose_system(DOME, TABLE, rng=np.random.default_rng(1))
+
+
+@pytest.mark.slow
+def test_every_probability_and_size_is_a_number(diagnosis_of_impossible):
+    assert sum(h.probability for h in diagnosis_of_impossible.judged.hypotheses) == pytest.approx(1.0)
+    assert diagnosis_of_impossible.effects
+    assert all(math.isfinite(effect.size_lambda) for effect in diagnosis_of_impossible.effects)
+    assert all(
+        np.isfinite([place.start, place.end]).all()
+        for place in diagnosis_of_impossible.where
+        if place.start is not None
+    )
+
+
+@pytest.mark.slow
+def test_a_size_is_that_of_a_refit_from_values_that_predict_something(diagnosis_of_impossible):
+    """Not that of readings a thousand noise sds off, which stands for an impossible one."""
+    assert max(effect.size_lambda for effect in diagnosis_of_impossible.effects) < 200
+
+
+@pytest.fixture(scope="module")
+def shifted():
+    """The fit with the true shift of x, and its usable rows; without it the outer readings are impossible."""
+    prepared = prepare_system(DOME, table_for(DOME, TABLE))
+    model = Model(prepared.null, (prepared.effects["input_offset:x"],), prepared.recording.plan)
+    height_and_radius = ndtri([0.4, math.log(2.0) / math.log(10.0)])
+    start = np.append(height_and_radius, model.z_of_last_effect(np.array([[-0.5]]))[0])
+    return fit(model, prepared.recording, start, white_noise(N)), prepared.usable_rows
+
+
+def test_rows_impossible_without_an_effect_change_most(shifted):
+    found, usable = shifted
+    assert found.sd < 2 * SD_OF_IMPOSSIBLE
+    change = found.change_by_effect("input_offset:x", usable)
+    outside = X > 1.01
+    assert np.isfinite(change).all()
+    assert (change[outside] == change.max()).all()
+    assert change.max() >= max(1000 * found.sd, np.abs(change[~outside]).max())
+
+
+def test_a_change_that_grows_without_end_stays_within_what_can_be_squared(shifted):
+    found, usable = shifted
+    beyond = replace(found, predicted=np.where(X > 1, 1.0, 0.0), model=_Diverging(found.model))
+    assert np.abs(beyond.change_by_effect("input_offset:x", usable)).max() == 1e6 * (1 + found.sd)
+
+
+class _Diverging:
+    """A model that without the effect predicts readings that grow until they are no numbers."""
+
+    def __init__(self, model):
+        self.model = model
+
+    def model_and_mask_without(self, name):
+        return self, self.model.model_and_mask_without(name)[1]
+
+    def predict(self, z):
+        return np.where(X > 1.3, np.inf, np.where(X > 1, 1e231, 0.0))[None, :]
+
+
+def test_an_effect_without_which_readings_are_impossible_is_detectable(shifted):
+    found, usable = shifted
+    assert log_probability_effects_detectable(found, white_noise(N), usable) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("noise", [{}, {"share": 0.1, "times": 5.0}, {"flat": 0.05, "sigma": SD_OF_IMPOSSIBLE}])
+def test_a_fit_whose_steps_leave_the_domain_warns_of_nothing(noise):
+    """Of any noise, normal, heavy-tailed or rounded: a step that is not taken is no news to a person."""
+    prepared = prepare_system(DOME, table_for(DOME, TABLE))
+    model = Model(prepared.null, (prepared.effects["input_offset:x"],), prepared.recording.plan)
+    height, offset = ndtri(0.2), model.z_of_last_effect(np.array([[-0.5]]))[0]
+    for radius in (0.35, 0.5, 0.9):  # shares of the prior; the first is close to the domain's edge
+        start = np.append([height, ndtri(radius)], offset)
+        assert np.isfinite(fit(model, prepared.recording, start, replace(white_noise(N), **noise)).objective)
+
+
+def test_a_late_reading_of_an_impossible_one_is_impossible_without_a_warning():
+    """Between two infinite readings there is none: pytest makes an error of numpy's warning."""
+    t = np.arange(30.0)
+    simulator = Simulator(
+        "y",
+        "V",
+        {"a": (0, 2)},
+        simulate=lambda p, u: np.where(p["a"] > 1, np.inf, p["a"] * u["t"]),
+        time="t",
+        vectorized=True,
+    )
+    prepared = prepare_system(simulator, table_for(simulator, {"t": t, "y": 0.5 * t + 0.01 * np.sin(9 * t)}))
+    model = Model(prepared.null, (prepared.effects["delay"],), prepared.recording.plan)
+    at_a_half, beyond = model.predict(np.array([[-0.67, 0.5, 0.0], [1.0, 0.5, 0.0]]))
+    assert np.isfinite(at_a_half).all()
+    assert not np.isfinite(beyond).all()
+
+
+_N_OF_NOISE = 240
+
+
+def _line(**more):
+    return Simulator("y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], **more)
+
+
+def _table(readings):
+    x = np.tile(np.linspace(0.0, 1.0, _N_OF_NOISE // 6), 6)
+    return {"x": x, "run": np.repeat(np.arange(6.0), _N_OF_NOISE // 6), "y": 1.0 + 2.0 * x + readings}
+
+
+@pytest.mark.slow
+def test_a_walk_is_named_and_predicted_beyond_its_end():
+    rng = np.random.default_rng(4)
+    walk = 0.3 * np.cumsum(rng.standard_normal(_N_OF_NOISE))
+    table = _table(0.1 * (rng.standard_normal(_N_OF_NOISE) + walk))
+    diagnosis = diagnose_system(_line(run="run"), table, rng=rng)
+    assert diagnosis.combination == ("random_walk",)
+    (found,) = [e for e in diagnosis.effects if e.name == "random_walk"]
+    low, high = found.parameters[0].interval95
+    assert low < 0.3 < high
+    predicted = predict_system(repaired_of(diagnosis), table, rng=rng)
+    assert predicted.sd[-1] > 1.2 * predicted.sd[0]
+
+
+@pytest.mark.slow
+def test_runs_of_another_noise_are_named_and_a_run_that_was_not_seen_gets_one_like_theirs():
+    rng = np.random.default_rng(5)
+    loud = np.repeat([0.5, 1.0, 3.0, 0.5, 1.0, 3.0], _N_OF_NOISE // 6)
+    table = _table(0.1 * loud * rng.standard_normal(_N_OF_NOISE))
+    diagnosis = diagnose_system(_line(run="run"), table, rng=rng)
+    assert diagnosis.combination == ("noise_per_run",)
+    later = {name: np.append(values, 9.0 if name == "run" else values[-1]) for name, values in table.items()}
+    predicted = predict_system(repaired_of(diagnosis), later, rng=rng)
+    assert predicted.sd[100] == pytest.approx(0.3, rel=0.3)
+    assert predicted.sd[0] == pytest.approx(0.05, rel=0.3)
+    assert 0.05 < predicted.sd[-1] < 2.0
+
+
+@pytest.mark.slow
+def test_known_sds_are_noise_of_the_rows_and_no_outliers():
+    """Without the column the loud readings are outliers; with it nothing is wrong."""
+    rng = np.random.default_rng(6)
+    sigma = np.where(rng.random(_N_OF_NOISE) < 0.15, 0.8, 0.1)
+    table = _table(sigma * rng.standard_normal(_N_OF_NOISE))
+    assert diagnose_system(_line(), table, rng=rng).combination == ("outliers",)
+    known = diagnose_system(_line(noise=Noise(sd="sigma_v")), {**table, "sigma_v": sigma}, rng=rng)
+    assert known.verdict == "clean"
+    predicted = predict_system(repaired_of(known), {**table, "sigma_v": sigma}, rng=rng)
+    np.testing.assert_allclose(predicted.sd, sigma, rtol=0.2)
+
+
+@pytest.mark.single_case
+@pytest.mark.slow
+def test_three_faults_of_the_noise_are_each_given_a_size():
+    rng = np.random.default_rng(7)
+    memory = np.zeros(_N_OF_NOISE)
+    for k in range(_N_OF_NOISE):
+        fresh = rng.standard_normal() * (8.0 if rng.random() < 0.06 else 1.0)
+        memory[k] = fresh + (0.6 * memory[k - 1] if k % (_N_OF_NOISE // 6) else 0.0)
+    table = _table(0.05 * memory * np.sqrt(1 + 20 * np.tile(np.linspace(0.0, 1.0, _N_OF_NOISE // 6), 6)))
+    diagnosis = diagnose_system(_line(run="run"), table, rng=rng)
+    assert set(diagnosis.combination) <= {"correlated_noise", "outliers", "signal_dependent_noise"}
+    assert all(np.isfinite(effect.size_lambda) for effect in diagnosis.effects)
+
+
+EPOCH = 1.7e9
+N_FAR_OFF = 60
+X_FAR_OFF = np.sin(0.7 * np.arange(N_FAR_OFF))
+Y_FAR_OFF = (
+    1.0
+    + 2.0 * X_FAR_OFF
+    + 0.1 * np.random.default_rng(1).standard_normal(N_FAR_OFF)
+    + 0.25 * (np.arange(N_FAR_OFF) > 35)
+)
+
+
+def clock(constant: float) -> Simulator:
+    priors = {"a": (constant - 5, constant + 5), "b": (-5, 5)}
+    return Simulator("y", "s", priors, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time="t")
+
+
+def table(constant: float) -> dict[str, np.ndarray]:
+    return {
+        "t": np.arange(float(N_FAR_OFF)),
+        "x": X_FAR_OFF,
+        "y": constant + Y_FAR_OFF,
+    }
+
+
+@pytest.mark.parametrize("name", ["offset_step", "lag", "offset_drift"])
+def test_a_template_is_the_same_about_a_large_constant(name):
+    columns = []
+    for constant in (0.0, EPOCH):
+        prepared = prepare_system(clock(constant), table_for(clock(constant), table(constant)))
+        model = Model(prepared.null, (), prepared.recording.plan)
+        found = fit(model, prepared.recording, np.zeros(2), white_noise(N_FAR_OFF))
+        templates = templates_of_effect(found, prepared.effects[name], prepared.usable_rows)
+        columns.append(np.concatenate(templates.columns, axis=1))
+    sizes = np.abs(columns[0]).max(axis=0)
+    assert (sizes > 0.01).all()
+    # A step of the last digit is 2e-7, and the amplitude is found by changes ten thousand times smaller.
+    np.testing.assert_allclose(columns[1] / sizes, columns[0] / sizes, atol=0.1)
+
+
+def test_a_step_is_found_in_readings_by_the_epoch():
+    diagnosis = diagnose_system(clock(EPOCH), table(EPOCH), rng=np.random.default_rng(1))
+    assert diagnosis.p_value < 1e-6
+    assert "offset_step" in {name for h in diagnosis.judged.hypotheses[:3] for name in h.effects}
+
+
+def test_a_plan_of_readings_by_the_epoch_is_audited():
+    simulator = Simulator(
+        "y", "s", {"a": (100 * EPOCH - 5, 100 * EPOCH + 5)}, simulate=lambda p, u: p["a"] + 40 * u["x"], time="t"
+    )
+    assert audit_system(simulator, {"t": np.arange(float(N_FAR_OFF)), "x": X_FAR_OFF}).effects
+
+
+def test_readings_lost_to_one_value_are_no_other_ones_near_it():
+    """Two rows read one value, one row is an outlier 0.7 away; all three are far from what is predicted."""
+    recording = prepare_system(clock(EPOCH), table_for(clock(EPOCH), table(EPOCH))).recording
+    readings = recording.readings.copy()
+    readings[[5, 20]], readings[30] = EPOCH - 6.0, EPOCH - 5.3
+    recording = recording.with_readings(readings)
+    lost = Dropouts.for_extent(Extent.of(recording))
+    nodes = NoiseModel((lost,), recording).nodes_for_predictions(EPOCH + 1.0 + 2.0 * X_FAR_OFF)
+    assert {tuple(np.flatnonzero(law.lost)) for law in nodes.laws} == {(5, 20)}

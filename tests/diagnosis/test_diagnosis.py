@@ -1,0 +1,74 @@
+"""The result of a diagnosis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, SensorAndShape, VerdictReport
+from probewise.diagnosis.diagnosis import _weighing_json
+from probewise.diagnosis.findings import EffectFound
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.search.thorough import Weighing
+from probewise.diagnosis.verdict import Hypothesis
+from probewise.recordings import Plan, Uniform
+from probewise.scene import Circle
+
+JUDGED = Judged("clean", (), 0.4, (Hypothesis((), 1.0),))
+FOUND = Diagnosis(None, JUDGED, None, (), None, VerdictReport("All is explained.", (), None), None)
+
+
+def test_what_is_read_most_is_at_hand():
+    assert (FOUND.verdict, FOUND.reason, FOUND.p_value) == ("clean", "All is explained.", 0.4)
+
+
+def test_a_name_that_never_was_is_no_attribute():
+    with pytest.raises(AttributeError, match="credibility"):
+        FOUND.credibility  # noqa: B018
+
+
+def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
+    twice = ("interference", "interference~again")
+    weighing = Weighing(twice, 0, -10.0, -10.1, 0.1)
+    assert weighing.label == "interference+interference"
+    assert _weighing_json(weighing)["effects"] == ["interference", "interference"]
+    effects = tuple(EffectFound(name, 0.9, 9.0, f"a wave, {k}", ()) for k, name in enumerate(twice))
+    repair = SimpleNamespace(
+        changes_predictions=False,
+        by_rows=False,
+        improvement=None,
+        after_in_words="repaired",
+        combination_shares={twice: 1.0},
+        shares_in_words="two waves in the readings",
+        unstated_effects=lambda stated: (),
+    )
+    found = replace(
+        FOUND,
+        recording=SimpleNamespace(
+            plan=SimpleNamespace(instrumentation=SimpleNamespace(unit_after_number="V")), weighting_in_words=""
+        ),
+        report=replace(FOUND.report, effects=effects),
+        repair=repair,
+        apparatus=LightSensorApparatus(),
+    )
+    assert "again" not in found.summary()
+
+
+def test_the_field_of_a_next_plan_is_described_as_it_is_believed_to_be():
+    known = {"field": Uniform(0.0), "card": Uniform(0.5)}
+    plan = Plan.from_arrays(x_mm=[0.0, 5.0], y_mm=0.0, pattern=["field", "card"], patterns=known, unit="V")
+    plan = replace(plan, patterns={"card": Uniform(0.5)})
+    asked = NextMeasurement(plan, "read again", 1.0, 9.0, ("a", "b"), ((), ("lag",)), np.full(2, 0.5), np.eye(2))
+    names = ("sd", "x_mm", "y_mm", "radius_mm")
+    model = SimpleNamespace(chain=SimpleNamespace(names=names), theta=np.array([[1.0, 90.0, 40.0, 50.0]] * 3))
+    diagnosis = replace(FOUND, repair=SimpleNamespace(model=model), next_measurement=asked)
+    null = SimpleNamespace(nuisance_names=names[1:], shape=Circle())
+    described = SensorAndShape.with_shape_in_next_plan(null, diagnosis).next_measurement.plan.patterns
+    assert described["card"] == Uniform(0.5)
+    corners = np.array(described["field"].vertices_mm)
+    np.testing.assert_allclose(np.hypot(*(corners - [90.0, 40.0]).T), 50.0, rtol=0.01)
+    without = replace(diagnosis, next_measurement=None)
+    assert SensorAndShape.with_shape_in_next_plan(null, without) is without

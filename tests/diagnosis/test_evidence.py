@@ -1,0 +1,286 @@
+"""Evidence of fits: detectable sizes, refined nodes, values per run; principal axes of Gram matrices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.special import log_ndtr, logsumexp
+from scipy.stats import multivariate_normal, norm
+
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import LEAST_VISIBLE, laplace_evidence, log_probability_effects_detectable, refined
+from probewise.diagnosis.fit import Fit, Model, effect_coordinates, fit
+from probewise.diagnosis.held_out import held_out_gain
+from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.search.refits import NoiseModels
+from probewise.diagnosis.sensors import default_sensor
+from probewise.diagnosis.templates import _gram_eigensystems
+from probewise.effects import VOCABULARY, Extent
+from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Outliers, RandomWalk, SignalDependentNoise
+from probewise.effects.priors import SharedScalePrior
+from probewise.recordings import Plan, Recording, paper_plan
+from probewise.systems import Simulator, table_for
+
+PLAN = paper_plan()
+EXTENT = Extent(10.0, 60.0, PLAN)
+SD = 0.5
+
+
+@pytest.mark.parametrize("amount", [0.001, 0.004, 0.012])
+def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
+    """Route one: the effect's change, the slopes of all else taken out; route two: the null refitted in full."""
+    sensor = default_sensor(EXTENT, 1)
+    effect = VOCABULARY["ambient_gradient"].for_extent(EXTENT)
+    model = Model(sensor, (effect,), PLAN)
+    z = np.concatenate([np.full(sensor.n_params, 0.2), model.z_of_last_effect(np.array([[amount, 0.0]]))[0]])
+    predicted, slopes = model.predict_and_differentiate(z)
+    found = Fit(model, z, predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
+    law = white_noise(len(PLAN))
+    null = Model(sensor, (), PLAN)
+    left = fit(
+        null, Recording(PLAN, predicted), z[: sensor.n_params], law.with_least_sigma(SD), tolerance=1e-6
+    ).residuals
+    expected = float(log_ndtr(np.linalg.norm(left) / SD - LEAST_VISIBLE))
+    assert log_probability_effects_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(
+        expected, abs=0.1 + 0.02 * abs(expected)
+    )
+
+
+def test_a_fit_without_effects_is_as_it_is():
+    model = Model(default_sensor(EXTENT, 1), (), PLAN)
+    predicted, slopes = model.predict_and_differentiate(np.zeros(7))
+    found = Fit(model, np.zeros(7), predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
+    assert log_probability_effects_detectable(found, white_noise(len(PLAN)), np.arange(len(PLAN))) == 0.0
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_closed_forms_are_those_of_the_general_solver(width):
+    columns = np.random.default_rng(3).standard_normal((50, 9, width))
+    if width > 1:
+        columns[0, :, 1] = columns[0, :, 0] * 2  # one axis only
+        columns[1] = 0.0
+    squares = columns.transpose(0, 2, 1) @ columns
+    values, axes = _gram_eigensystems(squares)
+    assert np.sort(values, axis=1) == pytest.approx(np.linalg.eigvalsh(squares), abs=1e-12)
+    assert (axes * values[:, None, :]) @ axes.transpose(0, 2, 1) == pytest.approx(squares, abs=1e-12)
+
+
+N = 2000
+
+
+@dataclass(frozen=True)
+class _DenseWalk(RandomWalk):
+    n_nodes = 400
+
+
+@dataclass(frozen=True)
+class _DenseCorrelation(CorrelatedNoise):
+    n_nodes = 400
+
+
+@dataclass(frozen=True)
+class _DenseDrift(DriftingNoise):
+    n_nodes = 400
+
+
+@dataclass(frozen=True)
+class _DenseSignal(SignalDependentNoise):
+    n_nodes = 400
+
+
+@dataclass(frozen=True)
+class _DenseOutliers(Outliers):
+    nodes_per_parameter = (30, 30)
+
+
+def _correlated(noise: np.ndarray, rho: float) -> np.ndarray:
+    out = noise.copy()
+    for k in range(1, len(out)):
+        out[k] = rho * out[k - 1] + np.sqrt(1 - rho**2) * noise[k]
+    return out
+
+
+def _found_with(noise: np.ndarray) -> tuple[Fit, Recording]:
+    """Make a fit of one parameter, at its prior's centre, to one long scan."""
+    x = np.linspace(-1.0, 1.0, len(noise))
+    zero = np.zeros(len(noise))
+    none = np.zeros(len(noise), dtype=int)
+    plan = Plan(x, zero, zero, np.arange(len(noise), dtype=float), none, ("scan",), none, ("edge",))
+    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(has_exchangeable_gaussians=False)))
+    slopes = np.random.default_rng(1).normal(size=(len(noise), 1))
+    return Fit(model, np.zeros(1), 10 * x, noise, slopes, 1.0, 0.0), Recording(plan, 10 * x + noise)
+
+
+RNG = np.random.default_rng(2)
+WHITE = RNG.normal(size=N)
+WIDE = np.where(RNG.random(N) < 0.05, 20.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("effect", "dense", "noise"),
+    [
+        (RandomWalk(), _DenseWalk(), WHITE + np.cumsum(0.9 * RNG.normal(size=N))),
+        (CorrelatedNoise(), _DenseCorrelation(), _correlated(WHITE, 0.93)),
+        (DriftingNoise(), _DenseDrift(), WHITE * 1.2 ** (np.arange(N) / N)),
+        (SignalDependentNoise(), _DenseSignal(), WHITE * np.sqrt(1 + 4 * np.arange(N) / N)),
+        (Outliers(), _DenseOutliers(), WHITE * WIDE),
+    ],
+    ids=lambda value: value.name if hasattr(value, "name") else "",
+)
+def test_refined_nodes_are_as_good_as_dense_ones(effect, dense, noise):
+    """Evidence to a tenth of a nat, mean and sd of each parameter to a fifth of the sd, and a node at the peak."""
+    found, recording = _found_with(noise)
+    wanted = laplace_evidence(found, NoiseModel((dense,), recording))
+    own = refined(found, laplace_evidence(found, NoiseModel((effect,), recording)))
+    assert own.log_z == pytest.approx(wanted.log_z, abs=0.1)
+    means, sds = zip(*(_mean_and_sd(e) for e in (own, wanted)), strict=True)
+    np.testing.assert_allclose(means[0], means[1], atol=0.2 * sds[1].min(), rtol=0.02)
+    np.testing.assert_allclose(sds[0], sds[1], rtol=0.2)
+    heights = [float((e.log_z_nodes - e.nodes.log_weights).max()) for e in (own, wanted)]
+    assert heights[0] > heights[1] - 0.1
+    assert len(own.nodes.laws) <= 9
+
+
+def _mean_and_sd(evidence):
+    mean = evidence.weights @ evidence.nodes.settings
+    return mean, np.sqrt(evidence.weights @ (evidence.nodes.settings - mean) ** 2)
+
+
+def test_nodes_that_are_close_enough_stay_as_they_are():
+    found, recording = _found_with(WHITE[:100])
+    for effect in (RandomWalk(), CorrelatedNoise(), DriftingNoise(), SignalDependentNoise(), Outliers()):
+        evidence = laplace_evidence(found, NoiseModel((effect,), recording))
+        assert refined(found, evidence) is evidence
+
+
+def test_a_noise_far_behind_is_not_refined():
+    found, recording = _found_with(WHITE + np.cumsum(0.9 * RNG.normal(size=N)))
+    evidence = laplace_evidence(found, NoiseModel((RandomWalk(),), recording))
+    assert refined(found, evidence, least=evidence.log_z + 100) is evidence
+    assert refined(found, evidence, least=evidence.log_z) is not evidence
+
+
+def test_a_pair_of_noises_has_no_less_evidence_than_all_its_nodes():
+    """AR(1) of correlation .75 whose innovations are sometimes wide: every third node of it was 20 nats too low."""
+    n = 300
+    found, recording = _found_with(_correlated(WHITE[:n] * WIDE[:n], 0.75))
+    effects = {"outliers": Outliers(), "correlated_noise": CorrelatedNoise()}
+    noises = NoiseModels(recording, effects, PriorOdds())
+    assert noises.add_significant_pairs(found, noises.evidence_by_noise(found))
+    own = noises.evidence_by_noise(found)["correlated_noise", "outliers"]
+    every = laplace_evidence(found, NoiseModel((CorrelatedNoise(), Outliers()), recording))
+    assert own.log_z > every.log_z - 1.0
+    assert _mean_and_sd(own)[0][0] == pytest.approx(0.75, abs=0.05)
+
+
+def test_a_fit_at_the_edge_of_its_formula_is_impossible_under_any_noise():
+    """A slope there is no number; neither is it a warning."""
+    found, recording = _found_with(WHITE[:100])
+    slopes = found.slopes.copy()
+    slopes[7, 0] = np.nan
+    for effects in ((), (RandomWalk(),), (Outliers(),), (Outliers(), RandomWalk())):
+        evidence = laplace_evidence(replace(found, slopes=slopes), NoiseModel(effects, recording))
+        assert evidence.log_z == -np.inf
+        assert refined(found, evidence) is evidence
+
+
+N_RUNS, N_EACH = 12, 30
+_X = 0
+_RUN = np.repeat(np.arange(N_RUNS), N_EACH)
+
+
+def _readings(values, seed):
+    return 3 + values[_RUN] + np.random.default_rng(seed).standard_normal(len(_RUN))
+
+
+def _fitted(readings):
+    """Return the recording, the fit of a mean alone, and those with one offset per run by each variant of its prior."""
+    simulator = Simulator("y", "V", {"mean": (-50, 50)}, simulate=lambda p, u: p["mean"] + 0 * u["x"], run="run")
+    table = table_for(simulator, {"x": _RUN % 7 * 1.0, "run": _RUN * 1.0, "y": readings})
+    prepared = prepare_system(simulator, table)
+    law, system = white_noise_of_recording(prepared.recording), prepared.null
+    form = prepared.effects["offset_per_run"]
+    means = np.array([readings[k == _RUN].mean() for k in range(N_RUNS)])
+    null = fit(Model(system, (), prepared.recording.plan), prepared.recording, system.first, law)
+    found = [
+        fit(
+            Model(system, (one,), prepared.recording.plan),
+            prepared.recording,
+            np.append(system.first, effect_coordinates(one, (means - means.mean())[None, :])[0]),
+            law,
+            max_steps=60,
+        )
+        for one in form.variants()
+    ]
+    return prepared.recording, null, found
+
+
+def _summed_gain_in_evidence(readings, prior, sds, *, shared):
+    """Route two: the log evidence of the offsets over none, by sums over the mean, the noise sd and the prior's sds."""
+    means = np.array([readings[k == _RUN].mean() for k in range(N_RUNS)])[:, None]
+    within = np.array([np.sum((readings[k == _RUN] - m) ** 2) for k, m in enumerate(means[:, 0])])[:, None]
+    at = np.linspace(readings.mean() - 3 * readings.std(), readings.mean() + 3 * readings.std(), 801)
+    with_offsets, without = [], []
+
+    def of_runs(sd, spread):
+        both = sd**2 + N_EACH * spread**2
+        return -(N_EACH - 1) * np.log(sd) - 0.5 * (np.log(both) + within / sd**2 + N_EACH * (means - at) ** 2 / both)
+
+    for sd in np.exp(np.linspace(np.log(readings.std() / 6), np.log(readings.std() * 1.6), 120)):
+        each = np.stack([of_runs(sd, spread) for spread in prior.typical * sds]) - np.log(1 if shared else len(sds))
+        one = logsumexp(each.sum(axis=1), axis=0) - np.log(len(sds)) if shared else logsumexp(each, axis=0).sum(axis=0)
+        with_offsets.append(logsumexp(one))
+        without.append(logsumexp(of_runs(sd, 0.0).sum(axis=0)))
+    return logsumexp(with_offsets) - logsumexp(without)
+
+
+@pytest.mark.parametrize("case", ["all differ", "one differs"])
+def test_the_evidence_of_one_offset_per_run_is_that_of_sums(case):
+    rng = np.random.default_rng(5)
+    values = rng.standard_normal(N_RUNS) if case == "all differ" else np.where(np.arange(N_RUNS) == 2, 4.0, 0.0)
+    readings = _readings(values, 6)
+    recording, null, (shared, own) = _fitted(readings)
+    noise = NoiseModel((), recording)
+    gains = [laplace_evidence(each, noise).log_z - laplace_evidence(null, noise).log_z for each in (shared, own)]
+    prior = shared.model.effects[0].prior.each
+    exact = [
+        _summed_gain_in_evidence(readings, prior, np.geomspace(0.05, 25, n), shared=together)
+        for n, together in ((60, True), (9, False))
+    ]
+    assert gains[0] == pytest.approx(exact[0], abs=0.7)
+    assert gains[1] == pytest.approx(exact[1], abs=3.0)
+    assert (exact[0] > exact[1] + 3) == (case == "all differ")
+
+
+def test_a_run_held_out_is_expected_to_differ_as_much_as_the_others():
+    """Route two: normal values with the sd of the other runs' means, each run's readings together."""
+    rng = np.random.default_rng(7)
+    readings = _readings(rng.standard_normal(N_RUNS), 8)
+    recording, null, (shared, own) = _fitted(readings)
+    law, parts = white_noise_of_recording(recording), (_RUN, tuple(map(str, range(N_RUNS))))
+    found, apart = (held_out_gain(null, each, recording, law, parts, law_of_null=law) for each in (shared, own))
+    means = np.array([readings[k == _RUN].mean() for k in range(N_RUNS)])
+    exact = []
+    for name, _ in found.by_scan:
+        held, rest = readings[int(name) == _RUN], readings[int(name) != _RUN]
+        others = np.delete(means, int(name))
+        covariance = np.eye(N_EACH) + others.var(ddof=1) * (1 + 1 / len(others))
+        exact.append(multivariate_normal.logpdf(held, np.full(N_EACH, others.mean()), covariance))
+        exact[-1] -= norm.logpdf(held, rest.mean(), rest.std()).sum()
+    assert found.per_reading * found.n_readings == pytest.approx(sum(exact), abs=10)
+    assert found.per_reading > apart.per_reading
+
+
+def test_many_runs_keep_priors_of_their_own():
+    simulator = Simulator("y", "V", {"mean": (-50, 50)}, simulate=lambda p, u: p["mean"] + 0 * u["x"], run="run")
+    run = np.repeat(np.arange(40.0), 3)
+    readings = np.random.default_rng(0).standard_normal(len(run))
+    prepared = prepare_system(simulator, table_for(simulator, {"x": run % 7, "run": run, "y": readings}))
+    (form,) = prepared.effects["offset_per_run"].variants()
+    assert not isinstance(form.prior, SharedScalePrior)

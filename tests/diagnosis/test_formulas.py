@@ -1,0 +1,161 @@
+"""Formulas for effects out of vocabulary."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
+from probewise.diagnosis.engine import diagnose_prepared
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.search.search import needs_more_than_memoryless_noise, search
+from probewise.diagnosis.search.searched import Posterior
+from probewise.diagnosis.verdict import run_global_test
+from probewise.systems import RunTable, Simulator, table_for
+
+SD = 0.05
+
+
+def _diagnosed(change, *, seed):
+    """Diagnose three runs of a straight line with a change that it leaves out."""
+    rng = np.random.default_rng(seed)
+    run = np.repeat([1.0, 2.0, 3.0], 60)
+    time = np.concatenate([np.sort(rng.uniform(0, 100, 60)) + 100 * k for k in range(3)])
+    force = 10 * rng.random(180)
+    room = 20 + np.cumsum(rng.normal(size=180)) * 0.4
+    damp = 50 + np.cumsum(rng.normal(size=180))
+    columns = {"t_s": time, "run": run, "force": force, "room": room, "damp": damp}
+    y = 2.0 + 0.5 * force + change(columns) + SD * rng.normal(size=180)
+    table = RunTable({**columns, "y": y}, time="t_s", run="run")
+    simulator = Simulator(
+        "y", "V", {"zero": (-10, 10), "slope": (0, 2)}, simulate=lambda p, u: p["zero"] + p["slope"] * u["force"],
+        time="t_s", run="run",
+    )  # fmt: skip
+    return diagnose_system(simulator, table, rng=np.random.default_rng(0))
+
+
+@pytest.mark.slow
+def test_a_square_wave_is_no_pair_of_sinusoids():
+    """A share of .35 of every 23 s, of lambda about 30."""
+    found = _diagnosed(lambda u: 0.23 * ((u["t_s"] / 23.0) % 1 < 0.35), seed=1)
+    assert found.verdict == "unknown"
+    (wave,) = [e for e in found.repaired.chain.effects if e.name.startswith("formula:")]
+    assert wave.expression.startswith("a while")
+    values = dict(zip(wave.prior.names, found.repaired.effect_samples(wave.name).mean(axis=0), strict=True))
+    assert 1 / values["hz"] == pytest.approx(23.0, rel=0.01)
+    # The rest of each period with the other sign is the same wave.
+    assert abs(values["a"]) == pytest.approx(0.23, abs=0.05)
+    assert values["share"] == pytest.approx(0.35 if values["a"] > 0 else 0.65, abs=0.02)
+
+
+@pytest.mark.slow
+def test_two_sinusoids_are_named_as_two():
+    found = _diagnosed(
+        lambda u: 0.15 * np.sin(2 * np.pi * u["t_s"] / 23.0) + 0.15 * np.sin(2 * np.pi * u["t_s"] / 9.3), seed=2
+    )
+    assert found.verdict == "named"
+    assert sorted(found.combination) == ["interference", "interference~again"]
+
+
+@pytest.mark.slow
+def test_a_product_of_columns_is_no_pair_of_names():
+    def change(u):
+        return 0.015 * (u["damp"] - u["damp"].mean()) * (u["room"] - u["room"].mean())
+
+    found = _diagnosed(change, seed=3)
+    assert found.verdict == "unknown"
+    (product,) = [e for e in found.repaired.chain.effects if e.name.startswith("formula:")]
+    assert "damp" in product.expression
+    assert "room" in product.expression
+
+
+def _prepared_with_climate(change, *, seed=5, **more):
+    """Prepare a line in x, read in a room whose temperature and humidity change it as the simulator does not say."""
+    rng = np.random.default_rng(seed)
+    temp, damp, x = 20 + 4 * rng.normal(size=150), 40 + 12 * rng.normal(size=150), rng.uniform(0, 1, 150)
+    y = 1.0 + 2.0 * x + change(temp, damp) + SD * rng.normal(size=150)
+    columns = {"lot": np.repeat([1.0, 2.0, 3.0], 50), "x": x, "temp": temp, "damp": damp, **more, "y": y}
+    simulator = Simulator(
+        "y", "V", {"a": (-5, 5), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], run="lot"
+    )
+    return prepare_system(simulator, table_for(simulator, columns))
+
+
+def test_a_product_of_columns_alone_is_no_noise():
+    """Neither column drives the simulator, and neither acts alone: no function of one of them shows the product."""
+    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * (temp - 20) * (damp - 40))
+    searched = search(prepared, depth=0)
+    assert run_global_test(searched, rng=np.random.default_rng(1)).p_value < 0.001
+    assert searched.posterior.marginal_over_noise["unknown",] > 0.9
+
+
+@pytest.mark.slow
+def test_a_product_of_columns_alone_is_unknown_with_its_formula():
+    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * (temp - 20) * (damp - 40))
+    found = diagnose_prepared(prepared, rng=np.random.default_rng(1))
+    assert found.verdict == "unknown"
+    formula = found.report.formula
+    assert formula is not None
+    assert formula.side == "reading"
+    assert re.fullmatch(r"a \(temp - [\d.]+\) \(damp - [\d.]+\)", formula.expression)
+    low, high = formula.parameters[0].interval95
+    assert low < 0.001 < high
+
+
+@pytest.mark.slow
+def test_a_product_beside_both_of_its_columns_is_what_remains():
+    """Without a mean taken off, most of a product is an influence of each column, and these have names."""
+    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * temp * damp)
+    found = diagnose_prepared(prepared, rng=np.random.default_rng(1))
+    assert {name.rpartition(":")[2] for name in found.combination} == {"temp", "damp"}
+    remainder = found.report.remainder
+    assert remainder is not None
+    assert remainder.formula is not None
+    low, high = remainder.formula.parameters[0].interval95
+    assert low < 0.001 < high
+
+
+def test_products_are_of_time_and_the_columns_that_vary_most():
+    """A column of few values gives way; the reading, the run and what is predicted are no columns of a product."""
+    rng = np.random.default_rng(2)
+    more = {f"c{k}": rng.random(150) for k in range(8)} | {"bench": rng.integers(1, 4, 150).astype(float)}
+    prepared = _prepared_with_climate(lambda temp, damp: 0.0, **more)
+    found = search(prepared, depth=0).misfit_templates.covariates
+    assert {"level", "row", "run", "bench"} <= {c.name for c in found}
+    chosen = [c.name for c in prepared.apparatus.multiplied_covariates(found)]
+    assert chosen == ["x", "temp", "damp", *(f"c{k}" for k in range(7))]
+
+
+def test_a_light_sensor_multiplies_no_columns():
+    columns = [Covariate(name, np.arange(5.0), np.arange(5)) for name in ("battery_mv", "room_c")]
+    assert LightSensorApparatus().multiplied_covariates(columns) == ()
+
+
+@pytest.mark.parametrize(
+    ("mean", "noise", "asked"),
+    [((), (), False), ((), ("outliers",), False), ((), ("random_walk",), True), (("lag",), (), True)],
+)
+def test_formulas_are_weighed_wherever_more_than_noise_without_a_memory_leads(mean, noise, asked):
+    """A walk takes up what changes slowly, and one name part of what a formula does."""
+    searched = SimpleNamespace(posterior=Posterior({(mean, noise): 0.95, (("drag",), ()): 0.05}, {}))
+    assert needs_more_than_memoryless_noise(searched) is asked
+
+
+def test_a_formula_that_the_readings_proposed_is_no_test_of_them():
+    """A p-value that counts the best of hundreds of formulas, chosen by these readings, is too small."""
+    rng = np.random.default_rng(4)
+    x = rng.uniform(0.0, 1.0, 60)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 2.0 * u["x"])
+    table = table_for(simulator, {"x": x, "y": 1.0 + 2.0 * x + 0.4 * SD * np.cos(9 * x) + SD * rng.normal(size=60)})
+    prepared = prepare_system(simulator, table)
+    searched = search(prepared, depth=0)
+    formulas = prepared.apparatus.proposed_formulas()
+    assert len(formulas) > 5
+    more = replace(searched, prepared=replace(prepared, effects={**prepared.effects, **formulas}))
+    tests = [run_global_test(each, rng=np.random.default_rng(1)) for each in (searched, more)]
+    assert tests[0].p_value == tests[1].p_value

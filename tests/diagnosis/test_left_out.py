@@ -1,0 +1,385 @@
+"""Readings of a table that are left out."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ndtri
+
+from probewise.diagnosis import diagnose_system, fit_simulator
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.evidence import Linearised, laplace_evidence
+from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.fit_simulator import repaired_of
+from probewise.diagnosis.held_out import held_out_gain
+from probewise.diagnosis.left_out import readings_near_ends, recording_from_table
+from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
+from probewise.diagnosis.noise_models import NoiseModel
+from probewise.effects import Extent
+from probewise.effects.noise import CorrelatedNoise, Dropouts
+from probewise.errors import ParameterError
+from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system, table_for
+
+TRUE = {"tau_s": 40.0, "gain": 55.0, "start_c": 20.0}
+OVEN = Simulator(
+    "temp_c",
+    "degC",
+    {"tau_s": ("log", 1, 1000), "gain": (0, 200), "start_c": ("normal", 20, 5)},
+    simulate=lambda p, data: p["start_c"] + p["gain"] * (1 - np.exp(-data["t_s"] / p["tau_s"])),
+    time="t_s",
+    noise={"sd": 0.1},
+)
+
+
+def oven(n: int = 40, **readings: float) -> dict[str, np.ndarray]:
+    """Record an oven; readings replace those of rows, called r0, r1, ... from the first or m1, m2, ... from the end."""
+    time = np.linspace(0, 117, n)
+    y = np.round(75 - 55 * np.exp(-time / 40) + 0.1 * np.random.default_rng(1).standard_normal(n), 2)
+    for row, value in readings.items():
+        y[int(row[1:]) * (1 if row[0] == "r" else -1)] = value
+    return {"t_s": time, "temp_c": y}
+
+
+def left_out(table: dict[str, np.ndarray]) -> list[int]:
+    return list(prepare_system(OVEN, table_for(OVEN, table), with_effects=False).recording.left_out)
+
+
+@pytest.mark.parametrize(
+    ("table", "rows"),
+    [
+        *((oven(r17=50 + size), [17]) for size in (1e2, 1e5, 1e11)),
+        (oven(m1=1e3), [39]),
+        (oven(r0=-1e9), [0]),
+        (oven(r10=999, r30=-1000), [10, 30]),
+        (oven(r10=-999, r11=-999, r12=-999), [10, 11, 12]),
+        (oven(12, m1=999), [11]),
+        (oven(), []),
+        (oven(m1=90, m2=90.2, m3=89.9, m4=90.1), []),  # a jump
+    ],
+)
+def test_readings_far_from_all_others_are_left_out_and_a_jump_is_not(table, rows):
+    assert left_out(table) == rows
+
+
+def test_first_readings_of_runs_that_are_all_far_off_are_an_effect_and_no_lost_readings():
+    runs = [oven(20, r0=60 + k) for k in range(6)]
+    table = {name: np.concatenate([run[name] for run in runs]) for name in runs[0]}
+    table["run"] = np.repeat([f"run {k}" for k in range(6)], 20)
+    simulator = Simulator(
+        "temp_c", "degC", dict(OVEN.parameters), simulate=OVEN.simulate, time="t_s", run="run", noise={"sd": 0.1}
+    )
+    assert prepare_system(simulator, table_for(simulator, table), with_effects=False).recording.left_out == ()
+
+
+def test_one_sentinel_is_noise_and_neither_model_is_bent_by_it():
+    diagnosis = diagnose_system(OVEN, oven(r17=999.0), rng=np.random.default_rng(1))
+    assert (diagnosis.verdict, diagnosis.combination) == ("noise", ("dropouts",))
+    assert diagnosis.p_value > 0.05
+    assert "row 19 (999)" in diagnosis.recording.notes[0]
+    (found,) = [effect for effect in diagnosis.effects if effect.name == "dropouts"]
+    share, value = found.parameters
+    assert share.interval95[0] < 1 / 40 < share.interval95[1]
+    assert value.mean == 999.0
+    for model in (diagnosis.null, diagnosis.repaired):
+        np.testing.assert_allclose(model.theta[:, :3].mean(axis=0), list(TRUE.values()), rtol=0.01)
+        assert np.median(model.noise_sd) == pytest.approx(0.1, rel=0.3)
+    predicted = predict_system(repaired_of(diagnosis), oven(), rng=np.random.default_rng(1))
+    assert predicted.sd.max() < 0.2
+
+
+@pytest.mark.parametrize("row", ["r0", "m1"])
+def test_a_moderate_outlier_at_an_end_of_a_run_is_no_jump_and_no_delay(row):
+    true = {"r0": 20.0, "m1": 72.1}[row]
+    diagnosis = diagnose_system(OVEN, oven(**{row: true + 2}), rng=np.random.default_rng(1))
+    assert (diagnosis.verdict, diagnosis.combination) == ("noise", ("outliers",))
+
+
+def test_a_fit_says_which_row_it_leaves_out_and_which_one_bends_it():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lost, bent, clean = (
+            fit_simulator(OVEN, oven(**rows), rng=np.random.default_rng(1))
+            for rows in ({"r17": 999.0}, {"r17": 61.0}, {})
+        )
+    assert lost.rms < 0.15
+    np.testing.assert_allclose(np.median(lost.fitted.samples, axis=0)[:3], list(TRUE.values()), rtol=0.01)
+    assert "left out as lost: row 19 (999)" in " ".join(lost.recording.notes)
+    assert "row 19 (61) carries" in " ".join(bent.recording.notes)
+    assert clean.recording.notes == ()
+
+
+def test_the_rms_of_readings_with_declared_sds_is_weighted_by_them():
+    rng = np.random.default_rng(2)
+    sd = np.tile([0.1, 10.0, 0.1], 20)
+    table = {"x": np.linspace(-1, 1, 60), "y": 2.0 + sd * rng.standard_normal(60), "s": sd}
+    simulator = Simulator(
+        "y", "V", {"a": ("normal", 0, 3)}, simulate=lambda p, data: p["a"] + 0 * data["x"], noise={"sd": "s"}
+    )
+    fit = fit_simulator(simulator, table, rng=rng)
+    assert fit.rms == pytest.approx(0.1, rel=0.4)
+    assert "V (weighted by s)" in fit.summary()
+
+
+FULL, BACK, EXPONENT, SD, HIGH = 1250.0, 12.0, 2.0, 6.0, 1000.0
+TRUE_LIMITED = np.array([FULL, BACK, EXPONENT])
+LAMP = Simulator(
+    "lux",
+    "lx",
+    {"full": (0, 5000), "back": (0, 100), "expo": (1, 3)},
+    simulate=lambda p, u: p["back"] + p["full"] / u["d_m"] ** p["expo"],
+    noise={"sd": SD, "range": (0, HIGH)},
+)
+WITHOUT_RANGE = replace(LAMP, noise={"sd": SD})
+
+
+def _lamp(seed=1, n=150, most=HIGH):
+    rng = np.random.default_rng(seed)
+    d = rng.uniform(0.8, 4.0, n)
+    return RunTable({"d_m": d, "lux": np.clip(BACK + FULL / d**EXPONENT + rng.normal(0, SD, n), 0, most)})
+
+
+def _fitted(simulator, table):
+    prepared = prepare_system(simulator, table, with_effects=False)
+    about = prepared.apparatus.about
+    law = white_noise_of_recording(prepared.recording)
+    found = fit(Model(about.system, (), prepared.recording.plan), prepared.recording, about.z, law)
+    return prepared, found, law
+
+
+def test_readings_at_a_declared_end_do_not_bend_the_fit_or_widen_its_noise():
+    prepared, found, law = _fitted(LAMP, _lamp())
+    theta = prepared.null.theta(found.z[None, :])[0]
+    covariance = np.linalg.inv(found.slopes.T @ found.slopes / found.sd**2 + np.eye(3))
+    off = found.z - _coordinates_of(prepared.null, TRUE_LIMITED)
+    assert off @ np.linalg.solve(covariance, off) < 21.1  # chi-square of 3 at 1e-4
+    assert abs(theta[2] - EXPONENT) < 0.1
+    assert abs(found.sd / SD - 1) < 4 / np.sqrt(2 * law.n_kept)
+    recording = recording_from_table(WITHOUT_RANGE, _lamp())
+    bent = fit(Model(System.of(WITHOUT_RANGE, _lamp()), (), recording.plan), recording, found.z, white_noise(150))
+    assert abs(bent.model.sensor.theta(bent.z[None, :])[0, 2] - EXPONENT) > 0.3
+
+
+def _coordinates_of(system, theta):
+    return ndtri(system.prior.to_unit_cube(theta[None, :]))[0]
+
+
+def test_readings_at_an_end_are_no_lost_readings():
+    """Once 7 % of such readings were dropouts of probability .99."""
+    prepared, found, law = _fitted(LAMP, _lamp())
+    dropouts = Dropouts.for_extent(Extent.of(prepared.recording))
+    white, lost = (laplace_evidence(found, NoiseModel(own, prepared.recording)) for own in ((), (dropouts,)))
+    assert law.n_kept < len(found.residuals)
+    assert not lost.nodes.laws or lost.log_z < white.log_z
+
+
+def test_a_lost_reading_that_is_at_an_end_is_still_found_lost():
+    table = _lamp()
+    lux, far = np.array(table.columns["lux"]), np.flatnonzero(table.columns["d_m"] > 2)[:5]
+    lux[far] = HIGH
+    prepared, found, _ = _fitted(LAMP, table.with_columns({"lux": lux}))
+    found = fit(found.model, prepared.recording, _coordinates_of(prepared.null, TRUE_LIMITED), _without(prepared, far))
+    dropouts = Dropouts.for_extent(Extent.of(prepared.recording))
+    white, lost = (laplace_evidence(found, NoiseModel(own, prepared.recording)) for own in ((), (dropouts,)))
+    assert lost.log_z > white.log_z + 10
+
+
+def _without(prepared, rows):
+    lost = np.isin(prepared.usable_rows, rows)
+    return replace(white_noise_of_recording(prepared.recording), lost=lost)
+
+
+def test_a_signal_that_rests_at_an_end_has_no_offset():
+    """By night half of the noise is cut off; what is left has a mean of 0.4 sds, which is no signal."""
+    rng = np.random.default_rng(3)
+    light = 800 * np.maximum(0.0, np.sin(np.arange(300) / 12))
+    lux = np.maximum(0.0, 0.1 * light + rng.normal(0, 3.0, 300))
+    meter = Simulator(
+        "lux",
+        "lx",
+        {"gain": (0, 1), "offset": ("normal", 0, 10)},
+        simulate=lambda p, u: p["offset"] + p["gain"] * u["light"],
+        noise={"sd": 3.0, "range": (0, None)},
+    )
+    prepared, found, _ = _fitted(meter, RunTable({"light": light, "lux": lux}))
+    _, offset = prepared.null.theta(found.z[None, :])[0]
+    covariance = np.linalg.inv(found.slopes.T @ found.slopes / found.sd**2 + np.eye(2))
+    assert abs(offset) < 4 * 10 * np.sqrt(covariance[1, 1])
+    assert abs(found.sd / 3.0 - 1) < 4 / np.sqrt(2 * 150)
+    assert any(
+        "left out near an end of the declared range, which cuts off the noise" in note
+        for note in prepared.recording.notes
+    )
+
+
+def test_readings_that_stand_below_the_declared_end_stay():
+    """Those of a meter that stops at 900 lx: the fit does not explain them by the end at 1000 lx."""
+    table = _lamp(most=900.0)
+    recording = recording_from_table(LAMP, table)
+    system = System.of(LAMP, table)
+    model, law = Model(system, (), recording.plan), white_noise_of_recording(recording)
+    found = fit(model, recording, _coordinates_of(system, TRUE_LIMITED), law, max_steps=0)
+    assert (table.columns["lux"] == 900.0).sum() > 10
+    assert not readings_near_ends(system, found, SD, recording)[table.columns["lux"] == 900.0].any()
+
+
+@pytest.mark.parametrize(("reading", "expected"), [(np.nan, HIGH), (HIGH, HIGH), (1000.4, 1000.4), (700.0, 1262.0)])
+def test_a_prediction_beyond_an_end_is_limited_unless_a_reading_within_was_recorded(reading, expected):
+    """With a step of 1, the reading of 1000.4 is at the end, and the residual there is 0."""
+    lamp = replace(LAMP, noise={"range": (0, HIGH), "step": 1.0})
+    table = RunTable({"d_m": np.array([1.0, 2.0]), "lux": np.array([reading, 300.0])})
+    predicted = System.of(lamp, table).chain(table, ()).predict(TRUE_LIMITED[None, :], table)
+    np.testing.assert_allclose(predicted, [[expected, BACK + FULL / 4]])
+
+
+def test_an_advised_row_beyond_the_range_tells_nothing():
+    plan = RunTable({"d_m": np.array([0.9, 1.0, 2.0])})
+    system = System.of(LAMP, plan)
+    _, slopes = Model(system, (), plan).predict_and_differentiate(_coordinates_of(system, TRUE_LIMITED))
+    assert not slopes[:2].any()
+    assert slopes[2].all()
+
+
+def test_a_reading_beyond_an_end_takes_no_change_that_is_added():
+    _, found, law = _fitted(LAMP, _lamp())
+    problem = Linearised.of(found, law)
+    beyond = found.residuals == 0
+    assert beyond.sum() > 5
+    assert not problem.whiten(np.ones((len(beyond), 1)))[beyond].any()
+    assert problem.whiten(np.ones((len(beyond), 1)))[~beyond].all()
+
+
+def test_a_predicted_mean_is_within_the_range_and_a_reading_at_its_end_is_sure_there():
+    samples = np.tile(TRUE_LIMITED, (500, 1))
+    model = FittedSystem(LAMP, ("full", "back", "expo"), samples, np.full(500, SD))
+    table = RunTable({"d_m": np.array([0.8, 1.0, 2.0]), "lux": np.array([HIGH, 700.0, 320.0])})
+    found = predict_system(model, table, rng=np.random.default_rng(1))
+    np.testing.assert_allclose(found.mean, [HIGH, HIGH, BACK + FULL / 4])
+    np.testing.assert_allclose(found.log_density[0], 0.0, atol=1e-9)
+    assert found.log_density[1] < -1000
+    assert (found.sd > 0).all()
+
+
+def test_a_reading_half_a_step_beyond_an_end_is_at_it_and_a_farther_one_is_an_error_code():
+    lamp = replace(LAMP, noise={"range": (0, HIGH), "step": 1.0})
+    table = RunTable({"d_m": np.arange(1.0, 6.0), "lux": np.array([HIGH, 1000.4, 999.4, 1001.0, 9999.0])})
+    recording = recording_from_table(lamp, table)
+    assert recording.usable.tolist() == [True, True, True, False, False]
+    assert recording.censored.tolist() == [True, True, False, False, False]
+
+
+def test_the_noise_of_a_reading_at_an_end_is_correlated_with_none():
+    prepared, found, _ = _fitted(LAMP, _lamp())
+    effect = CorrelatedNoise.for_extent(Extent.of(prepared.recording))
+    (law,) = NoiseModel((effect,), prepared.recording).laws_at(np.array([[0.5]]), found.predicted)
+    at_end = np.flatnonzero(law.censored)
+    assert at_end.size > 5
+    assert not law.carry[at_end].any()
+    assert not law.carry[at_end[at_end < len(law.carry) - 1] + 1].any()
+    assert (law.carry == 0.5).any()
+
+
+@pytest.mark.parametrize("carry", [0.0, 0.5], ids=["white", "correlated"])
+def test_a_held_out_reading_at_an_end_gains_nothing_by_another_noise(carry):
+    """Beyond the end the probability to read it is 1 whatever the noise."""
+    prepared, found, law = _fitted(LAMP, _lamp())
+    law = replace(law, carry=np.where(law.censored | np.append(True, law.censored[:-1]), 0.0, carry))
+    with_tail = replace(law, share=0.2, times=5.0)
+    parts = (found.residuals == 0).astype(np.int64), ("others", "at the end")
+    gain = held_out_gain(found, found, prepared.recording, with_tail, parts, law_of_null=law)
+    assert abs(dict(gain.by_scan)["at the end"]) < 1e-12
+
+
+def test_readings_that_are_all_at_the_ends_are_refused():
+    table = _lamp().with_columns({"lux": np.where(np.arange(150) % 2, HIGH, 0.0)})
+    with pytest.raises(ParameterError, match="readings within the declared range is 0; allowed: 12 or more"):
+        prepare_system(LAMP, table)
+
+
+def test_an_end_that_no_reading_reaches_leaves_nothing_out_however_wrong_the_simulator_is():
+    rng = np.random.default_rng(2)
+    x, w = rng.uniform(0, 10, 300), rng.uniform(0, 6, 300)
+    line = {"y": 10 + 4 * x + 28 * np.sin(w) + rng.normal(0, 0.2, 300), "x": x}
+    simulator = Simulator(
+        "y", "V", {"a": (-50, 50), "b": (0, 10)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"range": (-30, 90)},
+    )  # fmt: skip
+    assert prepare_system(simulator, table_for(simulator, line), with_effects=False).recording.usable.all()
+
+
+def test_a_walk_is_no_explanation_of_readings_at_an_end_that_the_simulator_does_not_predict_there():
+    rng = np.random.default_rng(0)
+    x, w = np.tile(np.linspace(0, 10, 60), 2), np.repeat([0.0, 1.0], 60)
+    y = np.minimum(2 + x + 6 * w * (x > 6) + rng.normal(0, 0.3, 120), 12.5)
+    simulator = Simulator(
+        "y", "V", {"a": (-10, 10), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"sd": 0.3, "range": (0, 12.5)},
+    )  # fmt: skip
+    prepared = prepare_system(simulator, table_for(simulator, {"x": x, "w": w, "y": y}))
+    assert prepared.recording.censored.sum() > 10
+    assert "random_walk" not in prepared.effects
+
+
+def test_too_few_readings_within_the_range_are_refused_in_one_line():
+    rng = np.random.default_rng(4)
+    x = np.linspace(0, 10, 60)
+    y = np.where(np.arange(60) < 5, 1 + rng.random(60), 0.0)
+    simulator = Simulator(
+        "y", "V", {"a": (-10, 10), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"range": (0, None)},
+    )  # fmt: skip
+    with pytest.raises(ParameterError, match="readings within the declared range is 5; allowed: 12 or more"):
+        prepare_system(simulator, table_for(simulator, {"x": x, "y": y}))
+
+
+def test_a_rounded_reading_at_a_declared_end_is_no_stop():
+    rng = np.random.default_rng(5)
+    x = np.linspace(0, 10, 300)
+    y = np.round(np.minimum(1 + 0.5 * x + rng.normal(0, 0.05, 300), 4.0951), 2)
+    simulator = Simulator(
+        "y", "V", {"a": (-10, 10), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"range": (0, 4.0951), "step": 0.01},
+    )  # fmt: skip
+    prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": y}), with_effects=False)
+    assert prepared.apparatus.stop is None
+    assert prepared.recording.censored.sum() > 50
+
+
+SLOPES_DEG = (6.0, 10.0, 14.0, 20.0)
+DRAG_PER_M, STOP_M = 0.25, 2.4
+
+
+def _recorded(rng):
+    """35 readings of each slope by SciPy's integrator, in centimetres with a noise of 1 cm."""
+    parts = []
+    for slope_deg in SLOPES_DEG:
+        t = np.append(0.0, 3 / 34 * (np.arange(34) + rng.uniform(0.1, 1.0, 34)))
+        pull = 9.81 * np.sin(np.radians(slope_deg))
+        x = solve_ivp(
+            lambda _, s, pull=pull: [s[1], pull - 0.35 * s[1] - DRAG_PER_M * abs(s[1]) * s[1]],
+            (0.0, 3.1), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11,
+        ).y[0]  # fmt: skip
+        parts.append((np.full(35, slope_deg), t, 100 * np.minimum(x, STOP_M) + rng.normal(0, 1.0, 35)))
+    return dict(zip(("slope_deg", "t_s", "x_cm"), map(np.concatenate, zip(*parts, strict=True)), strict=True))
+
+
+@pytest.mark.slow
+def test_a_drag_is_found_beside_the_stop_behind_which_the_law_alone_slides_on():
+    """About the law alone no drag is seen; beside the stop another gravity in one run was named at .98."""
+    table = {**_recorded(np.random.default_rng(511)), "go": np.repeat(np.arange(4.0), 35)}
+    law = Law(
+        {"x": 0.0, "v": 0.0},
+        lambda s, p, u: {"x": s["v"], "v": p["g"] * np.sin(np.radians(u["slope_deg"])) - p["damp"] * s["v"]},
+        lambda s, p, u: 100 * s["x"],
+    )
+    prior = {"damp": (0.0, 3.0), "g": ("normal", 9.81, 0.02)}
+    chute = Simulator("x_cm", "cm", prior, law=law, time="t_s", run="go", noise={"sd": 1.0})
+    found = diagnose_system(chute, table, rng=np.random.default_rng(1))
+    likely = [set(h.effects) for h in found.hypotheses if h.probability > 0.05]
+    assert likely
+    assert all(names in ({"limit:x", "drag:v"}, {"limit:x", "quadratic:v:v"}) for names in likely)  # one law: v > 0
+    stop = next(effect for effect in found.effects if effect.name == "limit:x").parameters[0]
+    assert abs(stop.mean - STOP_M) < 4 * stop.sd

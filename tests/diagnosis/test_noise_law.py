@@ -1,0 +1,260 @@
+"""Distributions of the noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from probewise.diagnosis import diagnose
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.noise_law import NoiseLaw, Tail, white_noise
+from probewise.diagnosis.noise_models import NoiseModel, log_prior_of_lost_value, rough_sd
+from probewise.effects import Extent
+from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
+from probewise.recordings import Recording, paper_plan, two_way_plan
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
+
+PLAN = paper_plan()
+N = len(PLAN)
+SD = 0.6
+MEAN = 35.0 + 25.0 * np.tanh(PLAN.x_mm / 8)
+
+
+def heavy(share: float, times: float, n: int = 50) -> NoiseLaw:
+    return NoiseLaw(np.ones(n), np.zeros(n), np.zeros(n, dtype=np.bool_), share, times)
+
+
+def found_with(noise: np.ndarray, slope: np.ndarray | None = None) -> tuple[Fit, Recording]:
+    """Make a fit of one parameter at its prior's centre."""
+    slopes = np.zeros((N, 1)) if slope is None else slope[:, None]
+    model = cast(Any, SimpleNamespace(sensor=SimpleNamespace(has_exchangeable_gaussians=False)))
+    return Fit(model, np.zeros(1), MEAN, noise, slopes, SD, 0.0), Recording(PLAN, MEAN + noise)
+
+
+def log_mixture(z: np.ndarray, share: float, times: float) -> np.ndarray:
+    return np.logaddexp(math.log1p(-share) + norm.logpdf(z), math.log(share) + norm.logpdf(z, scale=times))
+
+
+@pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
+def test_the_misfit_is_minus_the_log_density(share, times):
+    z = np.random.default_rng(0).normal(size=(50, 3)) * [1.0, 2.0, 5.0]
+    sigma = np.array([1.0, 1.5, 2.0])
+    found = heavy(share, times).minus_log_likelihood(z, sigma) + 25 * math.log(2 * math.pi)
+    wanted = -np.sum(log_mixture(z / sigma, share, times) - np.log(sigma), axis=0)
+    np.testing.assert_allclose(found, wanted)
+
+
+def test_the_scale_is_where_the_misfit_is_least():
+    z = np.random.default_rng(1).normal(size=(50, 1))
+    z[:3] *= 9
+    law = heavy(0.05, 8.0)
+    sigma = law.likeliest_sigma(z)
+    trial = sigma * np.linspace(0.8, 1.25, 451)
+    misfits = np.array([float(law.minus_log_likelihood(z, np.array([s]))[0]) for s in trial])
+    assert trial[misfits.argmin()] == pytest.approx(float(sigma[0]), rel=1e-2)
+
+
+def test_a_tail_that_is_not_there_is_none():
+    """With the floor of the scale too: white and nearly white noise are to have the same evidence."""
+    z = np.random.default_rng(2).normal(size=(50, 2))
+    thin, none = heavy(1e-12, 3.0), white_noise(50)
+    for floor in (0.0, 3.0):
+        bounded, sigma = thin.with_least_sigma(floor), none.with_least_sigma(floor).likeliest_sigma(z)
+        np.testing.assert_allclose(bounded.likeliest_sigma(z), sigma, rtol=1e-6)
+        np.testing.assert_allclose(
+            bounded.minus_log_likelihood(z, sigma), none.minus_log_likelihood(z, sigma), rtol=1e-6
+        )
+
+
+@pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
+def test_pseudo_residuals_say_as_much_as_the_density_does(share, times):
+    """Their mean follows a shift of the noise one to one, and their variance is one over the information."""
+    rng = np.random.default_rng(3)
+    n = 400_000
+    z = rng.normal(size=n) * np.where(rng.random(n) < share, times, 1.0)
+    tail = Tail(share, times)
+    one = np.ones(1)
+    plain, moved = (tail.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
+    assert np.var(plain) == pytest.approx(1 / float(tail.fisher_information), rel=0.02)
+    assert np.abs(plain).max() < 10
+
+
+def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
+    lost = np.zeros(50, dtype=np.bool_)
+    lost[7] = True
+    law = NoiseLaw(np.ones(50), np.zeros(50), lost, 0.05, 8.0)
+    drawn = law.draw_pseudo_residuals(4000, rng=np.random.default_rng(0))
+    assert drawn[~lost].std() == pytest.approx(1.0, rel=0.02)
+    np.testing.assert_array_equal(drawn[7], 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "effect",
+    [None, CorrelatedNoise(), SignalDependentNoise(), DriftingNoise(), Outliers()],
+    ids=lambda e: type(e).__name__,
+)
+def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
+    """Route two: a grid over both, for each node. A floor of the scale that is below it plays no part."""
+    rng = np.random.default_rng(4)
+    slope = rng.normal(size=N)
+    noise = SD * rng.normal(size=N) * np.where(rng.random(N) < 0.03, 6.0, 1.0)
+    found, recording = found_with(noise, slope)
+    evidence = laplace_evidence(found, NoiseModel(() if effect is None else (effect,), recording, least_sd=0.6 * SD))
+    step = np.linspace(-0.2, 0.2, 161)
+    log_sigma = math.log(SD) + np.linspace(-1.0, 1.2, 221)
+    for node in (0, len(evidence.nodes.laws) // 2):
+        law = evidence.nodes.laws[node]
+        whitened = law(noise)[:, None] - law(slope)[:, None] * step
+        total = []
+        for s in log_sigma:
+            z = whitened / math.exp(s)
+            density = log_mixture(z, law.share, law.times) if law.share else norm.logpdf(z)
+            total.append(logsumexp(density.sum(axis=0) - N * s + norm.logpdf(step)))
+        cell = (step[1] - step[0]) * (log_sigma[1] - log_sigma[0])
+        by_grid = float(logsumexp(total)) + math.log(cell) - law.half_log_det()
+        own = evidence.log_z_nodes[node] - evidence.nodes.log_weights[node]
+        assert own == pytest.approx(by_grid, abs=0.05)
+
+
+def test_readings_lost_to_one_value_are_no_wide_ones():
+    rng = np.random.default_rng(5)
+    noise = SD * rng.normal(size=N)
+    lost = np.array([30, 90, 200, 310])
+    noise[lost] = -MEAN[lost]
+    found, recording = found_with(noise)
+    log_z = {
+        type(e).__name__: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
+        for e in (Dropouts(), Outliers())
+    }
+    plain = laplace_evidence(found, NoiseModel((), recording, least_sd=1e-6)).log_z
+    assert log_z["Dropouts"] > log_z["Outliers"] + 3 > plain + 50
+    law = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6)).likeliest_law
+    np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
+
+
+@pytest.mark.parametrize(("value", "lost"), [(0.0, True), (100.0, True), (37.0, False)])
+def test_one_reading_at_an_end_of_the_declared_range_is_lost(value, lost):
+    """Elsewhere one reading says nothing of what others would be lost to, and is wide."""
+    rng = np.random.default_rng(15)
+    noise = SD * rng.normal(size=N)
+    at = int(np.argmax(np.abs(MEAN - value)))
+    noise[at] = value - MEAN[at]
+    found, recording = found_with(noise)
+    dropouts = Dropouts.for_extent(Extent.of(recording))
+    log_z = {
+        type(e).__name__: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
+        for e in (dropouts, Outliers())
+    }
+    if lost:
+        assert log_z["Dropouts"] > log_z["Outliers"] + 3
+    else:
+        assert log_z["Dropouts"] == -math.inf
+
+
+def test_two_readings_that_agree_say_more_than_one_at_an_end():
+    rng = np.random.default_rng(16)
+    noise = SD * rng.normal(size=N)
+    dark, bright = np.argsort(MEAN)[:1], np.argsort(MEAN)[-2:]
+    noise[dark], noise[bright] = 100.0 - MEAN[dark], 37.0 - MEAN[bright]
+    found, recording = found_with(noise)
+    law = laplace_evidence(
+        found, NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
+    ).likeliest_law
+    np.testing.assert_array_equal(np.flatnonzero(law.lost), np.sort(bright))
+
+
+def test_the_prior_of_what_is_lost_to_sums_to_one():
+    """Of a hundred cells of the range two are its ends, each of them likely."""
+    others = 98 * math.exp(log_prior_of_lost_value(37.0, 100.0, (0.0, 100.0)))
+    assert others + 2 * math.exp(log_prior_of_lost_value(100.0, 100.0, (0.0, 100.0))) == pytest.approx(1.0)
+    assert log_prior_of_lost_value(100.0, 100.0, ()) == -math.log(100.0)
+
+
+def test_an_own_effect_may_lose_readings_too():
+    class Blind(Dropouts):
+        name = "blind"
+
+        def apply(self, value, theta, plan):
+            return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
+
+    noise = SD * np.random.default_rng(5).normal(size=N)
+    noise[[30, 90, 200]] = -MEAN[[30, 90, 200]]
+    found, recording = found_with(noise)
+    law = laplace_evidence(found, NoiseModel((Blind(), Dropouts()), recording, least_sd=1e-6)).likeliest_law
+    np.testing.assert_array_equal(np.flatnonzero(law.lost), [30, 90, 200])
+
+
+class OfDeclaredSds(Recording):
+    """Readings of which each has a declared sd of its own."""
+
+    @property
+    def relative_sd(self):
+        return np.geomspace(0.25, 4.0, N)
+
+
+def test_lost_readings_are_found_where_every_reading_has_a_declared_sd_of_its_own():
+    """Their value is that of the readings, and no two residuals over their own sds agree."""
+    predicted = np.linspace(40.0, 60.0, N)
+    readings = predicted + 0.1 * np.geomspace(0.25, 4.0, N) * np.random.default_rng(0).standard_normal(N)
+    lost = [10, 21, 33, 160, 291]
+    readings[lost] = 12.1
+    recording = OfDeclaredSds(PLAN, readings)
+    model = NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
+    nodes = model.nodes_for_predictions(predicted)
+    np.testing.assert_array_equal(nodes.settings[:, 1], 12.1)  # to the last digit
+    np.testing.assert_array_equal(np.flatnonzero(nodes.laws[0].lost), lost)
+
+
+def test_where_nothing_is_lost_there_is_no_such_law():
+    found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
+    evidence = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))
+    assert evidence.log_z == -math.inf
+    assert evidence.nodes.laws == ()
+
+
+def test_a_law_of_some_scans_is_that_of_the_whole():
+    found, recording = found_with(np.zeros(N))
+    law = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(found.predicted).laws[20]
+    rows = PLAN.scan == 1
+    r = np.random.default_rng(7).normal(size=N)
+    np.testing.assert_allclose(law.take_readings(rows)(r[rows]), law(r)[rows])
+
+
+def test_the_rough_sd_needs_no_model():
+    _, recording = found_with(SD * np.random.default_rng(8).normal(size=N))
+    assert rough_sd(recording) == pytest.approx(SD, rel=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("declared", [True, False])
+def test_lost_readings_are_found_among_rounded_ones(declared):
+    """Where most readings are just as rounded predictions are, their spread is nothing, and still not all are far."""
+    plan = two_way_plan()
+    instrumentation = replace(plan.instrumentation, step=1.0 if declared else None)
+    plan = replace(plan, instrumentation=instrumentation)
+    world = World(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5))
+    rng = np.random.default_rng(3)
+    readings = np.round(world.expected_readings(plan) + 0.45 * rng.standard_normal(len(plan)))
+    readings[rng.choice(len(plan), 16, replace=False)] = 3.0
+    found = diagnose(Recording(plan, readings), rng=rng)
+    assert found.verdict == "noise"
+    assert "dropouts" in found.combination
+    lost = next(effect for effect in found.effects if effect.name == "dropouts")
+    assert lost.parameters[1].mean == pytest.approx(3.0, abs=0.01)
+
+
+def test_walks_that_differ_less_than_readings_tell_need_no_other_fit():
+    law = replace(white_noise(50), walk=np.full(50, 0.5))
+    assert law.is_practically_equal(replace(law, walk=1.15 * law.walk))
+    assert not law.is_practically_equal(replace(law, walk=1.3 * law.walk))

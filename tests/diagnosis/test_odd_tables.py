@@ -1,0 +1,145 @@
+"""Tables that are hardly tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import audit_system, diagnose_system, fit_simulator
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.left_out import recording_from_table
+from probewise.errors import ParameterError
+from probewise.systems import Law, Simulator, table_for
+
+_N = 40
+_X, _T = np.linspace(0.0, 1.0, _N), 0.5 * np.arange(_N)
+_Y = 1.0 + 2.0 * _X + 0.05 * np.random.default_rng(0).standard_normal(_N)
+_HALF = np.where(_X < 0.5, np.nan, _Y)
+
+
+def _line(**more):
+    return Simulator("y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], **more)
+
+
+_RUNS_AWAY = Simulator(
+    "y", "V", {"a": (-3, 3)}, law=Law({"s": 0.5}, lambda s, p, u: {"s": p["a"] * s["s"] ** 2}), time="t"
+)
+_TABLES = {
+    "all times equal": (_line(time="t"), {"t": np.zeros(_N), "x": _X, "y": _Y}),
+    "repeated times": (_line(time="t"), {"t": np.repeat(_T[::4], 4), "x": _X, "y": _Y}),
+    "runs of one row": (_line(run="r"), {"r": np.arange(float(_N)), "x": _X, "y": _Y}),
+    "a run without a reading": (_line(run="r"), {"r": np.repeat([1.0, 2.0], _N // 2), "x": _X, "y": _HALF}),
+    "a column of runs that nobody named": (_line(), {"x": _X, "run": np.repeat([1.0, 2.0], _N // 2), "y": _Y}),
+    "columns named as covariates are": (_line(), {"x": _X, "time": _T, "level": _X**2, "previous": _X, "y": _Y}),
+    "readings that are met exactly": (_line(time="t"), {"t": _T, "x": _X, "y": 1.0 + 2.0 * _X}),
+    "one reading out of this world": (_line(), {"x": _X, "y": np.where(np.arange(_N) == 20, 1e9, _Y)}),
+    "a law that runs away": (_RUNS_AWAY, {"t": 0.02 * _T, "y": 1 / (2 - 0.03 * _T) + 0.01 * (_Y - 1 - 2 * _X)}),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", _TABLES)
+def test_an_odd_table_gets_a_verdict(name):
+    simulator, table = _TABLES[name]
+    diagnosis = diagnose_system(simulator, table, rng=np.random.default_rng(1))
+    assert diagnosis.verdict in ("clean", "named", "noise", "cannot_tell", "unknown")
+    assert sum(h.probability for h in diagnosis.judged.hypotheses) == pytest.approx(1.0)
+
+
+def _table_with_a_gap(*, law):
+    time, heat = 0.5 * np.arange(60), 2.0 + np.sin(0.3 * np.arange(60))
+    heat_with_gap = np.where(np.arange(60) == 12, np.nan, heat)
+    noise = 0.02 * np.random.default_rng(2).standard_normal(60)
+    if not law:
+        simulator = Simulator("y", "V", {"a": (0, 5)}, simulate=lambda p, u: p["a"] * u["heat"], time="t")
+        return simulator, {"t": time, "heat": heat_with_gap, "y": 3.0 * heat + noise, "run": np.repeat([1.0, 2.0], 30)}
+    simulator = Simulator(
+        "y",
+        "V",
+        {"a": (0, 5)},
+        law=Law({"s": 1.0}, lambda s, p, u: {"s": p["a"] * u["heat"] - s["s"]}),
+        time="t",
+        run="run",
+    )
+    state = 3.0 * heat.mean() + np.cos(time) + noise
+    return simulator, {"t": time, "heat": heat_with_gap, "y": state, "run": np.repeat([1.0, 2.0], 30)}
+
+
+@pytest.mark.parametrize("law", [False, True])
+def test_a_missing_input_leaves_out_its_readings_and_no_effect(law):
+    simulator, table = _table_with_a_gap(law=law)
+    whole = {**table, "heat": np.where(np.isnan(table["heat"]), 1.5, table["heat"])}
+    with_gap, without = (prepare_system(simulator, table_for(simulator, each)) for each in (table, whole))
+    assert set(with_gap.effects) == set(without.effects)
+    assert np.flatnonzero(~with_gap.recording.usable).tolist() == (list(range(13, 30)) if law else [12])
+    assert np.isfinite(with_gap.apparatus.about.predicted).all()
+
+
+def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column():
+    """Before, its periodic error asked for a frequency of a range that is no number, and the diagnosis ended."""
+    x = np.where(np.arange(_N) == 7, np.nan, _X)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 2.0 * np.nan_to_num(u["x"]))
+    prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": 1.0 + 2.0 * np.nan_to_num(x) + _Y - 1}))
+    assert {"periodic_error:x", "input_gain:x", "sensitivity:x"} <= set(prepared.effects)
+    assert np.isfinite(prepared.effects["periodic_error:x"].bank()).all()
+
+
+def test_an_sd_of_0_where_nothing_was_read_does_not_count():
+    """Where most rows had none, the noise was 0: a division by it ended the diagnosis, and the audit saw everything."""
+    read = np.arange(_N) % 3 == 0
+    table = {"x": _X, "sd": np.where(read, 0.05, 0.0), "y": np.where(read, _Y, np.nan)}
+    simulator = _line(noise={"sd": "sd"})
+    assert prepare_system(simulator, table_for(simulator, table)).apparatus.about.sd == 0.05
+    assert "noise 0.05 V" in audit_system(simulator, table).assumed
+
+
+def test_where_all_times_are_equal_rows_count():
+    simulator, table = _TABLES["all times equal"]
+    about = prepare_system(simulator, table_for(simulator, table)).apparatus
+    np.testing.assert_array_equal(about.covariate_values_by_name(_Y)["row"], np.arange(_N))
+
+
+def test_a_table_of_readings_alone_is_refused():
+    constant = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"])
+    with pytest.raises(ParameterError, match=r"columns is \['y'\]; allowed: a column besides the reading"):
+        prepare_system(constant, table_for(constant, {"y": _Y}))
+
+
+def test_a_row_that_no_reading_can_be_predicted_for_is_refused():
+    """Without a reading too: no effect on the mean was looked for, since none had a finite change there."""
+    x = np.where(np.arange(_N) < 5, -1.0, _X + 1)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + np.log(u["x"]))
+    table = table_for(simulator, {"x": x, "y": np.where(x < 0, np.nan, _Y)})
+    with pytest.raises(ParameterError, match=r"no finite reading in 5 of 40 rows, first in row 2'"):
+        prepare_system(simulator, table)
+    assert prepare_system(simulator, table, with_effects=False).recording.usable.sum() == _N - 5
+
+
+def test_a_missing_reading_is_no_reason_why_a_law_predicts_nothing_later_in_the_run():
+    law = Law({"s": 0.0}, lambda s, p, u: {"s": p["a"] + 0 * s["s"]}, lambda s, p, u: s["s"] + np.sqrt(10 - u["t"]))
+    simulator = Simulator("y", "V", {"a": (0, 1)}, law=law, time="t")
+    table = table_for(simulator, {"t": _T, "y": np.where(np.arange(_N) == 2, np.nan, _Y)})
+    with pytest.raises(ParameterError, match=r"rates is 'no finite reading in 19 of 40 rows, first in row 23'"):
+        prepare_system(simulator, table)
+
+
+def test_a_table_of_one_row_is_refused_in_one_line():
+    with pytest.raises(ParameterError, match="the table is 'one row'; allowed: 12 rows or more"):
+        diagnose_system(_line(), {"x": [0.5], "y": [2.0]}, rng=np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("task", [diagnose_system, fit_simulator])
+@pytest.mark.parametrize("n", [1, 40])
+def test_a_table_without_a_reading_is_refused_before_any_fit(task, n):
+    """Warnings are errors here, and a fit to no reading gives some."""
+    with pytest.raises(ParameterError, match="allowed: 12 "):
+        task(_line(), {"x": _X[:n], "y": np.full(n, np.nan)}, rng=np.random.default_rng(1))
+
+
+def test_of_a_long_table_all_hours_are_used_and_a_note_says_how_many():
+    day = np.arange(9600) / 24
+    sun = np.maximum(0.0, np.sin(2 * np.pi * (day - 0.25)))
+    simulator = Simulator("y", "K", {"a": (0, 5), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["sun"])
+    recording = recording_from_table(simulator, table_for(simulator, {"sun": sun, "y": 1 + sun}))
+    assert np.bincount(np.flatnonzero(recording.usable) % 24).min() > 50
+    assert recording.notes == ("2,400 of 9,600 readings are used, in stretches of six spread over the whole table",)

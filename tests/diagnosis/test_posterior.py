@@ -1,0 +1,199 @@
+"""Draws from a posterior: by annealing, and through predictions to second order about a point."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.hypothesis_problem import log_likelihood_marginal_over_sigma
+from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.posterior import (
+    QuadraticPredictions,
+    draw_by_annealing,
+    importance_resample,
+    surrogate_log_density,
+)
+
+
+def normal(center, factor, n, rng):
+    """Draw n times about a centre, the factor a square root of the covariance; and the density of that."""
+    inverse = np.linalg.inv(factor)
+    first = center + rng.standard_normal((n, len(center))) @ factor
+    return first, lambda z: -0.5 * np.sum(((z - center) @ inverse) ** 2, axis=1)
+
+
+def drawn(center, factor, log_p, seed, n_walkers=400, n_wanted=800):
+    rng = np.random.default_rng(seed)
+    first, log_q = normal(np.array(center), np.array(factor), n_walkers, rng)
+    return draw_by_annealing(first, log_q, log_p, n_moves=6, n_wanted=n_wanted, rng=rng)
+
+
+@pytest.mark.slow
+def test_a_wrong_approximation_is_put_right():
+    """Ten parameters, correlated by 0.8 in pairs; the approximation is off by an sd, too wide and uncorrelated."""
+    n = 10
+    covariance = np.eye(n)
+    covariance[np.arange(0, n, 2), np.arange(1, n, 2)] = covariance[np.arange(1, n, 2), np.arange(0, n, 2)] = 0.8
+    precision = np.linalg.inv(covariance)
+    means, spreads = [], []
+    for seed in range(20):
+        z = drawn(np.ones(n), 1.5 * np.eye(n), lambda z: -0.5 * np.einsum("ij,jk,ik->i", z, precision, z), seed)
+        means.append(z[:, 0].mean())
+        spreads.append(z[:, 0].var())
+    # Walkers remember: the scatter between runs says how much. Four of its errors: one false alarm in 16,000.
+    for found, truth in ((means, 0.0), (spreads, 1.0)):
+        assert abs(np.mean(found) - truth) < 4 * np.std(found, ddof=1) / np.sqrt(20) + 0.02
+        assert np.std(found) < 0.25
+
+
+def test_a_bent_density_keeps_its_moments():
+    """Route two: quadrature. x is normal, y is normal about x^2 / 2."""
+
+    def log_p(z):
+        return -0.5 * z[:, 0] ** 2 - 2 * (z[:, 1] - z[:, 0] ** 2 / 2) ** 2
+
+    x, y = np.meshgrid(np.linspace(-6, 6, 601), np.linspace(-4, 20, 1201), indexing="ij")
+    weight = np.exp(log_p(np.stack([x.ravel(), y.ravel()], axis=1)))
+    truth = np.average(y.ravel(), weights=weight), np.average(x.ravel() ** 2, weights=weight)
+    assert truth == pytest.approx((0.5, 1.0), abs=1e-3)
+    runs = [drawn([0.0, 0.0], np.diag([1.0, 0.5]), log_p, seed) for seed in range(20)]
+    for found, value in (([z[:, 1].mean() for z in runs], truth[0]), ([np.mean(z[:, 0] ** 2) for z in runs], truth[1])):
+        assert abs(np.mean(found) - value) < 4 * np.std(found, ddof=1) / np.sqrt(20) + 0.02
+
+
+def test_what_cannot_be_is_left():
+    def log_p(z):
+        return np.where(z[:, 0] > 0, -0.5 * z[:, 0] ** 2, -np.inf)
+
+    z = drawn([0.0], [[1.0]], log_p, 1)
+    assert (z > 0).all()
+    assert z.mean() == pytest.approx(np.sqrt(2 / np.pi), abs=0.2)
+
+
+def test_weights_do_where_enough_of_them_count():
+    """The density wanted is half as wide, its mean an sd aside; of more samples than wanted as many as it takes."""
+
+    def log_p(z):
+        return -2.0 * np.sum((z - 0.5) ** 2, axis=1)
+
+    weighed = []
+
+    def counted(z):
+        weighed.append(len(z))
+        return log_p(z)
+
+    means, spreads = [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        first, log_q = normal(np.zeros(3), np.eye(3), 5000, rng)
+        z = importance_resample(first, log_q, counted, n_wanted=500, rng=rng)
+        assert z.shape == (500, 3)
+        means.append(z.mean(axis=0))
+        spreads.append(z.var(axis=0))
+    assert max(weighed) < 4000
+    # Of 250 that count each: four errors of the mean of twenty runs in three parameters, one false alarm in 5,000.
+    assert np.abs(np.mean(means, axis=0) - 0.5).max() < 4 * 0.5 / np.sqrt(20 * 200)
+    assert np.abs(np.mean(spreads, axis=0) - 0.25).max() < 4 * 0.25 * np.sqrt(2) / np.sqrt(20 * 200)
+
+
+def test_weights_are_refused_where_too_few_count():
+    rng = np.random.default_rng(1)
+    first, log_q = normal(np.zeros(8), np.eye(8), 1000, rng)
+    assert (
+        importance_resample(first, log_q, lambda z: -50 * np.sum((z - 1) ** 2, axis=1), n_wanted=500, rng=rng) is None
+    )
+    assert importance_resample(first, log_q, lambda z: np.full(len(z), -np.inf), n_wanted=500, rng=rng) is None
+
+
+CENTER = np.array([0.3, -0.2, 1.0])
+STEPS = np.array([[0.4, 0.1, 0.0], [0.0, 0.3, -0.2], [0.0, 0.0, 0.5]])
+PLACES = np.linspace(0.0, 3.0, 40)
+
+
+def curve(z):
+    """A bell of free height, place and width: no polynomial of its parameters."""
+    return z[:, :1] * np.exp(-0.5 * ((PLACES - 1 - z[:, 1:2]) / z[:, 2:3]) ** 2)
+
+
+def predicted(quadratic, e):
+    return quadratic.center + quadratic.change_coefficients(e) @ quadratic.changes
+
+
+CARRY = np.where(np.arange(40) % 20 > 0, 0.4, 0.0)
+LOST = np.arange(40) == 7
+LAW = NoiseLaw(np.linspace(0.8, 1.2, 40), np.where(LOST | np.roll(LOST, 1), 0.0, CARRY), LOST)
+
+
+def noisy(sd, seed=5, law=LAW):
+    """Readings at the centre, with noise that the law makes independent."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal(40) * np.where(rng.random(40) < law.share, law.times, 1.0)
+    own = np.zeros(40)
+    for k in range(40):
+        own[k] = law.carry[k] * own[k - 1] + np.sqrt(1 - law.carry[k] ** 2) * white[k]
+    return curve(CENTER[None, :])[0] + sd * law.sd * own
+
+
+def about_the_center(e):
+    return curve(CENTER + e @ STEPS)
+
+
+def test_what_is_quadratic_is_met_everywhere():
+    rng = np.random.default_rng(3)
+    slopes, bends = rng.standard_normal((3, 40)), rng.standard_normal((3, 3, 40))
+
+    def predict(e):
+        return 2.0 + e @ slopes + np.einsum("ni,nj,ijk->nk", e, e, bends)
+
+    e = rng.standard_normal((50, 3))
+    np.testing.assert_allclose(predicted(QuadraticPredictions.of(predict, 3, 1e-9), e), predict(e), atol=1e-8)
+
+
+def test_the_steps_and_their_sums_are_met():
+    one = np.eye(3)
+    asked = np.concatenate([np.zeros((1, 3)), one, -one, one[[0]] + one[[1]], one[[1]] + one[[2]]])
+    found = QuadraticPredictions.of(about_the_center, 3, 1e-9)
+    np.testing.assert_allclose(predicted(found, asked), about_the_center(asked), atol=1e-9)
+
+
+@pytest.mark.parametrize("sd", [0.01, 1.0])
+def test_what_makes_no_difference_is_left_out(sd):
+    """All readings together, what is left out is less than a fiftieth of the noise for each of the nine terms."""
+    full, thin = QuadraticPredictions.of(about_the_center, 3, 1e-9), QuadraticPredictions.of(about_the_center, 3, sd)
+    assert thin.changes.shape[0] < full.changes.shape[0] <= 9
+    one = np.eye(3)
+    assert np.linalg.norm(predicted(full, one) - predicted(thin, one), axis=1).max() < 9 * 0.02 * sd
+
+
+def test_the_density_is_that_of_its_predictions():
+    """Route two: readings predicted one by one and whitened; it looks at a few sums alone."""
+    quadratic, readings = QuadraticPredictions.of(about_the_center, 3, 1e-9), noisy(0.05)
+    e = np.random.default_rng(5).standard_normal((30, 3))
+    z = CENTER + e @ STEPS
+    residuals = (readings - predicted(quadratic, e)).T
+    expected = log_likelihood_marginal_over_sigma(LAW, LAW(residuals)) - 0.5 * np.sum(z**2, axis=1)
+    near = surrogate_log_density(quadratic, CENTER, STEPS, readings, LAW)
+    np.testing.assert_allclose(near(e), expected, rtol=1e-9)
+    assert near(np.full((1, 3), 100.0))[0] == -np.inf
+
+
+def test_under_a_tail_the_density_falls_off_as_it_should():
+    """By the mean of the true fall over the noise: one reading's says little, and thousands differ by chance."""
+    tailed = dataclasses.replace(LAW, share=0.1, times=5.0)
+    e = 0.3 * np.random.default_rng(6).standard_normal((20, 3))
+    quadratic = QuadraticPredictions.of(about_the_center, 3, 1e-9)
+    falls = []
+    for seed in range(60):
+        readings = noisy(0.1, seed, tailed)
+        near = surrogate_log_density(quadratic, CENTER, STEPS, readings, tailed)
+        true = [
+            log_likelihood_marginal_over_sigma(tailed, tailed((readings - predicted(quadratic, at)).T))
+            for at in (e, np.zeros((1, 3)))
+        ]
+        prior = 0.5 * np.sum((CENTER + e @ STEPS) ** 2, axis=1) - 0.5 * np.sum(CENTER**2)
+        falls.append([true[1] - true[0], near(np.zeros((1, 3))) - near(e) - prior])
+    true, found = np.mean(falls, axis=0)
+    np.testing.assert_allclose(found, true, rtol=0.25, atol=0.3)
+    assert true.max() > 5

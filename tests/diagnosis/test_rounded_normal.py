@@ -1,0 +1,351 @@
+"""Rounded normal noise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from probewise.diagnosis import diagnose, diagnose_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.noise_law import NoiseLaw, RoundedNormal, stacked_density
+from probewise.diagnosis.noise_models import NoiseModel, least_sd_given_rounding, rough_sd
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.search.refits import NoiseModels
+from probewise.diagnosis.search.search import search
+from probewise.diagnosis.search.stepwise import noise_sd_about_given_null
+from probewise.effects import VOCABULARY, Extent
+from probewise.recordings import Recording, paper_plan
+from probewise.sensor import Stage
+from probewise.systems import Noise, Simulator, table_for
+from probewise.world import concealed as hidden
+from probewise.world.spots import Blob, gaussian_spot
+from probewise.world.world import World
+
+STEP, SIGMA = 4.0, 0.7
+LAW = RoundedNormal(0.5 * STEP / SIGMA, SIGMA)
+
+
+def rounded(noise_sd: float, seed: int, *concealed: hidden.Concealed) -> Recording:
+    plan = paper_plan()
+    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
+    mean = World(spot, concealed=concealed).expected_readings(plan)
+    readings = mean + noise_sd * np.random.default_rng(seed).standard_normal(len(plan))
+    return Recording(plan, STEP * np.round(readings / STEP))
+
+
+def as_declared(recording: Recording) -> Recording:
+    instrumentation = dataclasses.replace(recording.plan.instrumentation, step=STEP)
+    return dataclasses.replace(recording, plan=dataclasses.replace(recording.plan, instrumentation=instrumentation))
+
+
+def noises(recording: Recording) -> NoiseModels:
+    extent = Extent.of(recording)
+    built = {name: kind.for_extent(extent) for name, kind in VOCABULARY.items() if kind.stage is Stage.NOISE}
+    effects = {name: effect for name, effect in built.items() if effect is not None}
+    return NoiseModels(recording, effects, PriorOdds.for_effects(effects))
+
+
+def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
+    """Whatever the mean: the chance that normal noise lands within half a step of the reading, over the step."""
+    mean = np.linspace(-9.0, 9.0, 37)[:, None]
+    reading = STEP
+    cell = norm.cdf((reading + STEP / 2 - mean) / SIGMA) - norm.cdf((reading - STEP / 2 - mean) / SIGMA)
+    misfit = np.array([LAW.minus_log_likelihood(row[None], np.array([SIGMA]), 1)[0] for row in reading - mean])
+    # A difference of cumulatives is exact to 1e-16 of one, and no better: far out it says nothing.
+    told = cell[:, 0] > 1e-12
+    wanted = -np.log(cell[told, 0] / STEP) - 0.5 * np.log(2 * np.pi)
+    np.testing.assert_allclose(misfit[told], wanted, rtol=1e-6, atol=1e-9)
+    assert np.isfinite(misfit).all()
+
+
+def log_cells(residuals: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Return the log probability of each reading's cell over the step, from the tail in which it is exact."""
+    near = -np.abs(residuals)
+    cell = norm.cdf((near + STEP / 2) / sd) - norm.cdf((near - STEP / 2) / sd)
+    return np.log(np.maximum(cell, 1e-300) / STEP)
+
+
+SDS = np.tile([0.1, 1.0, 3.0], 20)
+
+
+@pytest.fixture
+def law_of_own_sds() -> NoiseLaw:
+    """Return rounded noise of readings with sds of their own, of which every tenth is lost."""
+    return NoiseLaw(SDS, np.zeros(60), np.arange(60) % 10 == 4, flat=0.5 * STEP / SIGMA, sigma=SIGMA)
+
+
+def test_a_reading_of_its_own_sd_has_the_probability_of_its_cell(law_of_own_sds):
+    law = law_of_own_sds
+    residuals = np.linspace(-1.0, 1.0, 60) * (STEP / 2 + 2 * SIGMA * SDS)
+    whitened = law(residuals)[:, None]
+    found = -law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0] - law.half_log_det()
+    wanted = log_cells(residuals, SIGMA * SDS)[~law.lost].sum()
+    assert found - 0.5 * law.n_kept * np.log(2 * np.pi) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_whitened_readings_of_their_own_sds_are_equally_informative(law_of_own_sds):
+    """Each tells of the mean as its own law does, and is drawn as such."""
+    law, rng = law_of_own_sds, np.random.default_rng(1)
+    kept, n_draws = ~law.lost, 40_000
+    drawn = law.draw_pseudo_residuals(n_draws, rng=rng)
+    noise = SIGMA * SDS[:, None] * rng.standard_normal((60, n_draws)) + STEP / 2 * rng.uniform(-1, 1, (60, n_draws))
+    pseudo = law.normal_pseudo_residuals(law(noise), np.array([SIGMA])) * np.sqrt(law.fisher_information) / SIGMA
+    # The scores of a narrow reading are rare and large, so that few draws carry their variance.
+    np.testing.assert_allclose(pseudo.std(axis=1)[kept], 1.0, rtol=0.06)
+    bounded = law.bounded_pseudo_residuals(law(noise), np.array([SIGMA])) * np.sqrt(law.fisher_information) / SIGMA
+    np.testing.assert_allclose(drawn.std(axis=1), bounded.std(axis=1), rtol=0.06)
+    own = [float(RoundedNormal(0.5 * STEP / SIGMA / sd, 1.0).fisher_information) / sd**2 for sd in SDS[kept]]
+    told = law(np.ones(60))[kept] ** 2 * law.fisher_information
+    np.testing.assert_allclose(told, own, rtol=5e-3)
+
+
+@pytest.mark.parametrize("half", [0.8, 2.0, 6.0])
+def test_pseudo_residuals_say_as_much_as_the_density_does(half):
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=400_000) + half * rng.uniform(-1, 1, 400_000)
+    flat, one = RoundedNormal(half, 1.0), np.ones(1)
+    plain, moved = (flat.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.03)
+    assert np.var(plain) == pytest.approx(1 / float(flat.fisher_information), rel=0.02)
+
+    def squared_score(x: float) -> float:
+        density = (norm.cdf(x + half) - norm.cdf(x - half)) / (2 * half)
+        slope = (norm.pdf(x + half) - norm.pdf(x - half)) / (2 * half)
+        return slope**2 / density
+
+    wanted = quad(squared_score, -half - 7, half + 7, points=[-half, half], limit=200)[0]
+    assert float(flat.fisher_information) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_inside_the_flat_top_a_residual_says_nothing():
+    inside = LAW.normal_pseudo_residuals(np.array([[0.0], [0.3]]), np.array([SIGMA]))
+    outside = LAW.normal_pseudo_residuals(np.array([[STEP]]), np.array([SIGMA]))
+    assert np.abs(inside).max() < 0.01 * outside[0, 0]
+
+
+def test_laws_of_one_kind_are_taken_together():
+    one = np.ones(5)
+    laws = [NoiseLaw(one, 0 * one, one > 1, flat=flat, sigma=1 / flat) for flat in (1.0, 3.0)]
+    z = np.linspace(-2, 2, 5)[:, None]
+    together, sigma = stacked_density(laws), np.array([1.0, 1 / 3])
+    apart = np.concatenate([law.minus_log_likelihood(z, law.likeliest_sigma(z)) for law in laws])
+    np.testing.assert_allclose(together.minus_log_likelihood(z, sigma, 5), apart)
+    np.testing.assert_allclose(together.likeliest_sigma(z, 5), sigma)
+
+
+def test_no_pseudo_residual_is_farther_than_what_was_read():
+    law = NoiseLaw(np.ones(5), np.zeros(5), np.zeros(5, dtype=np.bool_), flat=3.0, sigma=0.5)
+    z = np.array([[0.0], [0.4], [1.4], [2.5], [-9.0]])
+    pseudo = law.bounded_pseudo_residuals(z, np.array([0.5]))
+    assert (np.abs(pseudo) <= np.abs(z)).all()
+    np.testing.assert_array_equal(pseudo[3:], z[3:])
+    drawn = law.draw_pseudo_residuals(20_000, rng=np.random.default_rng(0))
+    assert 0.8 < drawn.std() < 1.0  # of unit sd but for what is cut
+
+
+@pytest.mark.parametrize("declared", [False, True])
+@pytest.mark.parametrize(("noise_sd", "coarse"), [(0.4, True), (3.0, False)])
+def test_rounding_that_hides_the_noise_is_in_its_law_declared_or_not(noise_sd, coarse, declared):
+    recording = rounded(noise_sd, 1)
+    found = noises(as_declared(recording) if declared else recording)
+    assert found.certain == (() if declared else ("quantisation",))
+    for names, model in found.models.items():
+        laws = model.nodes_for_predictions(recording.readings).laws
+        assert all(bool(law.flat) == (coarse and names == found.certain) for law in laws)
+
+
+@pytest.mark.parametrize("order", ["sorted", "shuffled"])
+@pytest.mark.parametrize("spread", [1.0, 10.0])
+def test_rounding_is_found_in_whatever_order_readings_are_taken(order, spread):
+    """Successive readings may differ by the signal; of readings with declared sds, the most exact show the rounding."""
+    rng, n = np.random.default_rng(1), 100
+    x = rng.uniform(-1, 1, n)
+    x = np.sort(x) if order == "sorted" else x
+    sd = np.where(rng.random(n) < 0.5, 0.05, 0.05 * spread)
+    line = Simulator(
+        "y",
+        "V",
+        {"a": (-5, 5), "b": (-5, 5)},
+        simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        time="t",
+        noise=Noise(sd="sd"),
+    )
+    readings = 0.1 * np.round((1 + 2 * x + sd * rng.standard_normal(n)) / 0.1)
+    prepared = prepare_system(line, table_for(line, {"t": np.arange(float(n)), "x": x, "sd": sd, "y": readings}))
+    effects = {"quantisation": prepared.effects["quantisation"]}
+    prior, about = PriorOdds.for_effects(effects), noise_sd_about_given_null(prepared)
+    found = NoiseModels(prepared.recording, effects, prior, about)
+    assert found.certain == ("quantisation",)
+    assert found.models["quantisation",].rounding == pytest.approx(0.1)
+
+
+def test_a_lattice_of_printed_digits_is_no_rounding():
+    rng, x = np.random.default_rng(2), np.linspace(-1, 1, 100)
+    line = Simulator("y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"])
+    readings = np.round(1 + 2 * x + 0.05 * rng.standard_normal(100), 2)
+    prepared = prepare_system(line, table_for(line, {"x": x, "y": readings}))
+    effects = {"quantisation": prepared.effects["quantisation"]}
+    prior, about = PriorOdds.for_effects(effects), noise_sd_about_given_null(prepared)
+    assert about == pytest.approx(0.05, rel=0.3)
+    assert NoiseModels(prepared.recording, effects, prior, about).certain == ()
+
+
+@pytest.mark.parametrize("noise_sd", [0.5, 1.0, 3.0])
+def test_the_noise_of_rounded_readings_is_told_without_a_model(noise_sd):
+    """Rounding and all; the median of few values would be one of them. Less noise than half a step is told as less."""
+    rng = np.random.default_rng(5)
+    plan = paper_plan()
+    mean = 20 + 0.15 * np.arange(len(plan))
+    readings = Recording(plan, np.round(mean + noise_sd * rng.standard_normal(len(plan))))
+    wanted = np.sqrt(noise_sd**2 + 1 / 12 + 1 / 72)  # rounding, and what is the same spread over a step
+    assert rough_sd(readings) == pytest.approx(wanted, rel=0.2)
+
+
+def test_no_normal_law_sums_to_more_than_one_over_a_lattice():
+    """As narrow as it may be, about any mean, to a fifth of a percent."""
+    sd = least_sd_given_rounding(rounded(0.4, 1))
+    cells = STEP * np.arange(-9, 10)
+    sums = STEP * norm.pdf(cells, np.linspace(0, STEP / 2, 9)[:, None], sd).sum(axis=1)
+    np.testing.assert_allclose(sums, 1.0, atol=2e-3)
+    narrower = STEP * norm.pdf(cells, 0.0, 0.4 * STEP).sum()
+    assert narrower > 1.08
+
+
+@pytest.mark.parametrize("noise", ["correlated_noise", "signal_dependent_noise", "outliers"])
+def test_no_reading_is_known_better_from_those_before_it_than_a_lattice_allows(noise):
+    """Whatever the law makes of small residuals: their conditional sd is the floor's."""
+    recording = rounded(0.4, 1)
+    model = NoiseModel((noises(recording).effects[noise],), recording, least_sd=0.6 * STEP)
+    small = 0.01 * np.random.default_rng(4).standard_normal((int(recording.usable.sum()), 1))
+    for law in model.nodes_for_predictions(recording.readings[recording.usable]).laws:
+        conditional = law.likeliest_sigma(law(small)) * law.sd * np.sqrt(1 - law.carry**2)
+        assert conditional.min() == pytest.approx(0.6 * STEP)
+
+
+def test_the_nodes_of_the_noise_beside_rounding_hold_its_likeliest_sd_where_readings_declare_their_own():
+    """Residuals are divided by the declared sds once, by the law itself."""
+    plan = paper_plan()
+
+    class OfDeclaredSds(Recording):
+        @property
+        def relative_sd(self):
+            return np.tile([0.25, 1.0, 1.0, 4.0], len(plan) // 4)
+
+    predicted = np.linspace(10.0, 90.0, len(plan))
+    spread = np.tile([0.25, 1.0, 1.0, 4.0], len(plan) // 4)
+    noise = 1.2 * spread * np.random.default_rng(0).standard_normal(len(plan))
+    recording = OfDeclaredSds(plan, STEP * np.round((predicted + noise) / STEP))
+    nodes = NoiseModel((), recording, rounding=STEP, least_sd=1e-3).nodes_for_predictions(predicted)
+    halves = np.exp(np.arange(-3.0, 3.0, 0.05))
+    sds = 0.5 * STEP / halves
+    misfit = -log_cells(recording.readings - predicted, np.multiply.outer(sds, spread)).sum(axis=1)
+    assert min(law.sigma for law in nodes.laws) < sds[np.argmin(misfit)] < max(law.sigma for law in nodes.laws)
+
+
+@pytest.mark.parametrize("noise_sd", [0.3, 0.9, 1.6, 30.0])
+def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
+    """Route two: a fine grid of its logarithm, each reading the probability of its cell.
+
+    The largest is what may be left where something is missing from the mean, many steps of it.
+    """
+    rng = np.random.default_rng(7)
+    plan = paper_plan()
+    mean = 50 + 35 * np.sin(np.arange(len(plan)))
+    recording = Recording(
+        plan, STEP * np.round((mean + noise_sd * rng.standard_normal(len(plan))) / STEP)
+    ).without_declared_range()
+    nodes = NoiseModel((), recording, rounding=STEP).nodes_for_predictions(mean)
+    off = (recording.readings - mean)[:, None]
+    each = np.array([-law.minus_log_likelihood(off, law.likeliest_sigma(off))[0] for law in nodes.laws])
+
+    log_sigma = np.linspace(np.log(STEP / 30), np.log(30 * STEP), 4001)
+    near = -np.abs(off)  # where a difference of cumulatives is exact
+    cell = norm.cdf((near + STEP / 2) / np.exp(log_sigma)) - norm.cdf((near - STEP / 2) / np.exp(log_sigma))
+    grid = np.log(np.maximum(cell, 1e-300) / STEP).sum(axis=0) + 0.5 * len(plan) * np.log(2 * np.pi)
+    wanted = logsumexp(grid) + np.log(log_sigma[1] - log_sigma[0])
+    assert logsumexp(each + nodes.log_weights) == pytest.approx(wanted, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise_sd", [0.3, 0.7])
+def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise_sd):
+    """Where nine readings of ten say the same, what rounding leaves follows the place, and was taken for physics."""
+    found = diagnose(rounded(noise_sd, 1), rng=np.random.default_rng(0))
+    assert (found.verdict, found.combination) == ("noise", ("quantisation",))
+    assert found.p_value > 0.01  # one test; 0.09 and more in twenty others
+    sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
+    assert sigma == pytest.approx(noise_sd, rel=0.5)
+
+
+@pytest.mark.slow
+def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
+    found = diagnose(rounded(0.4, 1, hidden.AmbientGradient(0.15, 0.0)), rng=np.random.default_rng(0))
+    assert found.combination == ("ambient_gradient", "quantisation")
+    slope = next(effect for effect in found.effects if effect.name == "ambient_gradient").parameters[0]
+    assert abs(slope.mean - 0.15) < 4 * slope.sd
+    assert dataclasses.asdict(found.improvement)["log_evidence"] > 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise_sd", [0.9, 1.4])
+def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(noise_sd):
+    found = diagnose(as_declared(rounded(noise_sd, 1)), rng=np.random.default_rng(0))
+    assert (found.verdict, found.report.noise.model) == ("clean", "white")
+    assert found.p_value > 0.01  # one test each
+    sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
+    assert sigma == pytest.approx(np.hypot(noise_sd, STEP / np.sqrt(12)), rel=0.15)
+
+
+@pytest.mark.slow
+def test_lost_readings_are_found_among_coarsely_rounded_ones():
+    whole = rounded(0.4, 1)
+    readings = whole.readings.copy()
+    readings[np.random.default_rng(3).choice(len(readings), 8, replace=False)] = 0.0
+    found = diagnose(as_declared(Recording(whole.plan, readings)), rng=np.random.default_rng(0))
+    assert (found.verdict, found.combination) == ("noise", ("dropouts",))
+
+
+@pytest.mark.slow
+def test_where_no_three_readings_follow_each_other_nothing_says_that_a_step_is_coarse():
+    """Every second reading is missing, and the step is a sixtieth of the noise."""
+    whole = paper_plan()
+    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
+    readings = World(spot).expected_readings(whole) + 0.6 * np.random.default_rng(2).standard_normal(len(whole))
+    readings = np.where(np.arange(len(whole)) % 2, np.nan, np.round(readings, 2))
+    found = diagnose(Recording(whole, readings), rng=np.random.default_rng(0))
+    assert (found.verdict, found.report.noise.model) == ("clean", "white")
+
+
+def test_what_rivals_are_told_by_is_the_noise_of_a_reading_rounding_and_all():
+    """A whole step of noise and rounding is no less than either: of the normal part alone it would be."""
+    recording = as_declared(rounded(0.4, 1))
+    found = search(Prepared(recording, {}, None, LightSensorApparatus(), recording), max_order=1)
+    (null,) = found.evidences.fits.values()
+    assert null.law.flat > 0
+    rms = np.sqrt(np.mean(null.found.residuals**2))
+    assert null.whitened_sd == pytest.approx(rms, rel=0.15)
+    assert null.found.sd < 0.5 * null.whitened_sd
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("declared", [None, 0.2])
+def test_a_column_of_sds_beside_coarse_rounding_is_no_physics(declared):
+    """Readings of a tenth of the others' noise had as narrow a flat top as they, so far too narrow a one."""
+    rng, n = np.random.default_rng(1), 120
+    x, sd = np.sin(np.arange(n) / 11), np.where(rng.random(n) < 0.5, 0.015, 0.15)
+    noise = Noise(sd="sd") if declared is None else Noise(sd="sd", step=declared)
+    line = Simulator(
+        "y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time="t", noise=noise
+    )
+    readings = 0.2 * np.round((1 + 2 * x + sd * rng.standard_normal(n)) / 0.2)
+    table = {"t": np.arange(float(n)), "x": x, "sd": sd, "y": readings}
+    found = diagnose_system(line, table, rng=np.random.default_rng(1))
+    assert found.combination == (("quantisation",) if declared is None else ())
+    assert found.p_value > 0.05

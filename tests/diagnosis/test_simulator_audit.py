@@ -1,0 +1,114 @@
+"""Audit of a table."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from heater import heater, runs
+
+from probewise.diagnosis import audit_system
+from probewise.diagnosis import simulator_audit as system_audit
+from probewise.errors import ParameterError
+from probewise.systems import Noise, Simulator
+
+TABLE = runs()
+
+
+@pytest.fixture(scope="module")
+def audit():
+    return audit_system(heater(), TABLE)
+
+
+def of(audit, name):
+    return next(effect for effect in audit.effects if effect.name == name)
+
+
+def test_a_start_of_its_own_absorbs_an_offset_of_each_run(audit):
+    """Both add a constant to every row of a run."""
+    assert of(audit, "offset_per_run").detectability == "invisible"
+
+
+def test_an_offset_by_a_column_that_is_constant_in_runs_is_invisible_too(audit):
+    assert of(audit, "sensitivity:room_c").detectability == "invisible"
+
+
+def test_effects_that_are_the_same_are_one_class(audit):
+    """The start is added to every reading: a jump of the one is a jump of the other."""
+    assert any({"offset_step", "steps:start_c"} <= set(names) for names in audit.classes)
+
+
+def test_rows_that_show_an_effect_grow_with_the_square_of_what_is_absorbed(audit):
+    for effect in audit.effects:
+        if effect.rows is not None:
+            np.testing.assert_allclose(effect.rows, (8 / effect.share) ** 2, atol=1.0)
+
+
+def test_the_readings_play_no_part(audit):
+    bare = dataclasses.replace(TABLE, columns={k: v for k, v in TABLE.columns.items() if k != "temp_c"})
+    assert audit_system(heater(), bare).effects == audit.effects
+
+
+def test_what_needs_a_time_says_so_where_none_was_recorded():
+    simulator = heater(time=None, simulate=lambda p, data: p["start_c"] + p["gain"] * data["power_w"] * p["tau_s"])
+    found = audit_system(simulator, {**TABLE.columns})
+    assert of(found, "lag").reason == "no time was recorded"
+
+
+def test_readings_that_change_nowhere_are_refused():
+    simulator = heater(simulate=lambda p, data: p["start_c"] + 0.0 * data["t_s"], noise=Noise(sd=0.1), per_run=())
+    with pytest.raises(ParameterError, match="the same in all rows"):
+        audit_system(simulator, TABLE)
+
+
+def test_a_time_that_falls_within_a_run_is_refused_as_in_a_diagnosis():
+    simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], time="t")
+    with pytest.raises(ParameterError, match="begins anew"):
+        audit_system(simulator, {"x": np.arange(20.0), "t": np.arange(20.0) % 10})
+
+
+def test_a_plan_that_lacks_a_cell_is_told_in_which_row():
+    """Before, its readings were said to be the same in all rows."""
+    x = np.where(np.arange(40) == 7, np.nan, np.linspace(0.0, 1.0, 40))
+    simulator = Simulator("y", "V", {"a": (0, 5)}, simulate=lambda p, u: p["a"] * u["x"])
+    with pytest.raises(ParameterError, match="no finite reading in 1 of 40 rows, first in row 9"):
+        audit_system(simulator, {"x": x})
+
+
+def test_a_plan_by_the_epoch_shows_what_the_same_plan_from_0_shows():
+    x = np.random.default_rng(2).normal(size=40)
+    simulator = Simulator(
+        "y", "V", {"a": (0, 5), "b": (0, 3)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time="t"
+    )
+    near, later = (audit_system(simulator, {"t": np.arange(40.0) + shift, "x": x}) for shift in (0.0, 1.7e9))
+    expected, found = ({e.name: (e.detectability, e.share) for e in each.effects} for each in (near, later))
+    assert found.keys() == expected.keys()
+    for name, (detectability, share) in expected.items():
+        assert found[name][0] == detectability
+        assert found[name][1] == pytest.approx(share, abs=1e-3)
+
+
+@pytest.mark.parametrize("most", [100, 200])
+def test_a_part_of_a_long_table_tells_the_sizes_that_all_of_it_shows(most, monkeypatch):
+    whole = audit_system(heater(), runs(n=150))
+    monkeypatch.setattr(system_audit, "_MOST_ROWS", most)
+    part = {effect.name: effect.smallest for effect in audit_system(heater(), runs(n=150)).effects}
+    ratios = [
+        part[effect.name][0].amount / effect.smallest[0].amount
+        for effect in whole.effects
+        if effect.smallest and effect.smallest[0].amount and part[effect.name] and part[effect.name][0].amount
+    ]
+    assert len(ratios) > 10
+    np.testing.assert_allclose(np.median(ratios), 1.0, atol=0.05)
+    assert np.mean(np.abs(np.log(ratios)) < 0.2) > 0.8
+
+
+def test_rows_that_are_used_do_not_keep_step_with_a_table_that_repeats(monkeypatch):
+    """Power switches every second row; every fourth row would have it constant."""
+    monkeypatch.setattr(system_audit, "_MOST_ROWS", 75)
+    table = runs(n=100)
+    table = table.with_columns({"power_w": np.where(np.arange(300) % 2, 4.0, 2.0), "room_c": np.arange(300) % 4 / 1.0})
+    found = audit_system(heater(), table)
+    assert of(found, "sensitivity:room_c").detectability != "invisible"
+    assert of(found, "depends:gain:power_w").detectability != "invisible"

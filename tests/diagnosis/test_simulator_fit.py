@@ -1,0 +1,236 @@
+"""Starts of a simulator's fit, and its integration step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from probewise.diagnosis import diagnose_simulator as finer_step
+from probewise.diagnosis import diagnose_system
+from probewise.diagnosis.diagnose_simulator import _notes_on_integration, prepare_system, searched_at_step
+from probewise.diagnosis.left_out import recording_from_table
+from probewise.diagnosis.search.search import search
+from probewise.diagnosis.simulator_fit import fit_system, with_step_for_likely_parameters
+from probewise.systems import Law, RunTable, Simulator, System
+from probewise.systems.calls import IntegrationTally
+from probewise.systems.system import with_converged_step
+
+
+def _rates(s, p, u):
+    caught = p["eat"] * s["prey"] * s["hunters"]
+    return {"prey": p["grow"] * s["prey"] - caught, "hunters": 0.3 * caught - p["die"] * s["hunters"]}
+
+
+def test_a_fit_of_prey_and_hunters_finds_the_period_of_their_swings():
+    """From points of the prior over whole runs alone the fit ends in the valley of another period."""
+    priors = {"grow": ("log", 0.05, 5), "eat": ("log", 0.005, 0.5), "die": ("log", 0.05, 5)}
+    simulator = Simulator(
+        "n", "1/ml", priors, law=Law({"prey": 20.0, "hunters": 5.0}, _rates), time="t_d", noise={"sd": 0.3}
+    )
+    empty = RunTable({"t_d": np.linspace(0, 30, 80), "n": np.zeros(80)}, time="t_d")
+    truth = {"grow": 0.74, "eat": 0.074, "die": 0.65}
+    system = System.of(simulator, empty)
+    theta = np.array([[truth[name] for name in system.marginals]])
+    noise_free = system.chain(empty, ()).predict(theta, empty)[0]
+    readings = noise_free + 0.3 * np.random.default_rng(0).normal(size=80)
+    recording = recording_from_table(simulator, empty.with_columns({"n": readings}))
+    _, found, _ = fit_system(System.of(simulator, recording.plan), recording)
+    fitted = dict(zip(system.marginals, system.theta(found.z[None, :])[0], strict=True))
+    assert fitted == pytest.approx(truth, rel=0.03)
+
+
+SD = 0.05
+TIMES = np.arange(60.0)
+HEATED = np.where(TIMES % 20 < 10, 1.0, 0.0)
+PRIORS = {"tau_s": ("log", 0.01, 100), "gain": (0, 10)}
+LAW = Law({"x": 0.0}, lambda s, p, u: {"x": (p["gain"] * u["power"] - s["x"]) / p["tau_s"]})
+
+
+def _readings(tau, gain):
+    """Return the state at every second by the closed form: the power is held from row to row."""
+    x = [0.0]
+    for power in HEATED[:-1]:
+        x.append(gain * power + (x[-1] - gain * power) * np.exp(-1.0 / tau))
+    return np.array(x)
+
+
+def _table(tau, seed):
+    y = _readings(tau, 3.0) + SD * np.random.default_rng(seed).normal(size=len(TIMES))
+    return RunTable({"t_s": TIMES, "power": HEATED, "y": y}, time="t_s", run=None)
+
+
+def _simulator(law=LAW):
+    return Simulator("y", "K", PRIORS, law=law, time="t_s")
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    table, simulator = _table(0.15, 3), _simulator()
+    recording = recording_from_table(simulator, table)
+    return table, recording, *fit_system(System.of(simulator, table), recording)
+
+
+def test_the_step_serves_all_time_constants_that_the_readings_allow(stiff):
+    table, _, system, _, _ = stiff
+    assert system.stiff
+    for tau in (0.011, 0.05, 0.2):  # with a tenth of a second they differ by less than the noise
+        predicted = system.chain(table, ()).predict(np.array([[tau, 3.0]]), table)[0]
+        np.testing.assert_allclose(predicted, _readings(tau, 3.0), atol=0.2 * SD)
+    assert not system.tally.too_stiff
+
+
+def test_the_step_of_the_best_fit_alone_would_not(stiff):
+    """So the test above can fail: the explicit step that is still at the best fit runs away at 0.011 s."""
+    table, _, _, _, sd = stiff
+    first = with_converged_step(System.of(_simulator(), table), table, np.array([[0.15, 3.0]]), tolerance=0.02 * sd)
+    assert not first.stiff
+    predicted = first.chain(table, ()).predict(np.array([[0.011, 3.0]]), table)[0]
+    assert not np.allclose(predicted, _readings(0.011, 3.0), atol=10 * SD)
+
+
+def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():
+    table, simulator = _table(8.0, 4), _simulator()
+    recording = recording_from_table(simulator, table)
+    system, found, sd = fit_system(System.of(simulator, table), recording)
+    assert not system.stiff
+    # The step fails at 0.01 s, which the readings exclude: there it may.
+    assert with_step_for_likely_parameters(system, table, recording, found, sd) is system
+    assert not np.isfinite(system.chain(table, ()).predict(np.array([[0.01, 3.0]]), table)).all()
+
+
+def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
+    table, recording, _, found, sd = stiff
+    monkeypatch.setattr("probewise.systems.system._MOST_STEPS", 20)
+    first = System.of(_simulator(), table)
+    assert not first.tally.too_stiff
+    assert with_step_for_likely_parameters(first, table, recording, found, sd).tally.too_stiff
+
+
+def test_a_law_that_is_said_to_be_stiff_is_searched_so():
+    """As the second search is, where the repaired law needs the linearly implicit method."""
+    table, simulator = _table(8.0, 4), _simulator()
+    prepared = prepare_system(simulator, table, with_effects=False, stiff=True)
+    assert prepared.null.stiff
+    predicted = prepared.null.chain(table, ()).predict(np.array([[0.01, 3.0], [8.0, 3.0]]), table)
+    np.testing.assert_allclose(predicted[1], _readings(8.0, 3.0), atol=0.1 * SD)
+    assert np.isfinite(predicted).all()
+
+
+@pytest.mark.parametrize("sets_step", [True, False])
+def test_a_search_that_was_cut_short_advises_a_larger_step_only_where_one_was_set(sets_step):
+    (note,) = _notes_on_integration(IntegrationTally(cut_short=True), 1000, sets_step=sets_step)
+    assert "after 1,000 evaluations" in note
+    assert ("max_step_s" in note) is sets_step
+
+
+N, SD_FINER = 40, 1e-3
+TIMES_FINER = np.linspace(0.0, 4.0, N)
+KEPT = ("drag:v", "damping:v", "forcing:v", "gain_drift", "correlated_noise")
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    """A speed that falls by damping and drag, of which the law has the damping; a few of the effects."""
+    k, a, v0 = 0.4, 0.5, 20.0  # v' = -k v - a v^2
+    exact = k / ((k / v0 + a) * np.exp(k * TIMES_FINER) - a)
+    y = exact + SD_FINER * np.random.default_rng(4).normal(size=N)
+    table = RunTable({"t_s": TIMES_FINER, "v_mps": y}, time="t_s", run=None)
+    law = Law({"v": "v0"}, lambda s, p, u: {"v": -p["k"] * s["v"]}, max_step_s=0.1)
+    simulator = Simulator("v_mps", "m/s", {"k": (0, 2), "v0": (10, 30)}, law=law, time="t_s")
+    every = prepare_system(simulator, table)
+    return replace(every, effects={name: every.effects[name] for name in KEPT if name in every.effects})
+
+
+def at_step(prepared, max_step):
+    return replace(prepared, null=replace(prepared.null, max_step=max_step))
+
+
+@pytest.fixture(scope="module")
+def first(prepared):
+    return search(at_step(prepared, 0.02))
+
+
+def test_what_has_a_chance_is_refitted_and_is_as_probable_as_by_another_search(prepared, first):
+    stages = []
+    found = searched_at_step(first, 0.01, progress=lambda stage, *numbers, **note: stages.append(stage))
+    again = search(at_step(prepared, 0.01)).posterior.marginal_over_noise
+    by_mean = found.posterior.marginal_over_noise
+    assert max(by_mean, key=by_mean.get) == ("drag:v",)
+    for names, p in again.items():
+        assert by_mean.get(names, 0.0) == pytest.approx(p, abs=0.02)
+    finer = [names for (_, names), fit in found.evidences.fits.items() if fit.found.model.sensor.max_step == 0.01]
+    assert {(), ("drag:v",)} <= set(finer)
+    assert len(stages) == len(finer) < len(first.evidences.fits)
+    assert found.prepared.null.max_step == found.prepared.apparatus.system.max_step == 0.01
+    assert all(null.max_step == 0.01 for null in found.nulls.values())
+    # Effects were bound to the predictions of the coarser step, and are stored with them.
+    assert found.prepared.apparatus.about is first.prepared.apparatus.about
+
+
+def test_a_search_that_errors_of_the_integration_may_have_led_is_made_again(prepared):
+    """One step of fourth order between rows 0.1 s apart, in which the drag at first halves the speed."""
+    first = search(at_step(prepared, 0.2))
+    assert searched_at_step(first, 0.01) is None
+
+
+def test_a_null_without_a_chance_may_move_by_more(first, monkeypatch):
+    assert first.posterior.marginal_over_noise[()] < 1e-9
+    refitted = finer_step._refitted
+
+    def moved(searched, held, system):
+        return refitted(searched, held, system).with_log_evidence_shifted(0.0 if held.names else -5.0)
+
+    monkeypatch.setattr(finer_step, "_refitted", moved)
+    found = searched_at_step(first, 0.01)
+    assert found.evidences.fits[0, ()].log_z < first.evidences.fits[0, ()].log_z - 4.0
+
+
+TIMES_OF_REPAIR = np.linspace(0.0, 8.0, 41)  # about five rows a period
+SD_OF_REPAIR = 1e-4
+
+
+@pytest.fixture(scope="module")
+def swings():
+    """A spring of stiffness 36 that hardens with 20 x^3, by scipy's own integrator."""
+    noise = np.random.default_rng(3)
+    exact = solve_ivp(
+        lambda t, s: [s[1], -36.0 * s[0] - 20.0 * s[0] ** 3 - 0.1 * s[1]],
+        (0.0, TIMES_OF_REPAIR[-1]),
+        [1.0, 0.0],
+        t_eval=TIMES_OF_REPAIR,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    return exact.y[0] + noise.normal(0.0, SD_OF_REPAIR, len(TIMES_OF_REPAIR))
+
+
+@pytest.mark.slow
+def test_a_law_that_needs_finer_steps_once_it_is_repaired_gets_them(swings):
+    spring = Simulator(
+        "x_m",
+        "m",
+        {"k": ("log", 10, 100), "c": (0, 1)},
+        law=Law(
+            {"x": 1.0, "v": 0.0},
+            lambda s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]},
+        ),
+        time="t_s",
+    )
+    stages = []
+
+    def told(stage, *numbers, **note):
+        stages.append(stage)
+
+    found = diagnose_system(
+        spring, {"t_s": TIMES_OF_REPAIR, "x_m": swings}, rng=np.random.default_rng(1), progress=told
+    )
+    assert any("once more" in stage for stage in stages)
+    assert found.verdict == "named"
+    assert found.combination == ("cubic:v:x",)
+    cubic = next(effect for effect in found.effects if effect.name == "cubic:v:x")
+    a = cubic.parameters[0]
+    assert a.mean == pytest.approx(20.0, abs=4 * a.sd)
+    assert found.improvement.rms_after < 2 * SD_OF_REPAIR

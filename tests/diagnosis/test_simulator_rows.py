@@ -1,0 +1,390 @@
+"""A simulator over a table: columns, effects, runs to record next."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+from heater import runs
+
+from probewise.diagnosis.advice import Rival, measurement_separating_rivals
+from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
+from probewise.diagnosis.diagnosis import diagnosis_json
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
+from probewise.diagnosis.samples import ModelSamples
+from probewise.diagnosis.simulator_rows import (
+    SimulatorApparatus,
+    _minutes_of_runs,
+    plan_of_alternatives,
+    plan_of_sequence,
+    possible_run_commands,
+)
+from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
+from probewise.recordings import Plan
+from probewise.systems import (
+    FittedSystem,
+    Law,
+    RunTable,
+    Simulator,
+    System,
+    concatenate_tables,
+    predict_system,
+    table_for,
+)
+from probewise.systems.forms import ReferenceFit, bind_forms
+from probewise.systems.forms.binding import extract_stored_fit
+from probewise.systems.forms.formulas import formula_forms
+from probewise.systems.table import covariate_of_column, published_covariate
+
+TABLE = runs()
+
+
+def offered(controls=("power_w",), table=TABLE):
+    return {c.table.scan_names[0]: c for c in possible_run_commands(table, "temp_c", controls, "s")}
+
+
+def test_without_controls_recorded_runs_are_taken_again():
+    assert list(offered(())) == ["1 again", "2 again", "3 again"]
+
+
+def test_a_control_is_swept_held_and_switched_between_its_ends():
+    found = offered()
+    power = {name: command.table.columns["power_w"] for name, command in found.items()}
+    np.testing.assert_allclose(power["1 power_w up"][[0, -1]], [2.0, 4.0])
+    np.testing.assert_allclose(power["1 power_w down"][[0, -1]], [4.0, 2.0])
+    assert set(power["1 power_w steps"].tolist()) == {2.0, 4.0}
+    assert set(power["1 power_w middle"].tolist()) == {3.0}
+
+
+def test_a_control_is_swept_in_values_that_can_be_set():
+    """In thousandths of its range, from 2 to 4 W: two decimals would be too few, sixteen cannot be set."""
+    swept = offered()["1 power_w up"].table.columns["power_w"]
+    np.testing.assert_array_equal(swept, np.round(swept, 3))
+    np.testing.assert_allclose(swept, np.linspace(2.0, 4.0, len(swept)), atol=0.0005)
+    assert len(np.unique(swept)) == len(swept)
+
+
+def test_a_slow_run_takes_twice_the_time():
+    time = offered()["1 slow"].table.time_s
+    np.testing.assert_allclose(np.ptp(time), 2 * np.ptp(TABLE.time_s[:12]))
+
+
+def test_what_is_yet_to_be_read_is_empty():
+    assert all(np.isnan(command.table.columns["temp_c"]).all() for command in offered().values())
+
+
+def test_time_that_begins_anew_in_each_run_does_so_in_the_next():
+    assert offered()["2 again"].table.time_s[0] == 0.0
+
+
+def test_time_that_goes_on_is_later_than_all_that_was_recorded():
+    time = np.arange(float(len(TABLE)))
+    table = TABLE.with_columns({"t_s": time})
+    commands = list(offered((), table).values())
+    asked = cast(RunTable, plan_of_sequence(commands[:2], table))
+    assert (np.diff(asked.time_s) > 0).all()
+    assert asked.time_s[0] > time[-1]
+
+
+def test_commands_set_behind_each_other_are_runs_of_their_own():
+    together = cast(RunTable, plan_of_alternatives(list(offered().values())[:3], TABLE))
+    assert len(together.scan_names) == 3
+    assert set(together.like.values()) <= set(TABLE.scan_names)
+
+
+def test_no_command_has_more_than_102_readings():
+    long = runs((20.0,), n=1000)
+    assert max(len(command.table) for command in offered(table=long).values()) <= 102
+
+
+def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
+    table = runs((20.0, 21.0), names=("1", "1 again"))
+    assert list(offered((), table)) == ["1 again (2)", "1 again again"]
+
+
+def test_runs_that_differ_in_a_small_control_are_each_taken_again():
+    table = TABLE.with_columns({"power_w": 1e-10 * TABLE.columns["power_w"]})
+    assert offered(table=table).keys() == offered().keys()
+
+
+@pytest.mark.parametrize(("unit", "minutes"), [("s", 1 / 60), ("min.", 1.0), ("Month", 43_830.0), ("fortnight", None)])
+def test_the_time_that_runs_take_is_in_the_unit_of_the_table(unit, minutes):
+    """Half a minute before each run; of an unknown unit a second a reading."""
+    taken = _minutes_of_runs(TABLE, unit)
+    of_rows = len(TABLE) / 60 if minutes is None else np.ptp(TABLE.time_s) * minutes
+    assert taken == pytest.approx(0.5 + of_rows)
+
+
+@pytest.mark.parametrize("run", [None, "run"])
+def test_what_is_planned_is_what_a_diagnosis_of_both_tables_predicts(run):
+    """A warming block that starts at 20: of a FILE.py without runs a table is one run, so only one is planned."""
+    time, power = 10.0 * np.arange(34), np.where(np.arange(34) // 8 % 2 == 0, 60.0, 0.0)
+    columns = {"t_s": time, "power_w": power, "temp_c": 20.0 + 0 * time}
+    law = Law({"temp": 20.0}, lambda s, p, u: {"temp": (20 + p["gain"] * u["power_w"] - s["temp"]) / p["tau"]})
+    prior = {"gain": (0.1, 2), "tau": ("log", 10, 1000)}
+    simulator = Simulator("temp_c", "degC", prior, law=law, time="t_s", run=run, controls=("power_w",))
+    table = RunTable(columns | ({} if run is None else {run: np.full(34, "1")}), "t_s", run)
+    system = System.of(simulator, table)
+    rivals = [
+        Rival(f"{z}", Model(system, (), table), np.array([z, z]), 0.01 * np.eye(2), 0.5) for z in (0.0, 0.1)
+    ]  # 0.1 apart: more than one run is needed
+    apparatus = SimulatorApparatus(ReferenceFit(system, table, np.zeros(2), 6.0))
+    asked = measurement_separating_rivals(rivals, 6.0, cast(Plan, table), apparatus)
+    assert asked is not None
+    plan = cast(RunTable, asked.plan)
+    assert (len(plan.scan_names) == 1) == (run is None)
+    both, _ = concatenate_tables([table, RunTable(plan.columns, "t_s", run)], ["first.csv", "next.csv"])
+    theta = system.theta(np.zeros((1, 2)))
+    predicted = [system.chain(rows, ()).predict(theta, rows)[0] for rows in (plan, both)]
+    np.testing.assert_allclose(predicted[0], predicted[1][34:], rtol=1e-9)
+
+
+def test_when_time_begins_anew_does_not_depend_on_the_order_of_rows():
+    interleaved = TABLE.take(np.lexsort((TABLE.scan, TABLE.time_s)))
+    assert offered((), interleaved)["2 again"].table.time_s[0] == 0.0
+    goes_on = TABLE.with_columns({"t_s": np.arange(float(len(TABLE)))})
+    last_first = goes_on.take(np.argsort(-goes_on.scan, kind="stable"))
+    assert offered((), last_first)["2 again"].table.time_s[0] > len(TABLE) - 1
+
+
+_N = 60
+_T = 0.5 * np.arange(_N)
+_RNG = np.random.default_rng(8)
+_X = _RNG.normal(size=_N)
+_OWN = {name: _RNG.normal(size=_N) for name in ("level", "time", "run", "previous", "scan", "state:s", "room_c")}
+
+
+def _prepared(more, **options):
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"], time="t_s", **options)
+    y = 1.0 + _X + 0.1 * np.random.default_rng(9).normal(size=_N)
+    return prepare_system(simulator, table_for(simulator, {"t_s": _T, "x": _X, **more, "y": y}))
+
+
+def test_covariates_that_are_no_columns_keep_their_values_beside_columns_of_that_name():
+    prepared = _prepared({**_OWN, "days": np.repeat([1.0, 2.0], _N // 2)}, run="days")
+    predicted = np.linspace(0.0, 1.0, _N) ** 2
+    found = prepared.apparatus.covariate_values_by_name(predicted)
+    np.testing.assert_array_equal(found["level"], predicted)
+    np.testing.assert_array_equal(found["time"], _T)
+    np.testing.assert_array_equal(found["run"], np.repeat([0.0, 1.0], _N // 2))
+    np.testing.assert_allclose(found["previous"][1 : _N // 2], np.diff(predicted)[: _N // 2 - 1])
+    for name, values in _OWN.items():
+        np.testing.assert_array_equal(found[covariate_of_column(name)], values)
+    assert covariate_of_column("room_c") == "room_c"
+
+
+@pytest.mark.parametrize("name", ["level", "time", "run", "previous", "scan", "state:s", "room_c"])
+def test_every_effect_of_a_column_shows_in_it(name):
+    about = _prepared({name: _OWN[name]}).apparatus.about
+    known = set(_prepared({name: _OWN[name]}).apparatus.covariate_values_by_name(about.predicted))
+    for form in (bind_forms(about)[f"sensitivity:{name}"], *(p for p in formula_forms(about) if name in p.name)):
+        assert covariate_of_column(name) in form.covariates or "time" in form.covariates
+        assert set(form.covariates) <= known
+
+
+def test_a_formula_of_time_shows_in_time():
+    about = _prepared({}).apparatus.about
+    (square,) = (
+        form for form in formula_forms(about) if form.expression.startswith("a (t_s - ") and "^2" in form.name[-3:]
+    )
+    assert square.covariates == ("time",)
+
+
+def test_results_name_a_column_as_it_is_unless_that_means_something_else():
+    assert published_covariate(covariate_of_column("scan")) == "scan"
+    assert published_covariate(covariate_of_column("level")) == "column:level"
+    assert published_covariate("level") == "level"
+    words = _prepared({}).apparatus.words
+    assert words.covariate_in_words("level") == "predicted y"
+    assert words.covariate_in_words("column:level") == "column level"
+    assert words.covariate_in_words("slope") == "slope"
+    assert words.covariate_in_words("state:s") == "state s"
+
+
+@pytest.mark.parametrize(("name", "published"), [("scan", "scan"), ("level", "column:level"), ("room_c", "room_c")])
+def test_a_place_and_a_family_of_unknown_effects_have_the_name_that_results_have(name, published):
+    """Before, a place had "column:scan" in Python and "scan" in diagnosis.json."""
+    prepared, rows = _prepared({name: _OWN[name]}), np.arange(_N)
+    covariate = Covariate(covariate_of_column(name), _OWN[name], rows)
+    bump = np.exp(-0.5 * ((_OWN[name] - 1) / 0.3) ** 2)
+    ones = np.ones((_N, 1)) / np.sqrt(_N)
+    residual = 3 * (bump - ones @ (ones.T @ bump[:, None])[:, 0]) + 0.3 * (_X - _X.mean())
+    problem = Linearised(ones, residual, white_noise(_N), 1.0, _N)
+    draws = problem.draw_null_residuals(199, rng=np.random.default_rng(0))
+    (place,) = significant_places(problem, [covariate], ("all",), residual, draws)
+    effect, plan = bind_forms(prepared.apparatus.about)[f"sensitivity:{name}"], prepared.recording.plan
+    (of_effect,) = places_of_effect(effect, bump, covariate, None, plan, residual, p_value=0.001, size=8.0, sd=1.0)
+    assert place.covariate == of_effect.covariate == published
+    bank = bank_of_unknown_effects([covariate], _X - _X.min(), _X, np.zeros(_N, dtype=int))
+    assert set(bank.labels) <= {published, f"{published}, locally", "what was seen before", "ends of scans"}
+    assert published in bank.labels
+    assert list(clustering_log_bayes_factors(bump, [covariate])) == [f"{published}{FAR_OUT}"]
+
+
+def test_a_column_with_the_name_of_a_state_is_no_second_variable_of_that_name():
+    law = Law({"s": 0.5}, lambda s, p, u: {"s": -p["a"] * s["s"]})
+    simulator = Simulator("y", "V", {"a": (0.01, 1)}, law=law, time="t_s")
+    y = 0.5 * np.exp(-0.1 * _T) + 0.001 * _X
+    about = prepare_system(simulator, table_for(simulator, {"t_s": _T, "s": 3.0 + _X, "y": y})).apparatus.about
+    of_rate = [form for form in formula_forms(about) if form.name.startswith("formula:rate")]
+    assert of_rate
+    assert all(set(form.covariates) <= {"state:s", "time"} for form in of_rate)
+
+
+@pytest.mark.slow
+def test_a_reading_that_depends_on_a_column_called_scan_is_found_in_it():
+    """Before, the column was taken for numbers of scans, and the diagnosis ended in an IndexError."""
+    scan = _RNG.normal(20, 2, _N)
+    y = 1.0 + _X + 0.2 * (scan - 20) + 0.1 * _RNG.normal(size=_N)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"], time="t_s")
+    found = diagnose_system(simulator, {"t_s": _T, "x": _X, "scan": scan, "y": y}, rng=np.random.default_rng(1))
+    assert found.where[0].covariate == diagnosis_json(found)["where"][0]["covariate"] == "scan"
+
+
+def test_samples_of_an_effect_are_its_own_beside_a_column_whose_name_goes_on_with_a_point():
+    """As "x.1", which is how data frames name the second of two columns: their average ended in a traceback."""
+    prepared = _prepared({"x.1": _RNG.normal(size=_N)})
+    table, system = prepared.recording.plan, prepared.apparatus.system
+    effects = [prepared.effects[name] for name in ("sensitivity:x", "sensitivity:x.1")]
+    samples = ModelSamples(system.chain(table, effects), np.array([[1.0, 2.0, 3.0]]), np.ones(1), (), 0)
+    alone = ModelSamples(system.chain(table, effects[1:]), np.array([[1.0, 3.0]]), np.ones(1), (), 0)
+    assert [samples.effect_samples(effect.name).tolist() for effect in effects] == [[[2.0]], [[3.0]]]
+    assert alone.effect_samples("sensitivity:x").shape == (1, 0)
+
+
+@pytest.mark.slow
+def test_a_wave_of_days_is_named_in_a_recording_of_ten_years_with_a_long_pause():
+    """Of 150 readings in 10 years no period below 49 days was tried: the wave was taken for noise with memory."""
+    rng = np.random.default_rng(5)
+    nights = np.concatenate([np.sort(rng.choice(200, 30, replace=False)), 3650 + np.arange(0, 40, 2)])
+    times = np.sort((nights[:, None] + np.sort(rng.uniform(0.0, 0.3, (len(nights), 3)), axis=1)).ravel())
+    y = 1.0 + 0.03 * np.sin(2 * np.pi * times / 4.785) + 0.015 * rng.standard_normal(times.size)
+    simulator = Simulator(
+        "y", "V", {"offset": (-5, 5)}, simulate=lambda p, u: p["offset"] + 0 * u["t_d"], time="t_d", time_unit="d"
+    )
+    found = diagnose_system(simulator, RunTable({"t_d": times, "y": y}, time="t_d"), rng=np.random.default_rng(0))
+    assert found.verdict == "named"
+    (wave,) = [effect for effect in found.effects if effect.name == "interference"]
+    assert wave.probability > 0.9
+    hz = next(each for each in wave.parameters if each.name == "hz")
+    # How many waves passed in the pause, nobody has counted: periods apart by one of them fit as well.
+    assert 1 / hz.mean == pytest.approx(4.785, rel=5e-3)
+
+
+YEARS = np.arange(1871.0, 1971.0)
+
+
+@pytest.fixture(scope="module")
+def flow():
+    """A river that carries 250 less from 1899 on; noise with sd 130."""
+    return 1100.0 - 250.0 * (YEARS > 1898) + np.random.default_rng(11).normal(0.0, 130.0, len(YEARS))
+
+
+def in_closed_form(readings):
+    """Mean and sd of the change point: flat priors of both levels, log-uniform of the sd; marginal likelihood by gap.
+
+    Each half has n levels about its own mean: (n1 n2)^(-1/2) S^(-(n - 2) / 2), S the sum of squares about both.
+    """
+    log_p, n = [], len(readings)
+    for k in range(1, n):
+        before, after = readings[:k], readings[k:]
+        about = ((before - before.mean()) ** 2).sum() + ((after - after.mean()) ** 2).sum()
+        log_p.append(-0.5 * np.log(k * (n - k)) - 0.5 * (n - 2) * np.log(about))
+    p = np.exp(np.array(log_p) - max(log_p))
+    p /= p.sum()
+    middle = 0.5 * (YEARS[1:] + YEARS[:-1])
+    mean = float(p @ middle)
+    return mean, float(np.sqrt(p @ (middle - mean) ** 2 + 1 / 12))  # it is uniform within a gap
+
+
+def test_a_step_that_correlated_noise_imitates_is_as_well_known_as_by_the_closed_form(flow):
+    river = Simulator(
+        "volume",
+        "1e8 m3",
+        {"mean": ("normal", 1000, 300)},
+        simulate=lambda p, data: p["mean"] + 0 * data["year"],
+        time="year",
+        time_unit="year",
+    )
+    found = diagnose_system(river, {"year": YEARS, "volume": flow}, rng=np.random.default_rng(1))
+    step = next(effect for effect in found.effects if effect.name == "offset_step")
+    at = next(parameter for parameter in step.parameters if parameter.name == "at_s")
+    mean, sd = in_closed_form(flow)
+    assert sd < 3.0
+    assert at.mean == pytest.approx(mean, abs=0.5 * sd)
+    assert at.sd == pytest.approx(sd, rel=0.4)
+
+
+NAME = "depends:rate:temp_c"
+_HOURS, _TEMP = (a.ravel() for a in np.meshgrid(np.linspace(1.0, 40.0, 12), np.linspace(20.0, 80.0, 8)))
+SIMULATOR = Simulator(
+    "y",
+    "V",
+    {"start": (5, 15), "rate": ("log", 1e-4, 1.0)},
+    simulate=lambda p, u: p["start"] * np.exp(-p["rate"] * u["hours"]),
+)
+
+
+def _table(y):
+    return RunTable({"hours": _HOURS, "temp_c": _TEMP, "y": y})
+
+
+def _about(misfit):
+    table = _table(np.zeros(_HOURS.size))
+    system = System.of(SIMULATOR, table)
+    return ReferenceFit(system, table, np.zeros(system.n_params), 0.05, misfit=misfit)
+
+
+def test_a_scale_parameter_changes_linearly_first_and_by_a_factor_of_the_same_slope_second():
+    about = _about(100.0)
+    form = bind_forms(about)[NAME]
+    start, rate = about.theta[0]
+    warmer = _TEMP - _TEMP.mean()
+    linear, factor = form.variants()
+    for variant, expected in (
+        (linear, lambda a: rate + a * warmer),
+        (factor, lambda a: rate * np.exp(a / rate * warmer)),
+    ):
+        (which,) = np.unique(variant.bank()[:, :, 1])
+        chain = about.system.chain(about.table, [variant])
+        found = chain.predict(np.array([[start, rate, 3e-4, which]]), about.table)[0]
+        np.testing.assert_allclose(found, start * np.exp(-expected(3e-4) * _HOURS), rtol=1e-6)
+        assert variant.fixed == ("as_factor",)
+        assert np.isfinite(variant.prior.log_prob(np.array([[3e-4, which]])))[0]
+
+
+def test_a_misfit_that_asks_for_a_small_change_offers_the_linear_one_alone():
+    assert len(bind_forms(_about(1.0))[NAME].variants()) == 1
+
+
+@pytest.mark.single_case
+@pytest.mark.slow
+def test_a_rate_that_doubles_every_ten_degrees_is_named_with_its_slope_at_the_mean():
+    """By a factor of 64 over the table: linearly, it would fall below zero at the cold end."""
+    rng = np.random.default_rng(2)
+    rate = 0.02 * 2 ** ((_TEMP - _TEMP.mean()) / 10)
+    y = 10.0 * np.exp(-rate * _HOURS) + 0.05 * rng.standard_normal(_HOURS.size)
+    found = diagnose_system(SIMULATOR, _table(y), rng=np.random.default_rng(0))
+    assert found.verdict == "named"
+    assert found.combination == (NAME,)
+    (effect,) = [e for e in found.effects if e.name == NAME]
+    (slope,) = effect.parameters
+    assert slope.name == "a"
+    assert slope.mean == pytest.approx(0.02 * np.log(2) / 10, rel=0.05)
+    assert "exponentially" in effect.sentence
+
+
+def test_a_stored_model_of_an_earlier_version_depends_linearly():
+    """Its file holds `a` alone: predictions are those of the same file with the new parameter at 0."""
+    about = _about(1.0)
+    names = ("start", "rate", f"{NAME}.a")
+    samples = np.array([10.0, 0.02, 3e-4]) * (1 + 0.01 * np.random.default_rng(0).standard_normal((500, 3)))
+    old = FittedSystem(SIMULATOR, names, samples, np.full(500, 0.05), effects=(NAME,), known=extract_stored_fit(about))
+    mean = predict_system(old, about.table, rng=np.random.default_rng(0)).mean
+    rate = samples[:, 1:2] + samples[:, 2:] * (_TEMP - _TEMP.mean())
+    np.testing.assert_allclose(mean, (samples[:, :1] * np.exp(-rate * _HOURS)).mean(axis=0), atol=0.02)

@@ -1,0 +1,143 @@
+"""Basis functions of unknown effects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.light_sensor import varying_covariates
+from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.templates import TemplateBank
+from probewise.diagnosis.unknown_bases import (
+    PRODUCTS,
+    bank_of_unknown_effects,
+    bases_unlike_named,
+    without_products_like,
+)
+from probewise.recordings import two_way_plan
+
+PLAN = two_way_plan()
+N = len(PLAN)
+SIGNAL = 25.0 * (1 + np.tanh(PLAN.x_mm / 8))
+FORTH = np.sign(PLAN.direction_of_motion[:, 0])
+IN_X = 25.0 / 8 / np.cosh(PLAN.x_mm / 8) ** 2  # the signal's slope in the lab frame
+SLOPE = IN_X * np.where(FORTH == 0, 1.0, FORTH)  # and along the move
+STARTS = np.flatnonzero(np.diff(PLAN.scan, prepend=-1))
+BASES = bank_of_unknown_effects(varying_covariates(PLAN, np.arange(N), SIGNAL, SLOPE), SIGNAL, SLOPE, PLAN.scan)
+TEMPLATES = [BASES[k] for k in range(len(BASES.widths))]
+TIME = (PLAN.time_s - PLAN.time_s.min()) / np.ptp(PLAN.time_s)
+MISMATCHES = {
+    "a rail bent along X": IN_X * (PLAN.x_mm / 50) ** 2,
+    "a slip along X at a moment": IN_X * (TIME > 0.5),
+    "a gain that wanders in time": SIGNAL * np.sin(9 * TIME),
+    "a wave in time": np.sin(20 * TIME),
+    "a tone that slides": np.sin(2 * np.pi * (4 * TIME + 14 * TIME**2)),
+    "a bend of the response": SIGNAL * (SIGNAL.max() - SIGNAL),
+    "a gain for each angle": SIGNAL * np.cos(2 * PLAN.orientation_rad),
+    "a start of each scan": np.exp(-(np.arange(N) - np.repeat(STARTS, np.diff(STARTS, append=N))) / 2),
+    "the brightest so far": np.concatenate([np.maximum.accumulate(part) for part in np.split(SIGNAL, STARTS[1:])]),
+}
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+def test_what_varies_does_not_depend_on_the_unit(unit):
+    """Readings and a column in picoamperes; a level that is constant but for its last digit does not vary."""
+    usable = np.arange(N)
+
+    def names(signal, slope, column):
+        plan = replace(PLAN, covariates={"dark": column})
+        return [covariate.name for covariate in varying_covariates(plan, usable, signal, slope)]
+
+    assert {"level", "slope", "dark"} <= set(names(SIGNAL, SLOPE, TIME))
+    assert names(unit * SIGNAL, unit * SLOPE, unit * TIME) == names(SIGNAL, SLOPE, TIME)
+    still = unit * (30.0 + np.tile([0.0, 1e-14], N)[:N])
+    assert not {"level", "slope", "dark"} & set(names(still, still - still[0], still))
+
+
+def test_a_column_that_is_called_as_another_covariate_is_a_covariate_beside_it():
+    names = ("time", "level", "slope", "direction", "orientation", "place", "edge_distance", "dark")
+    plan = replace(PLAN, covariates=dict.fromkeys(names, 360 * TIME))
+    own = [c.name for c in varying_covariates(replace(PLAN, covariates={}), np.arange(N), SIGNAL, SLOPE)]
+    found = [c.name for c in varying_covariates(plan, np.arange(N), SIGNAL, SLOPE)]
+    added = {"dark", *(f"column {name}" for name in names if name != "dark")}
+    assert [name for name in found if name not in added] == own
+    assert added < set(found)
+
+
+@pytest.mark.parametrize("mismatch", MISMATCHES.values(), ids=MISMATCHES)
+def test_some_basis_holds_it(mismatch):
+    left = []
+    for columns in TEMPLATES:
+        amount = np.linalg.lstsq(columns, mismatch)[0]
+        left.append(float(np.sum((mismatch - columns @ amount) ** 2) / np.sum(mismatch**2)))
+    assert min(left) < 0.1
+
+
+def test_every_basis_is_of_the_rows_and_has_a_family():
+    assert len(BASES.widths) == len(BASES.labels)
+    assert BASES.columns.shape == (N, BASES.widths.sum())
+    assert all(np.isfinite(columns).all() and np.any(columns) for columns in TEMPLATES)
+
+
+def test_what_a_name_describes_is_no_unknown():
+    """One offset per run is a name's; it becomes zero, and its share of the prior is not given to other bases."""
+    rng = np.random.default_rng(3)
+    run, x = np.repeat(np.arange(6), 20), np.tile(np.linspace(0, 1, 20), 6)
+    covariates = [
+        Covariate("x", x, np.arange(len(x))),
+        Covariate("run", run.astype(np.float64), np.arange(len(x)), groups=True),
+    ]
+    signal = x + 0.1 * rng.random(len(x))
+    bases = bank_of_unknown_effects(covariates, signal, np.gradient(signal), run)
+    each = (run[:, None] == np.arange(6)).astype(np.float64)
+    mean = np.ones((len(x), 1)) / np.sqrt(len(x))
+    problem = Linearised(mean, rng.standard_normal(len(x)), white_noise(len(x)), 1.0, len(x))
+    named = TemplateBank.of([each], ["offset_per_run"], len(x))
+    left = bases_unlike_named(bases, named, problem)
+    of_runs = left.indices_by_label["run"]
+    assert len(of_runs) == len(bases.indices_by_label["run"])
+    assert [bool(np.any(left[k])) for k in of_runs] == [False] + [True] * (len(of_runs) - 1)
+    factors = left.log_bayes_factors(problem)[:, 0]
+    assert factors[of_runs[0]] < -40
+
+
+def _three_columns_and_bases():
+    """Return three columns, (3, 200), of 190, 200 and 200 rows, and the bases with and without their products."""
+    rng = np.random.default_rng(8)
+    columns = rng.normal([[20.0], [45.0], [1e-9]], [[3.0], [9.0], [1e-10]], (3, 200))
+    rows = [np.arange(10, 200), np.arange(200), np.arange(200)]
+    covariates = [Covariate(name, c[at], at) for name, c, at in zip("abc", columns, rows, strict=True)]
+    level = rng.random(200)
+    apart = bank_of_unknown_effects(covariates, level, np.gradient(level), None)
+    return columns, bank_of_unknown_effects(covariates, level, np.gradient(level), None, multiplied=covariates), apart
+
+
+def test_products_of_two_columns_are_one_family_that_no_function_of_one_imitates():
+    columns, bases, apart = _three_columns_and_bases()
+    assert PRODUCTS not in apart.labels
+    products = [bases[int(k)][:, 0] for k in bases.indices_by_label[PRODUCTS]]
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    centred[0] = np.where(np.arange(200) < 10, 0.0, columns[0] - columns[0, 10:].mean())
+    for product, (first, second) in zip(products, [(0, 1), (0, 2), (1, 2)], strict=True):
+        wanted = centred[first] * centred[second]
+        assert np.corrcoef(product, wanted)[0, 1] == pytest.approx(1.0)
+        assert np.all(product[:10] == 0) == (first == 0)
+        every = [apart[k] for k in range(len(apart.widths))]
+        left = [np.sum((wanted - t @ np.linalg.lstsq(t, wanted)[0]) ** 2) / np.sum(wanted**2) for t in every]
+        assert min(left) > 0.7
+
+
+def test_a_product_that_is_a_formula_is_no_basis():
+    """The other bases stay, whatever the formula: they are no formulas."""
+    columns, bases, apart = _three_columns_and_bases()
+    a, b, _ = columns - columns.mean(axis=1, keepdims=True)
+    problem = Linearised(np.ones((200, 1)) / np.sqrt(200), np.zeros(200), white_noise(200), 1.0, 200)
+    formulas = [(a * b)[:, None], apart[0]]
+    left = without_products_like(bases, TemplateBank.of(formulas, ["formula", "other"], 200), problem)
+    assert left.labels.count(PRODUCTS) == bases.labels.count(PRODUCTS) - 1
+    assert len(left.labels) == len(bases.labels) - 1
+    assert without_products_like(apart, TemplateBank.of(formulas, ["formula", "other"], 200), problem) is apart

@@ -1,0 +1,212 @@
+"""The verdict from probabilities."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from probewise.diagnosis.aliases import Alias
+from probewise.diagnosis.search.searched import Posterior
+from probewise.diagnosis.verdict import (
+    Hypothesis,
+    Judged,
+    decided_rare_effects,
+    hypotheses_with_verdict,
+    ranked_hypotheses,
+    shared_effects,
+    verdict_and_combination,
+    with_shared_effects,
+)
+
+NOISE = frozenset({"outliers"})
+
+
+def verdict(probabilities, *, p_value=1e-6, aliases=(), same=(), **more):
+    found = ranked_hypotheses(probabilities)
+    return verdict_and_combination(
+        found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same), **more
+    )
+
+
+def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_noise():
+    found = ranked_hypotheses(
+        {
+            (("lag",), ()): 0.3,
+            (("lag",), ("outliers",)): 0.1,
+            (("lag",), ("drifting_noise",)): 0.2,
+            (("unknown",), ()): 0.1,
+            (("unknown",), ("outliers",)): 0.1,
+            (("arm_knock",), ()): 0.2,
+        }
+    )
+    held = {h.effects: h.probability for h in found}
+    assert held == {("lag",): pytest.approx(0.5), ("unknown",): pytest.approx(0.4), ("lag", "outliers"): 0.1}
+    assert [h.probability for h in found] == sorted(held.values(), reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("unknown", "named"),
+    [
+        ({("arm_knock",): 0.9, ("unknown",): 0.05}, ("arm_knock",)),
+        ({("arm_knock", "lag"): 0.55, ("bent_rails",): 0.05}, ("arm_knock",)),
+        ({("arm_knock",): 0.6, ("arm_knock", "lag"): 0.35}, ("arm_knock",)),
+        ({("arm_knock",): 0.6, ("unknown",): 0.3}, ()),  # bases explain it about as well
+        ({("arm_knock",): 0.6, ("bent_rails",): 0.2}, ()),
+        ({("arm_knock",): 0.4}, ()),  # names of the vocabulary have the rest
+        ({("formula:reading:y:x^2",): 0.99}, ()),  # a proposal is none
+        ({("unknown",): 0.9}, ()),
+    ],
+)
+def test_a_rare_effect_is_decided_where_hardly_anything_else_out_of_vocabulary_explains_as_much(unknown, named):
+    leader = max((names for names in unknown if names != ("unknown",)), key=lambda names: unknown[names], default=())
+    assert decided_rare_effects(leader, unknown) == named
+
+
+def searched(probabilities):
+    """A search with these probabilities by effects on mean and noise, of which all out of vocabulary are unknown."""
+    posterior = Posterior(probabilities, {0: 1.0})
+    rare = [mean for mean, _ in probabilities if mean in (("arm_knock",), ("bent_rails",))]
+    return SimpleNamespace(
+        posterior=posterior,
+        evidences=SimpleNamespace(reported_shares=lambda mean: {("unknown",) if mean in rare else mean: 1.0}),
+        leading_combination_out_of_vocabulary=lambda: max(rare, key=lambda m: posterior.marginal_over_noise[m]),
+    )
+
+
+def of_probabilities(hypotheses, *, same=()):
+    return verdict_and_combination(
+        hypotheses, 1e-6, noise_names=NOISE, aliases=(), aliased_with=lambda _: frozenset(same)
+    )
+
+
+def test_a_decided_rare_effect_is_reported_by_name_on_an_alarm_only():
+    found = searched({(("arm_knock",), ()): 0.9, (("bent_rails",), ()): 0.04, (("lag",), ()): 0.06})
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 1e-6, of_probabilities)
+    assert rare == ("arm_knock",)
+    assert [h.effects for h in hypotheses] == [("arm_knock",), ("lag",), ("unknown",)]
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 0.02, of_probabilities)
+    assert (rare, hypotheses[0].effects) == ((), ("unknown",))
+
+
+def test_a_rare_effect_split_by_noise_behind_another_name_leaves_the_verdict_unknown():
+    """By name it would be .29 and .26, behind the lag's .43: weaker than the unknown that it was."""
+    found = searched(
+        {
+            (("arm_knock",), ()): 0.29,
+            (("arm_knock",), ("correlated_noise",)): 0.26,
+            (("lag",), ()): 0.43,
+            (("unknown",), ()): 0.02,
+        }
+    )
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 1e-6, of_probabilities)
+    assert rare == ()
+    assert (hypotheses[0].effects, hypotheses[0].probability) == (("unknown",), pytest.approx(0.57))
+
+
+def test_a_rare_effect_that_the_readings_cannot_tell_from_an_alias_stays_unknown():
+    found = searched({(("arm_knock",), ()): 0.7, (("lag",), ()): 0.3})
+    assert hypotheses_with_verdict(found, 1e-6, of_probabilities)[1] == ("arm_knock",)
+    hypotheses, rare, _ = hypotheses_with_verdict(found, 1e-6, lambda each: of_probabilities(each, same=[("lag",)]))
+    assert (rare, hypotheses[0].effects) == ((), ("unknown",))
+
+
+def test_physics_is_named_on_an_alarm_only():
+    sure = {(("lag",), ()): 0.9, ((), ()): 0.1}
+    assert verdict(sure) == ("named", ("lag",))
+    assert verdict(sure, p_value=0.2) == ("cannot_tell", ())
+
+
+def test_noise_is_named_without_an_alarm_of_the_mean():
+    assert verdict({((), ("outliers",)): 0.8, ((), ()): 0.2}, p_value=0.6) == ("noise", ("outliers",))
+
+
+def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_being_named():
+    two = {(("lag",), ()): 0.6, (("backlash",), ()): 0.4}
+    assert verdict(two) == ("named", ("lag",))
+    assert verdict(two, same=[("backlash",)]) == ("cannot_tell", ("lag",))
+
+
+def test_a_class_of_aliases_that_holds_half_is_not_told_apart():
+    two = {(("lag",), ()): 0.4, (("backlash",), ()): 0.3, ((), ()): 0.3}
+    pair = Alias(("backlash", "lag"), 1.0, "scan faster", 26)
+    assert verdict(two) == ("named", ("lag",))
+    assert verdict(two, aliases=(pair,)) == ("cannot_tell", ("lag",))
+
+
+def test_of_a_simulator_nothing_is_named_below_one_half():
+    """Whatever noise is beside it counts; a light sensor's contract names the leader of several."""
+    three = {(("lag",), ()): 0.4, (("drift",), ()): 0.3, (("glint",), ()): 0.3}
+    assert verdict(three) == ("named", ("lag",))
+    assert verdict(three, named_needs_half=True) == ("cannot_tell", ("lag",))
+    noisy = {(("lag",), ()): 0.4, (("lag",), ("outliers",)): 0.2, (("glint",), ()): 0.4}
+    assert verdict(noisy, named_needs_half=True) == ("named", ("lag",))
+
+
+def test_of_a_simulator_the_leader_is_the_effect_on_the_mean_with_the_most_probability_over_all_noises():
+    """An alias of a hundredth does not tip the class over one half, either."""
+    split = {(("lag",), ()): 0.33, (("lag",), ("outliers",)): 0.27, (("drift",), ()): 0.4}
+    assert verdict(split, named_needs_half=True) == ("named", ("lag",))
+    pair = Alias(("drift", "lag"), 0.95, "repeat", 26)
+    split = {(("lag",), ()): 0.49, (("lag",), ("outliers",)): 0.42, (("drift",), ()): 0.02, ((), ()): 0.07}
+    assert verdict(split, aliases=(pair,), same=[("drift",)], named_needs_half=True) == ("named", ("lag",))
+    assert verdict({((), ("outliers",)): 0.6, (("lag",), ()): 0.4}, named_needs_half=True) == ("noise", ("outliers",))
+
+
+def by_what_is_shared(verdict, combination, probabilities, *, p_value=1e-6, aliases=()):
+    hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
+    judged = with_shared_effects(Judged(verdict, combination, p_value, hypotheses, aliases=aliases), NOISE)
+    return judged.verdict, judged.combination, judged.repaired_by
+
+
+def test_an_effect_that_nearly_all_hypotheses_share_is_named_whatever_is_open_beside_it():
+    """The model is repaired by the most probable set that holds it."""
+    probabilities = {("drift", "lag"): 0.25, ("lag", "outliers"): 0.2, ("glint", "lag"): 0.5, ("drift",): 0.05}
+    judged = by_what_is_shared("cannot_tell", ("glint", "lag"), probabilities)
+    assert judged == ("named", ("lag",), ("glint", "lag"))
+    doubtful = by_what_is_shared("cannot_tell", ("glint", "lag"), probabilities, p_value=0.2)
+    assert doubtful[0] == "cannot_tell"
+
+
+def test_a_likely_partner_of_a_shared_effect_is_in_the_combination_but_not_stated():
+    probabilities = {("delay", "drag"): 0.67, ("cubic", "delay"): 0.25, ("delay",): 0.08}
+    hypotheses = tuple(Hypothesis(names, p) for names, p in probabilities.items())
+    judged = with_shared_effects(Judged("cannot_tell", ("delay", "drag"), 1e-6, hypotheses), NOISE)
+    assert (judged.verdict, judged.combination, judged.stated) == ("named", ("delay", "drag"), ("delay",))
+
+
+def test_an_effect_with_a_credible_alias_is_not_shared():
+    """Half of the probability is not enough: of 0.52 and 0.48, the prior alone decides."""
+    assert by_what_is_shared("cannot_tell", ("lag",), {("lag",): 0.52, ("drift",): 0.48})[0] == "cannot_tell"
+    joint = {("drift", "lag"): 0.8, ("lag",): 0.1, ("drift",): 0.1}  # each is in nine tenths, both in eight
+    assert by_what_is_shared("cannot_tell", ("drift", "lag"), joint)[1] == ("drift", "lag")
+    assert len(shared_effects(joint)) == 1
+
+
+def test_a_shared_fault_of_the_noise_names_no_physics():
+    probabilities = {("lag", "outliers"): 0.4, ("drift", "outliers"): 0.4, ("outliers",): 0.2}
+    judged = by_what_is_shared("cannot_tell", ("lag", "outliers"), probabilities)
+    assert judged[:2] == ("cannot_tell", ("lag", "outliers"))
+
+
+def test_noise_is_no_verdict_if_most_of_the_probability_is_on_the_mean():
+    """The leader is sought among classes of aliases: a jump and its twin, not a lone drift that is more probable."""
+    probabilities = {("outliers",): 0.3, ("drift",): 0.26, ("step",): 0.24, ("jump",): 0.2}
+    pair = Alias(("jump", "step"), 1.0, "repeat", 26)
+    judged = by_what_is_shared("noise", ("outliers",), probabilities, aliases=(pair,))
+    assert judged[:2] == ("cannot_tell", ("step",))
+    assert by_what_is_shared("noise", ("outliers",), probabilities, aliases=(pair,), p_value=0.3)[1] == ()
+    assert by_what_is_shared("noise", ("outliers",), {("outliers",): 0.5, ("drift",): 0.5})[0] == "noise"
+
+
+def test_what_fails_on_held_out_readings_is_withdrawn():
+    judged = Judged("named", ("lag",), 1e-6, (Hypothesis(("lag",), 1.0),)).with_verdict_withdrawn()
+    assert (judged.verdict, judged.combination, judged.withdrawn) == ("cannot_tell", (), True)
+
+
+def test_the_unknown_is_shared_out_over_what_it_may_be():
+    hypotheses = (Hypothesis(("unknown",), 0.8), Hypothesis((), 0.2))
+    judged = Judged("unknown", ("unknown",), 1e-6, hypotheses, unknown_shares={"time": 0.25, "level": 0.75})
+    assert judged.unknown_candidates == (("level", pytest.approx(0.6)), ("time", pytest.approx(0.2)))
+    assert (judged.unknown_probability, judged.clean_probability) == (0.8, 0.2)
+    assert judged.credible == ("unknown", "clean")

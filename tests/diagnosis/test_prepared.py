@@ -20,7 +20,7 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
 from probewise.priors import Normal, Product
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, paper_plan
-from probewise.report.covariate import covariate_values_by_place
+from probewise.report.covariates import covariate_values
 from probewise.scene import Circle
 from probewise.sensor import SSFField, mixture_parameter_names
 
@@ -198,14 +198,14 @@ def test_places_of_a_thinned_recording_are_drawn_over_all_of_it_and_scans_have_t
     level = FunctionNull(lambda p, plan: p["level"] * np.ones((1, len(plan))), Product({"level": Normal(0.0, 10.0)}))
     known = {"ambient_step": VOCABULARY["ambient_step"]}
     found = diagnose(whole, null=level, effects=known, rng=np.random.default_rng(0))
-    values = covariate_values_by_place(found)
     rows = rows_to_diagnose(whole)
     rows = rows[whole.usable[rows]]
     assert f"(From {len(rows)} of 2999 readings, evenly spread.)" in found.reason
-    np.testing.assert_array_equal(values["witness_time.svg"][rows], whole.plan.time_s[rows])
+    (time,) = (place for place in found.where if place.figure_name == "witness_time.svg")
+    np.testing.assert_array_equal(covariate_values(found, time)[rows], whole.plan.time_s[rows])
     (scan,) = (place for place in found.where if place.covariate == "scan")
-    np.testing.assert_array_equal(values[scan.figure_name][rows], whole.plan.scan[rows])
-    assert np.isfinite(values[scan.figure_name]).sum() == len(rows)
+    np.testing.assert_array_equal(covariate_values(found, scan)[rows], whole.plan.scan[rows])
+    assert np.isfinite(covariate_values(found, scan)).sum() == len(rows)
     np.testing.assert_array_equal(scan.curve_at, np.unique(whole.plan.scan[rows]))
 
 

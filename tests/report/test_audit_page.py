@@ -5,7 +5,7 @@ import pytest
 
 from probewise.diagnosis import EffectAudit
 from probewise.diagnosis.audit import DetectableSize
-from probewise.report.audit_table import audit_table
+from probewise.report.audit import audit_table
 from probewise.report.plots import audit_matrix
 
 NAMES = ["lag", "backlash", "outliers"]

@@ -6,27 +6,34 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import Place
-from probewise.report.covariate import covariate_in_words, covariate_unit
-from probewise.report.covariate_view import (
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.recordings import Recording, Uniform
+from probewise.report.covariates import (
     ResidualNoise,
     _probability_unknown_depends_on,
-    view_along_place_covariate,
+    covariate_in_words_and_unit,
+    views_of_place,
 )
 from probewise.report.diagnosis import _place_caption
 from probewise.systems import RunTable
 from probewise.systems.table import RunRecording
 
 
+def words_and_unit(name):
+    plan = SimpleNamespace(instrumentation=SimpleNamespace(unit="counts"))
+    recording = SimpleNamespace(plan=plan)
+    return covariate_in_words_and_unit(SimpleNamespace(recording=recording, apparatus=LightSensorApparatus()), name)
+
+
 @pytest.mark.parametrize("name", ["k", "c", "v", "s", "mm", "deg", "percent", "_k"])
 def test_a_letter_that_is_the_whole_name_of_a_column_is_no_unit(name):
-    assert covariate_unit(name, "counts") == ""
+    assert words_and_unit(name) == (name.replace("_", " "), "")
 
 
 def test_the_last_part_of_a_columns_name_is_its_unit_and_the_rest_its_name():
-    assert (covariate_in_words("room_c"), covariate_unit("room_c", "counts")) == ("room", "°C")
-    assert (covariate_in_words("battery_mv"), covariate_unit("battery_mv", "counts")) == ("battery", "mV")
-    assert (covariate_in_words("k"), covariate_in_words("_k")) == ("k", " k")
-    assert covariate_unit("time", "counts") == "s"
+    assert words_and_unit("room_c") == ("room", "°C")
+    assert words_and_unit("battery_mv") == ("battery", "mV")
+    assert words_and_unit("time") == ("time", "s")
 
 
 @pytest.mark.parametrize(
@@ -44,10 +51,11 @@ def test_every_category_has_its_name_on_the_axis_and_in_the_caption(covariate, v
     start, end = (None, None) if covariate == "scan" else (np.nanmin(at), np.nanmax(at))
     scan = "one" if covariate == "scan" else None
     place = Place(covariate, scan, start, end, 0.001, 5.0, np.zeros(2), np.zeros(2), np.ones(2), values=at)
-    plan = SimpleNamespace(scan_names=("one", "two"), instrumentation=SimpleNamespace(unit="V"))
-    words = SimpleNamespace(run="scan")
-    diagnosis = SimpleNamespace(recording=SimpleNamespace(plan=plan), apparatus=SimpleNamespace(words=words))
-    view = view_along_place_covariate(diagnosis, place, at)
+    rows = np.arange(len(at))
+    scans = ["one", *["two"] * (len(at) - 1)]
+    taken = Recording.from_arrays(x_mm=rows, y_mm=0, readings=rows, patterns=Uniform(0.5), unit="V", scan=scans)
+    diagnosis = SimpleNamespace(recording=taken, apparatus=LightSensorApparatus())
+    view = views_of_place(diagnosis, place)[-1]
     assert view.category_names_on_axis == names
     assert view.window == ((-0.5, 0.5) if scan else (-0.5, len(names) - 0.5))
     assert ("scan one" if scan else ", ".join(names)) in _place_caption(diagnosis, place)

@@ -16,12 +16,12 @@ from probewise.diagnosis import (
     diagnose,
 )
 from probewise.diagnosis.advice import NextMeasurement
-from probewise.diagnosis.simulator_rows import SimulatorApparatus
+from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, shipped
-from probewise.report import covariate_view
+from probewise.report import covariates
 from probewise.report import diagnosis as page
-from probewise.report.covariate import axis_label, category_name_by_value, covariate_values_by_place
-from probewise.report.covariate_view import is_scan_along_line
+from probewise.report.covariates import axis_label, category_name_by_value, covariate_values, is_scan_along_line
 from probewise.report.diagnosis_figures import noun_of_held_out_part, rows_of_scan_changed_most
 from probewise.report.plots import heldout_gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
@@ -66,10 +66,8 @@ def test_the_page_says_what_is_missing_and_what_to_do(saturated):
 
 @pytest.mark.slow
 def test_every_place_has_its_covariate_row_by_row(saturated):
-    by_witness = covariate_values_by_place(saturated)
-    assert set(by_witness) == {place.figure_name for place in saturated.where}
     for place in saturated.where:
-        values = by_witness[place.figure_name]
+        values = covariate_values(saturated, place)
         rows = np.isfinite(values)
         assert rows.any()
         if place.start is not None and category_name_by_value(saturated, place) is None:
@@ -119,7 +117,7 @@ def test_numbers_are_written_as_people_write_them():
 
 def test_labels_carry_units():
     recording = SimpleNamespace(plan=paper_plan())
-    found = SimpleNamespace(recording=recording, apparatus=SimpleNamespace(words=SimpleNamespace(run="scan")))
+    found = SimpleNamespace(recording=recording, apparatus=LightSensorApparatus())
     assert axis_label(found, "level") == "predicted reading (LEGO units)"
     assert axis_label(found, "place", "edge_0") == "place along the scans, scan edge_0 (mm)"
     assert axis_label(found, "battery_mv") == "battery (mV)"
@@ -216,7 +214,7 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
 
 def test_a_scan_whose_name_returns_is_shown_each_time():
     plan = Plan.from_arrays(x_mm=[0, 1, 2] * 3, y_mm=0, patterns=HalfPlane(0.0, 0.0), unit="V", scan=list("aaabbbaaa"))
-    shown = covariate_view.view_along_scan(SimpleNamespace(recording=SimpleNamespace(plan=plan)), "a")
+    shown = covariates.view_along_scan(SimpleNamespace(recording=SimpleNamespace(plan=plan)), "a")
     np.testing.assert_array_equal(shown.at, [0, 1, 2, np.nan, np.nan, np.nan, 0, 1, 2])
 
 
@@ -240,14 +238,10 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     apparatus = SimpleNamespace(words=SimpleNamespace(run="scan"))
     where.append(dataclasses.replace(where[2], scan="s"))
     found = SimpleNamespace(verdict="unknown", judged=judged, where=tuple(where), apparatus=apparatus)
-    monkeypatch.setattr(
-        covariate_view, "covariate_values_by_place", lambda d: {place.figure_name: np.arange(3.0) for place in d.where}
-    )
-    monkeypatch.setattr(covariate_view, "_views_of_place", lambda d, place, at: [place])
-    chance = SimpleNamespace(
-        mean_residuals=lambda d, view, after: SimpleNamespace(largest_mean_in_sds=sizes[view.covariate])
-    )
-    ordered = covariate_view.ranked_places_with_visibility(found, chance)
+    monkeypatch.setattr(covariates, "covariate_values", lambda d, place: np.arange(3.0))
+    monkeypatch.setattr(covariates, "views_of_place", lambda d, place: [place])
+    chance = SimpleNamespace(largest_mean_in_sds=lambda d, view: sizes[view.covariate])
+    ordered = covariates.ranked_places_with_visibility(found, chance)
     assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
 
 
@@ -256,11 +250,9 @@ def place_of(covariate, start):
 
 
 def test_a_columns_values_are_no_categories_though_it_is_called_as_those_of_a_light_sensor():
-    simulator = SimpleNamespace(time="t", reading="y", parameters={})
-    plan, table = SimpleNamespace(scan_names=("1", "2")), SimpleNamespace(columns={})
-    about = SimpleNamespace(system=SimpleNamespace(simulator=simulator), table=table, states={})
-    apparatus = SimulatorApparatus(about)
-    found = SimpleNamespace(apparatus=apparatus, recording=SimpleNamespace(plan=plan))
+    words = Words(null="the oven", find_signal="", settles_nothing="", run="run", covariates={})
+    plan = SimpleNamespace(scan_names=("1", "2"))
+    found = SimpleNamespace(apparatus=SimpleNamespace(words=words), recording=SimpleNamespace(plan=plan))
     for name in ("scan", "direction", "orientation"):
         assert category_name_by_value(found, place_of(name, 0.0)) is None
     assert category_name_by_value(found, place_of("run", 0.0)) == {0.0: "1", 1.0: "2"}
@@ -275,7 +267,7 @@ def test_an_effect_that_is_there_twice_has_the_name_of_diagnosis_json_in_the_tab
 def test_the_page_of_a_long_recording_counts_the_readings_that_were_diagnosed():
     readings = np.append(np.full(4999, 7.0), np.nan)
     recording = Recording.from_arrays(x_mm=np.arange(5000), y_mm=0, readings=readings, patterns=Uniform(0.5), unit="V")
-    assert page._n_readings_used(SimpleNamespace(recording=recording, apparatus=None)) < 2600
+    assert page._n_readings_used(SimpleNamespace(recording=recording, apparatus=LightSensorApparatus())) < 2600
 
 
 def test_a_held_out_part_is_called_a_run_only_if_it_is_one():
@@ -306,7 +298,7 @@ def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
     )  # fmt: skip
     found = SimpleNamespace(
         next_measurement=plan,
-        apparatus=SimpleNamespace(words=SimpleNamespace(next_plan="next_plan.csv")),
+        apparatus=LightSensorApparatus(),
         hypotheses=(),
         judged=SimpleNamespace(unknown_shares={}),
         repaired=SimpleNamespace(effects=()),
@@ -323,7 +315,5 @@ def test_a_range_far_narrower_than_all_values_is_one_number():
     values = np.append(np.linspace(10.0, 60.0, 9), [57.636938104, 57.636938115])
     place = dataclasses.replace(place_of("level", 0.0), start=57.636938104, end=57.636938115, values=values)
     plan = SimpleNamespace(instrumentation=SimpleNamespace(unit="LEGO"))
-    found = SimpleNamespace(
-        apparatus=SimpleNamespace(words=SimpleNamespace(run="scan")), recording=SimpleNamespace(plan=plan)
-    )
+    found = SimpleNamespace(apparatus=LightSensorApparatus(), recording=SimpleNamespace(plan=plan))
     assert "predicted reading, 57.64 LEGO units (p" in page._place_caption(found, place)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,8 +63,10 @@ class Words:
     `null`: the calibrated model; `find_signal`: how to obtain a signal; `settles_nothing`: no reading separates two
     aliased effects; `run`: name of a group of rows; `next_plan`, `model`: files of the next readings and of the
     repaired model; `no_cure`: what to say where no scan to add is proposed; `covariates`: words for a table's time,
-    row, level and previous row; None: not a table. `own_names`: what a person has named, such as columns, which no
-    sentence capitalises.
+    row, level and previous row; None: not a table. `units`: units of covariates whose names do not end with one,
+    "{reading}" for the readings'. `own_names`: what a person has named, such as columns, which no sentence
+    capitalises. `nothing_held_out`: why no part could be held out; `facts`: term and text of what else a report lists;
+    `tells_duration`: how long readings take is known.
     """
 
     null: str
@@ -76,6 +78,10 @@ class Words:
     no_cure: str = "no scan of this arm helps"
     covariates: Mapping[str, str] | None = None
     own_names: frozenset[str] = frozenset()
+    units: Mapping[str, str] = field(default_factory=dict)
+    nothing_held_out: str = "No scan could be held out: that takes two scans of eight readings or more."
+    facts: tuple[tuple[str, str], ...] = ()
+    tells_duration: bool = True
 
     def as_sentence(self, text: str) -> str:
         """Return a text with a capital first letter, unless its first word is a person's own name."""

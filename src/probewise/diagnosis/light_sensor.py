@@ -188,6 +188,14 @@ class LightSensorApparatus(Apparatus):
         null="the sensor",
         find_signal="scan across an edge",
         settles_nothing="no reading that this apparatus can take tells them apart",
+        units={
+            "time": "s",
+            "place": "mm",
+            "edge_distance": "mm",
+            "orientation": "degree",
+            "level": "{reading}",
+            "slope": "{reading} per mm",
+        },
     )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:

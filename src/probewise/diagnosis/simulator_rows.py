@@ -320,17 +320,24 @@ class SimulatorApparatus(Apparatus):
                 "previous": f"change of predicted {own.reading} between rows",
             },
             own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
+            units={"time": own.time_unit, "level": "{reading}", "previous": "{reading}"},
+            nothing_held_out="Nothing could be held out: that takes two runs of eight readings or more, or a single "
+            "run with about 40.",
+            facts=self._facts(),
+            tells_duration=_minutes_of_time_unit(self.about.table, own.time_unit) is not None,
         )
+
+    def _facts(self) -> tuple[tuple[str, str], ...]:
+        source = ("simulator", self.system.simulator.source or "given in Python")
+        if (caller := self.system.caller) is None:
+            return (source,)
+        how = "for all samples at once" if caller.broadcasts else "for one sample after the other"
+        return source, ("calls of simulate", f"{caller.n_calls:,}, {how}")
 
     @property
     def controls(self) -> tuple[str, ...]:
         """The columns that the simulator's file declares as controls."""
         return self.system.simulator.controls
-
-    @property
-    def tells_duration(self) -> bool:
-        """Whether the table says how long a measurement takes: it has a time, in a known unit."""
-        return _minutes_of_time_unit(self.about.table, self.system.simulator.time_unit) is not None
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""

@@ -12,9 +12,8 @@ from probewise.proof.plots import confusion_matrix, reliability_diagram
 from probewise.proof.scoring import NOISE, are_names_right, confusion_counts, leading_hypothesis, reliability_bins
 from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, gains_on_held_out_runs, name_without_target
 from probewise.recordings.table import csv_text_of_rows
-from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
+from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots.canvas import png
-from probewise.report.terms import explain_new_terms, sections_with_terms_explained
 from probewise.report.words import typeset_numbers
 
 Results = Sequence[Mapping[str, Any]]
@@ -94,12 +93,12 @@ def page_html(results: Results, rows: Sequence[ScoreRow], *, command: str, syste
         png(reliability_diagram(reliability_bins(done))),
         "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
     )
-    known: set[str] = set()
     return page(
         "How good a diagnosis is",
         answer=summary_sentence(rows, len(results)),
-        key_figure=fragment(honest, *explain_new_terms(honest, known)),
-        sections=sections_with_terms_explained(sections, known),
+        key_figure=honest,
+        sections=sections,
+        terms_in=honest,
     )
 
 

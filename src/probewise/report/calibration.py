@@ -11,7 +11,7 @@ import numpy as np
 from probewise._words import count_with_noun, unit_after_number
 from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Markup, Section, definition_list, figure, note_paragraphs, page, paragraph, table
 from probewise.report.plots.canvas import AxesGrid, png
 from probewise.report.plots.readings import (
     predicted_and_recorded_by_scan,
@@ -62,10 +62,11 @@ def figure_drawers(
     calibration: Calibration, recording: Recording, prediction: Prediction
 ) -> dict[str, Callable[[], bytes]]:
     """List the figures of a calibration by file name: functions that draw them, as PNGs."""
+    mean, sd = prediction.mean, prediction.sd
     return {
         "readings.png": lambda: png(readings_by_orientation(recording)),
-        "predicted.png": lambda: png(predicted_and_recorded_by_scan(recording, prediction.mean, prediction.sd)),
-        "residuals.png": lambda: png(standardised_residuals(recording, prediction.mean, prediction.sd)),
+        "predicted.png": lambda: png(predicted_and_recorded_by_scan(recording, mean, sd)),
+        "residuals.png": lambda: png(standardised_residuals(recording, mean, sd)),
         "ssf.png": lambda: png(spatial_sensitivity(calibration.sensor.field)),
         "ssf_by_order.png": lambda: png(draw_ssf_by_n_gaussians(calibration)),
     }
@@ -102,16 +103,13 @@ def sections(
             "Readings",
             (
                 figure(drawn["readings.png"], "Readings as recorded, along the scans; single readings are below."),
-                *_note_paragraphs(recording.notes),
+                *note_paragraphs(recording.notes),
             ),
         ),
         Section(
             "Predicted against recorded",
             (
-                figure(
-                    drawn["predicted.png"],
-                    "Recorded readings, and what the model predicts.",
-                ),
+                figure(drawn["predicted.png"], "Recorded readings, and what the model predicts."),
                 paragraph(
                     f"Chi-square per reading is {number_text(float(np.mean(z**2)), 3)} over "
                     f"{count_with_noun(int(ok.sum()), 'reading')} "
@@ -124,7 +122,7 @@ def sections(
             ),
         ),
         Section(
-            "Parameters", (ssf_centre_and_width_table(sensor), parameter_table(sensor), *_note_paragraphs(sensor.notes))
+            "Parameters", (ssf_centre_and_width_table(sensor), parameter_table(sensor), *note_paragraphs(sensor.notes))
         ),
         Section(
             "Prior",
@@ -218,7 +216,3 @@ def page_html(
         ),
         sections=sections(calibration.sensor, recording, prediction, drawn, seed=seed),
     )
-
-
-def _note_paragraphs(notes: tuple[str, ...]) -> tuple[Markup, ...]:
-    return tuple(paragraph(f"Note: {note}.") for note in notes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from probewise.diagnosis import (
     p_in_words,
 )
 from probewise.diagnosis.prepared import rows_to_diagnose
-from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.diagnosis.words import (
     effect_has_words,
     effect_in_words,
@@ -33,13 +33,28 @@ from probewise.diagnosis.words import (
     parameter_in_words,
 )
 from probewise.effects import name_without_copy_suffix
-from probewise.report.audit_table import audit_table
-from probewise.report.covariate import category_name_by_value, covariate_in_words_and_unit, term_family_in_words
-from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
+from probewise.report.audit import audit_table
+from probewise.report.covariates import (
+    ResidualNoise,
+    category_name_by_value,
+    covariate_in_words_and_unit,
+    ranked_places_with_visibility,
+    term_family_in_words,
+)
 from probewise.report.diagnosis_figures import figure_drawers, first_figure_content, noun_of_held_out_part
-from probewise.report.headline import headline
-from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
-from probewise.report.terms import explain_new_terms, sections_with_terms_explained
+from probewise.report.headline import headline as summary_sentence
+from probewise.report.html import (
+    Markup,
+    Section,
+    definition_list,
+    details,
+    figure,
+    fragment,
+    note_paragraphs,
+    page,
+    paragraph,
+    table,
+)
 from probewise.report.words import (
     duration_text,
     number_text,
@@ -56,6 +71,7 @@ _MOST_PLACES = 3
 _MOST_CREDIBLE = 6
 _LIKELY = 0.05  # probability of an effect from which it has a paragraph of its own
 _CHANCE = 0.05  # p-value above which chance is a sufficient explanation
+_AS_CALIBRATED = "The predicted mean is as calibrated: there is no repair to test on held-out readings."
 _NOISE_CAPTIONS = {
     "correlated_noise": "Correlation of residuals, by how many readings they lie apart.",
     "random_walk": "Correlation of residuals, by how many readings they lie apart: for a random walk it falls slowly.",
@@ -64,11 +80,6 @@ _NOISE_CAPTIONS = {
     "dropouts": "Recorded against predicted readings; lost readings have one value, whatever is predicted.",
     "quantisation": "Position of readings between two multiples of the rounding step; unrounded readings lie anywhere.",
 }
-
-
-def summary_sentence(diagnosis: Diagnosis) -> str:
-    """Return a diagnosis's verdict in twenty words at most."""
-    return headline(diagnosis)
 
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
@@ -100,31 +111,30 @@ def page_html(
                     ("recordings", source),
                     ("readings", f"{_n_readings_used(diagnosis)} used of {len(diagnosis.recording)}"),
                     ("seed", str(seed)),
-                    *_simulator_facts(diagnosis),
+                    *diagnosis.apparatus.words.facts,
                 )
             ),
-            *(paragraph(f"Note: {note}.") for note in (*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
+            *note_paragraphs((*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
         ),
     )
     design = () if audit is None else (Section("What these readings could have shown", _audit_elements(audit)),)
-    known: set[str] = set()
     first = fragment(
         figure(drawn["first.svg"], _first_figure_caption(diagnosis)), definition_list(_questions_and_answers(diagnosis))
     )
     return page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=summary_sentence(diagnosis),
-        key_figure=fragment(first, *explain_new_terms(f"{diagnosis.verdict} {first}", known)),
-        sections=sections_with_terms_explained([*sections(diagnosis, drawn), *design, run], known),
+        key_figure=first,
+        sections=[*sections(diagnosis, drawn), *design, run],
+        terms_in=f"{diagnosis.verdict} {first}",
     )
 
 
 def _n_readings_used(diagnosis: Diagnosis) -> int:
     """Return the number of readings diagnosed: of a long recording by a light sensor, only a part."""
-    usable = diagnosis.recording.usable
-    if isinstance(diagnosis.apparatus, SimulatorApparatus):  # its recording has the readings that are used only
-        return int(usable.sum())
-    return int(usable[rows_to_diagnose(diagnosis.recording)].sum())
+    usable, is_table = diagnosis.recording.usable, diagnosis.apparatus.words.covariates is not None
+    # A table's recording holds only the readings that are used.
+    return int((usable if is_table else usable[rows_to_diagnose(diagnosis.recording)]).sum())
 
 
 def _first_figure_caption(diagnosis: Diagnosis) -> str:
@@ -184,18 +194,6 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return facts
 
 
-def _simulator_facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """List pairs of term and text on the user's simulator and its number of calls; empty for the light sensor."""
-    if not isinstance(diagnosis.apparatus, SimulatorApparatus):
-        return []
-    system = diagnosis.apparatus.system
-    own = [("simulator", system.simulator.source or "given in Python")]
-    if system.caller is None:
-        return own
-    how = "for all samples at once" if system.caller.broadcasts else "for one sample after the other"
-    return [*own, ("calls of simulate", f"{system.caller.n_calls:,}, {how}")]
-
-
 def _formula_in_words(formula: Formula) -> str:
     """Write what a formula is added to, its parameters, and its gain in log evidence and per held-out reading."""
     numbers = ", ".join(f"{p.name} = {value_with_sd(p.mean, p.sd)}" for p in formula.parameters)
@@ -247,7 +245,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
         return "No readings that can be taken here would settle what is open."
     told = plan.expected_log_bayes_factor
     asked = count_with_noun(len(plan.plan), "reading")
-    if not isinstance(diagnosis.apparatus, SimulatorApparatus) or diagnosis.apparatus.tells_duration:
+    if diagnosis.apparatus.words.tells_duration:
         asked += f", about {duration_text(plan.minutes)}"
     description, file = plan.description.rstrip("."), diagnosis.apparatus.words.next_plan
     said = f"{description}: {asked}, {file}."
@@ -258,7 +256,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
 
 
 def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    credible = [hypothesis_in_words(_effects_in_label(label)) for label in diagnosis.judged.credible]
+    credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.judged.credible]
     return (
         *(
             paragraph(
@@ -283,16 +281,10 @@ def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     )
 
 
-def _effects_in_label(label: str) -> tuple[str, ...]:
-    """Return the names of the effects in a hypothesis's label "A+B"; none for "clean"."""
-    return () if label == "clean" else tuple(label.split("+"))
-
-
 def _credible_set_elements(names: Sequence[str]) -> tuple[Markup, ...]:
     if len(names) <= _MOST_CREDIBLE:
         return (paragraph(f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(names)}."),)
-    summary = element("summary", f"95 % credible set: {len(names)} explanations")
-    return (element("details", summary, paragraph(f"{'; '.join(names)}.")),)
+    return (details(f"95 % credible set: {len(names)} explanations", paragraph(f"{'; '.join(names)}.")),)
 
 
 def _unknown_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -300,12 +292,11 @@ def _unknown_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
-    said = ", ".join(f"{_unknown_candidate_in_words(name)} ({probability_text(p)})" for name, p in likely)
-    return (paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {said}."),)
-
-
-def _unknown_candidate_in_words(name: str) -> str:
-    return effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)
+    candidates = ", ".join(
+        f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
+        for name, p in likely
+    )
+    return (paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {candidates}."),)
 
 
 def _unstated_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
@@ -352,8 +343,7 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
         f"band.{_walk_note(diagnosis)}"
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
-    more = (element("details", element("summary", f"{len(rest)} more"), *rest),) if rest else ()
-    return (opening, *first, *more)
+    return (opening, *first, *((details(f"{len(rest)} more", *rest),) if rest else ()))
 
 
 def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
@@ -378,6 +368,7 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
+    changes = diagnosis.repair.changes_predictions
     shown = (
         (
             figure(
@@ -388,7 +379,7 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
             ),
         )
         if "gain.svg" in drawn
-        else (paragraph(_why_nothing_held_out(diagnosis)),)
+        else (paragraph(diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED),)
     )
     unit = f"{unit}{diagnosis.recording.weighting_in_words}"
     held = f"{_signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)} per reading"
@@ -408,16 +399,6 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
             )
         ),
     )
-
-
-def _why_nothing_held_out(diagnosis: Diagnosis) -> str:
-    if not diagnosis.repair.changes_predictions:
-        return "The predicted mean is as calibrated: there is no repair to test on held-out readings."
-    if isinstance(diagnosis.apparatus, SimulatorApparatus):
-        return (
-            "Nothing could be held out: that takes two runs of eight readings or more, or a single run with about 40."
-        )
-    return "No scan could be held out: that takes two scans of eight readings or more."
 
 
 def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
@@ -447,7 +428,7 @@ def _effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     shown = (_effect_table(likely),) if likely else ()
     if not rest:
         return shown
-    return (*shown, element("details", element("summary", f"{len(rest)} less likely effects"), _effect_table(rest)))
+    return (*shown, details(f"{len(rest)} less likely effects", _effect_table(rest)))
 
 
 def _effect_table(effects: Sequence[EffectFound]) -> Markup:
@@ -486,10 +467,8 @@ def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     if not ranked:
         return (paragraph("None: these readings tell apart all effects of the vocabulary that they can detect."),)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
-    if not rest:
-        return (_alias_table(first),)
-    more = element("details", element("summary", f"{len(rest)} more pairs"), _alias_table(rest))
-    return (_alias_table(first), more)
+    more = (details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()
+    return (_alias_table(first), *more)
 
 
 def _alias_table(aliases: Sequence[Alias]) -> Markup:
@@ -513,29 +492,21 @@ def _readings_needed_text(n: int) -> str:
 
 
 def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
-    def joined_or_none(found: Sequence[str]) -> str:
-        return ", ".join(found).replace("_", " ") or "none"
-
-    aliased = [f"{e.name} (with {e.alike[0][0]})" for e in audit.effects_with_detectability("aliased")]
-
+    meaning: dict[Literal["fine", "aliased", "invisible"], str] = {
+        "fine": "detected, and told from every other",
+        "aliased": "detected, but another effect can imitate it",
+        "invisible": "not detected",
+    }
+    pairs = []
+    for detectability, words in meaning.items():
+        names = [
+            f"{e.name} (with {e.alike[0][0]})" if detectability == "aliased" else e.name
+            for e in audit.effects_with_detectability(detectability)
+        ]
+        pairs.append((f"{detectability} ({words})", ", ".join(names).replace("_", " ") or "none"))
     return (
-        definition_list(
-            (
-                (
-                    "fine (detected, and told from every other)",
-                    joined_or_none([e.name for e in audit.effects_with_detectability("fine")]),
-                ),
-                (
-                    "aliased (detected, but another effect can imitate it)",
-                    joined_or_none(aliased),
-                ),
-                (
-                    "invisible (not detected)",
-                    joined_or_none([e.name for e in audit.effects_with_detectability("invisible")]),
-                ),
-            )
-        ),
-        element("details", element("summary", "every effect, with numbers"), audit_table(audit.effects)),
+        definition_list(pairs),
+        details("every effect, with numbers", audit_table(audit.effects)),
         paragraph("probewise audit PLAN.csv lists the readings that would help, before any are taken."),
     )
 

@@ -13,14 +13,14 @@ from probewise._words import unit_after_number
 from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.recordings import Plan
-from probewise.report.covariate import axis_label, covariate_values_by_place
-from probewise.report.covariate_view import (
+from probewise.report.covariates import (
     CovariateView,
     ResidualNoise,
+    axis_label,
     choose_first_figure_view,
     is_scan_along_line,
-    view_along_place_covariate,
     view_along_scan,
+    views_of_place,
 )
 from probewise.report.plots.canvas import stack_of_axes, svg
 from probewise.report.plots.noise import (
@@ -117,18 +117,11 @@ def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 
 
 def _place_svg(diagnosis: Diagnosis, noise: Callable[[], ResidualNoise], place: Place) -> bytes:
-    """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
-
-    A whole scan or run gets two panels: above, its residuals along X, Y, time or rows; below, its mean beside others.
-    """
-    chance, at = noise(), covariate_values_by_place(diagnosis)[place.figure_name]
-    by_covariate = view_along_place_covariate(diagnosis, place, at)
-    if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
-        axes = stack_of_axes([2.6])
-    else:
-        axes = stack_of_axes([2.4, 2.6])
-        _draw_means_along(diagnosis, chance, view_along_scan(diagnosis, place.scan), after=False, each=True, ax=axes[0])
-    _draw_means_along(diagnosis, chance, by_covariate, after=False, each=True, ax=axes[-1])
+    """Draw the calibrated model's residuals in each view of a place: readings, means, the band of chance."""
+    views = views_of_place(diagnosis, place)
+    axes = stack_of_axes([2.4, 2.6][-len(views) :])
+    for ax, view in zip(axes, views, strict=True):
+        _draw_means_along(diagnosis, noise(), view, after=False, each=True, ax=ax)
     return svg(axes)
 
 

@@ -6,26 +6,28 @@ from collections.abc import Callable, Mapping
 from typing import cast
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise._words import unit_after_number
 from probewise.diagnosis import SystemFit
-from probewise.report.html import Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Section, definition_list, figure, note_paragraphs, page, paragraph, table
 from probewise.report.plots.canvas import svg
 from probewise.report.plots.residuals import recorded_against_predicted, residuals_against_covariates
 from probewise.report.words import digits_of_range, number_text, typeset_numbers
 from probewise.systems import RunTable
 
-_MOST_COLUMNS = 6
+_MOST_INPUTS = 4
 _LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 
 
 def summary_sentence(fit: SystemFit) -> str:
     """Summarise a fit of a simulator in one sentence: number of readings, and rms of the residuals."""
-    unit = fit.recording.plan.instrumentation.unit_after_number
-    n = int(fit.recording.usable.sum())
-    rms = f"{fit.rms:.3g} {unit} (rms){fit.recording.weighting_in_words}"
-    return f"The simulator fits {n} readings with residuals of {rms}."
+    rms = f"{fit.rms:.3g} {fit.recording.plan.instrumentation.unit_after_number} (rms)"
+    return (
+        f"The simulator fits {fit.recording.usable.sum()} readings with residuals of {rms}"
+        f"{fit.recording.weighting_in_words}."
+    )
 
 
 def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
@@ -33,27 +35,29 @@ def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
 
     Residuals are drawn against time, predicted reading, and up to four input columns of eight distinct values or more.
     """
-    recording, own = fit.recording, fit.fitted.simulator
-    unit, readings = unit_after_number(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
+    residuals = [("fitted", fit.residuals)]
+    unit = unit_after_number(fit.fitted.simulator.unit)
     return {
-        "predicted.svg": lambda: svg(
-            recorded_against_predicted(readings, fit.predicted, fit.sd, label=own.reading, unit=unit)
-        ),
-        "residuals.svg": lambda: svg(
-            residuals_against_covariates(
-                _labelled_covariates(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
-            )
-        ),
+        "predicted.svg": lambda: svg(draw_recorded_against_predicted(fit)),
+        "residuals.svg": lambda: svg(residuals_against_covariates(_labelled_covariates(fit), residuals, unit=unit)),
     }
 
 
-def _labelled_covariates(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
-    own = fit.fitted.simulator
-    time = f"{plan.time} ({own.time_unit})" if plan.has_varying_time else "row of the table"
-    out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_after_number(own.unit)})", fit.predicted)]
-    inputs = {name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd)}
-    varying = {name: v for name, v in inputs.items() if len(np.unique(v[np.isfinite(v)])) >= _LEAST_VALUES}
-    return (*out, *list(varying.items())[: _MOST_COLUMNS - len(out)])
+def draw_recorded_against_predicted(fit: SystemFit) -> Axes:
+    """Draw each usable reading against its prediction; return the axes."""
+    simulator = fit.fitted.simulator
+    readings = np.where(fit.recording.usable, fit.recording.readings, np.nan)
+    unit = unit_after_number(simulator.unit)
+    return recorded_against_predicted(readings, fit.predicted, fit.sd, label=simulator.reading, unit=unit)
+
+
+def _labelled_covariates(fit: SystemFit) -> list[tuple[str, FloatArray]]:
+    simulator, plan = fit.fitted.simulator, cast(RunTable, fit.recording.plan)
+    time = f"{plan.time} ({simulator.time_unit})" if plan.has_varying_time else "row of the table"
+    level = f"predicted {simulator.reading} ({unit_after_number(simulator.unit)})"
+    inputs = {name: v for name, v in plan.covariates.items() if name not in (simulator.reading, simulator.noise.sd)}
+    varying = [pair for pair in inputs.items() if len(np.unique(pair[1][np.isfinite(pair[1])])) >= _LEAST_VALUES]
+    return [(time, plan.time_s), (level, fit.predicted), *varying[:_MOST_INPUTS]]
 
 
 def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
@@ -63,13 +67,10 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     error = f" ± {number_text(evidence.error, 2)}" if evidence.error else ""
     how = f"; {evidence.reason}" if evidence.reason else ""
     digits = {name: digits_of_range(*interval[name], 5) for name in own.names}
+    ends = {name: " to ".join(f"{end:.{digits[name]}g}" for end in interval[name]) for name in own.names}
     rows = [
-        (
-            name,
-            typeset_numbers(f"{median[k]:.{digits[name]}g}"),
-            typeset_numbers(" to ".join(f"{end:.{digits[name]}g}" for end in interval[name])),
-        )
-        for k, name in enumerate(own.names)
+        (name, typeset_numbers(f"{value:.{digits[name]}g}"), typeset_numbers(ends[name]))
+        for name, value in zip(own.names, median, strict=True)
     ]
     run = (
         ("readings", f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}"),
@@ -91,6 +92,6 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
                     paragraph("probewise diagnose tests them and names the physics that would explain them."),
                 ),
             ),
-            Section("This run", (definition_list(run), *(paragraph(f"Note: {note}.") for note in fit.recording.notes))),
+            Section("This run", (definition_list(run), *note_paragraphs(fit.recording.notes))),
         ],
     )

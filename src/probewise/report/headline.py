@@ -18,7 +18,7 @@ from probewise.diagnosis.words import (
     join_names,
 )
 from probewise.effects import PROPOSAL, RARE_EFFECTS
-from probewise.report.covariate import covariate_in_words_and_unit
+from probewise.report.covariates import covariate_in_words_and_unit
 from probewise.report.words import typeset_numbers
 
 MOST_WORDS = 20

@@ -1,12 +1,14 @@
-"""Self-contained HTML pages: escaped elements, embedded figures, one style sheet, no external files."""
+"""Self-contained HTML pages: escaped elements, embedded figures, technical terms explained where first used."""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from PIL import Image
 
@@ -68,16 +70,23 @@ def _table_cell(text: str, label: str) -> Markup:
     return element("td", text, **attributes)
 
 
+def details(summary: str, *content: Markup) -> Markup:
+    """Build a part of a page that is folded away under its summary."""
+    return element("details", element("summary", summary), *content)
+
+
+def note_paragraphs(notes: Iterable[str]) -> tuple[Markup, ...]:
+    """Build a paragraph for each note on a run."""
+    return tuple(paragraph(f"Note: {note}.") for note in notes)
+
+
 def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
     """Build a list of terms, each with its value."""
     return element("dl", *(fragment(element("dt", term), element("dd", value)) for term, value in pairs))
 
 
 def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
-    """Build a figure that embeds a PNG or an SVG; `alt`, by default the caption, is its alternative text.
-
-    Without an image (b""), it says that none could be drawn.
-    """
+    """Build a figure that embeds a PNG or an SVG, with `alt`, by default the caption; b"" could not be drawn."""
     if not image:
         return element("figure", paragraph("This figure could not be drawn."), element("figcaption", caption))
     kind = "svg+xml" if image.startswith(b"<svg") else "png"
@@ -95,15 +104,7 @@ def _least_width_attribute(png: bytes) -> str:
 
 
 def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
-    """Build a slideshow: embedded pictures, and a slider that selects one; without scripts the last one is shown.
-
-    Parameters
-    ----------
-    slides
-        Picture and one line of text each, in order.
-    caption
-        Caption of all pictures together.
-    """
+    """Build a slideshow of pictures, each with a line of text; without scripts the last one is shown."""
     *earlier, last = (element("div", figure(image, text), class_="slide") for image, text in slides)
     hidden = (Markup(slide.replace("<div", "<div hidden", 1)) for slide in earlier)
     n = len(slides)
@@ -114,25 +115,26 @@ def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
 
 
 def page(
-    title: str, *, answer: str, key_figure: Markup, sections: Sequence[Section], reload_s: int | None = None
+    title: str,
+    *,
+    answer: str,
+    key_figure: Markup,
+    sections: Sequence[Section],
+    terms_in: str | None = None,
+    reload_s: int | None = None,
 ) -> str:
     """Return the HTML of a page whose first screen is the answer in one sentence and the picture that shows it.
 
-    A table of contents precedes the sections if there are four or more, parts included.
-
-    Parameters
-    ----------
-    title
-        What the page is about.
-    answer
-        The answer in one sentence.
-    key_figure
-        The picture to go with it, from `figure`.
-    sections
-        Everything else, in reading order.
-    reload_s
-        Load the page anew after so many seconds; None: never.
+    A table of contents precedes the sections, which are in reading order, if there are four or more, parts included.
+    With `terms_in`, the text of the first screen, technical terms are explained below its picture and in the section
+    that first uses them. The page is loaded again after `reload_s` seconds; None: never.
     """
+    if terms_in is not None:
+        known: set[str] = set()
+        key_figure = fragment(key_figure, *_explain_new_terms(terms_in, known))
+        sections = [
+            replace(s, body=(*s.body, *_explain_new_terms(" ".join((s.heading, *s.body)), known))) for s in sections
+        ]
     body = fragment(
         element("header", element("h1", title), paragraph(answer, class_="answer")),
         key_figure,
@@ -151,6 +153,19 @@ def page(
     return f"<!doctype html>\n{document}\n"
 
 
+def _explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
+    """Build the paragraph on an HTML text's terms not in `known`, empty if there is none; add the terms to `known`."""
+    text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
+    new: list[str] = []
+    while text:  # an explanation may use a term itself
+        used = [term for term, (pattern, _) in _TERMS.items() if term not in known and re.search(pattern, text)]
+        known.update(used)
+        new += used
+        text = " ".join(_TERMS[term][1] for term in used)
+    parts = [part for term in new for part in (element("b", term), f": {_TERMS[term][1]}. ")]
+    return (paragraph(*parts, class_="terms"),) if parts else ()
+
+
 def _section_element(section: Section, number: str, level: int) -> Markup:
     parts = (_section_element(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
     heading = element(f"h{level}", section.heading)
@@ -158,7 +173,6 @@ def _section_element(section: Section, number: str, level: int) -> Markup:
 
 
 def _table_of_contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
-    """Build a table of contents with links; empty for fewer than four sections and parts."""
     if sum(1 + len(s.parts) for s in sections) < _FEWEST_LISTED:
         return ()
     entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))
@@ -174,6 +188,32 @@ def _contents_entry(section: Section, number: str) -> Markup:
 def _section_id(number: str) -> str:
     return f"part-{number.replace('.', '-')}"
 
+
+_TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "residual": (r"(?i)\bresiduals?\b", "recorded minus predicted reading"),
+        "p": (r"\bp\s[=<]", "p-value: how often chance alone gives at least this, with nothing missing"),
+        "SSF": (r"\bSSF\b", "spatial sensitivity function: how strongly the sensor sees each point beneath it"),
+        "sd": (r"\bsds?\b", "standard deviation"),
+        "rms": (r"\brms\b", "root of the mean square"),
+        "nat": (r"\bnats?\b", "unit of evidence, a natural logarithm: 3 nats are odds of 20 to 1"),
+        "held-out": (r"\bheld-out\b", "kept for testing: not used in the fit"),
+        "λ": (
+            r"λ|\blambda\b",
+            "size of an effect: norm of its change in the readings after a full refit without it, in noise sds",
+        ),
+        "aliased": (
+            r"(?i)\balias(es|ed)?\b",
+            "two effects that change these readings in the same way, so that the readings cannot tell which it is",
+        ),
+        "cosine": (
+            r"\bcosine\b",
+            "1 where two effects change the readings in the same proportions, 0 where unrelated",
+        ),
+        "unknown": (r"\bunknown\b", "something that no effect which this program knows explains"),
+    }
+)
+"""For each term: a pattern that finds its uses in a text, and its explanation."""
 
 # The slider is hidden until this has run: without scripts only the last slide is shown.
 _SLIDER = """

@@ -9,12 +9,11 @@ from probewise.diagnosis import p_in_words
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import spoken_name
 from probewise.investigation import Investigation, Round
-from probewise.report import diagnosis as of_a_diagnosis
+from probewise.report import diagnosis as diagnosis_report
 from probewise.report.headline import headline
-from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
+from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots.canvas import png
 from probewise.report.plots.probabilities import probabilities_by_round
-from probewise.report.terms import explain_new_terms, sections_with_terms_explained
 from probewise.report.words import probability_text, typeset_numbers
 
 _MOST_TOLD = 4
@@ -51,45 +50,31 @@ def page_html(
 ) -> str:
     """Return the HTML of an investigation's page.
 
-    Parameters
-    ----------
-    found
-        The investigation, with all rounds.
-    drawn
-        Figures of the last diagnosis and that of `probabilities_png`, by_round.png, by file name.
-    source
-        Source of the readings, in words.
-    seed
-        Of the run.
-    concealed
-        Names of the effects that a simulated world concealed, stated at the end; None for any other arm.
+    `drawn` has the figures of the last diagnosis, and that of `probabilities_png` as by_round.png; `source` is that of
+    the readings, in words; `concealed` are the effects that a simulated world concealed, None for any other arm.
     """
-    last = found.last
-    bars = probabilities_figure_html(drawn["by_round.png"])
+    hidden = ", ".join(map(spoken_name, concealed or ())) or "nothing"
+    bars, diagnosis = probabilities_figure_html(drawn["by_round.png"]), found.last.diagnosis
+    n_readings, rounds = sum(len(each.recording) for each in found.rounds), count_with_noun(len(found.rounds), "round")
     run = definition_list(
         (
             ("arm", source),
-            (
-                "readings",
-                f"{sum(len(each.recording) for each in found.rounds)} in {count_with_noun(len(found.rounds), 'round')}",
-            ),
+            ("readings", f"{n_readings} in {rounds}"),
             ("seed", str(seed)),
-            *(
-                (("the world concealed", ", ".join(map(spoken_name, concealed)) or "nothing"),)
-                if concealed is not None
-                else ()
-            ),
+            *((("the world concealed", hidden),) if concealed is not None else ()),
         )
     )
-    known: set[str] = set()
-    story = Section("How it came to that", (), tuple(_round_section(each) for each in found.rounds))
-    details = Section("The diagnosis of all readings", (), tuple(of_a_diagnosis.sections(last.diagnosis, drawn)))
-    verdict, rounds = last.diagnosis.verdict.replace("_", " "), count_with_noun(len(found.rounds), "round")
+    sections = [
+        Section("How it came to that", (), tuple(_round_section(each) for each in found.rounds)),
+        Section("The diagnosis of all readings", (), tuple(diagnosis_report.sections(diagnosis, drawn))),
+        Section("This run", (run,)),
+    ]
     return page(
-        f"Investigation: {verdict} after {rounds}",
+        f"Investigation: {diagnosis.verdict.replace('_', ' ')} after {rounds}",
         answer=summary_sentence(found),
-        key_figure=fragment(bars, *explain_new_terms(bars, known)),
-        sections=sections_with_terms_explained([story, details, Section("This run", (run,))], known),
+        key_figure=bars,
+        sections=sections,
+        terms_in=bars,
     )
 
 

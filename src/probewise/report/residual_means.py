@@ -15,6 +15,7 @@ _MOST_STEPS = 60
 _LEAST_ROWS = 4
 _FEW_STEPS = 6
 _NEVER_LESS = 0.05  # of the variance of a mean: the least width of the band, however much the fit absorbs
+_NEGLIGIBLE = 0.01  # correlation
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,8 @@ def mean_residuals(
     """
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     values = covariate[ok]
-    groups = _groups_by_value(values) if names else _groups_in_steps(values, window)
+    by_value = [np.flatnonzero(values == value) for value in np.unique(values)] if names else None
+    groups = by_value if by_value is not None else _groups_in_steps(values, window)
     rows = [ok[group] for group in groups]
     at = np.arange(len(groups), dtype=np.float64) if names else np.array([values[g].mean() for g in groups])
     sd_of_row = np.broadcast_to(np.asarray(sd, dtype=np.float64), before.shape)
@@ -88,39 +90,28 @@ def mean_residuals(
     )
 
 
-def _groups_by_value(values: FloatArray) -> list[IntArray]:
-    return [np.flatnonzero(values == value) for value in np.unique(values)]
-
-
 def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
     """List row numbers by equal steps of the covariate; groups of few rows are joined, not across the window's ends."""
     if values.size == 0:
         return []
-    if window is None:
-        return _groups_of_given_rows(values, np.arange(values.size), _LEAST_ROWS)
-    inside = (values >= window[0]) & (values <= window[1])
-    least = int(np.clip(inside.sum(), 1, _LEAST_ROWS))
-    parts = (values < window[0], inside, values > window[1])
-    return [
-        group for part in parts if part.any() for group in _groups_of_given_rows(values, np.flatnonzero(part), least)
-    ]
+    low, high = window or (-np.inf, np.inf)
+    inside = (values >= low) & (values <= high)
+    least = int(np.clip(inside.sum(), 1, _LEAST_ROWS)) if window else _LEAST_ROWS
+    parts = [np.flatnonzero(part) for part in (values < low, inside, values > high)]
+    return [group for part in parts if part.size for group in _groups_of_rows(values, part, least)]
 
 
-def _groups_of_given_rows(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
+def _groups_of_rows(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
     """Split `rows` by equal steps of the covariate; into equal numbers where most of them share a few values."""
-    mine = values[rows]
-    share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
-    n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
-    groups = _merged_groups(_rows_by_step(mine, rows, n), least)
+    there = values[rows]
+    span = float(np.ptp(there))
+    n = int(np.clip(round(_STEPS * (span / max(float(np.ptp(values)), 1e-300))), 1, _MOST_STEPS))
+    step = np.minimum((n * (there - there.min()) / max(span, 1e-300)).astype(int), n - 1)
+    groups = _merged_groups([rows[step == k] for k in range(n)], least)
     if len(groups) >= min(_FEW_STEPS, n) or rows.size < _FEW_STEPS * least:
         return groups
     # Where most readings share a few values, groups of equal size show more than bins of equal width.
-    return np.array_split(rows[np.argsort(mine, kind="stable")], min(n, rows.size // least))
-
-
-def _rows_by_step(mine: FloatArray, rows: IntArray, n: int) -> list[IntArray]:
-    step = np.minimum((n * (mine - mine.min()) / max(float(np.ptp(mine)), 1e-300)).astype(int), n - 1)
-    return [rows[step == k] for k in range(n)]
+    return np.array_split(rows[np.argsort(there, kind="stable")], min(n, rows.size // least))
 
 
 def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
@@ -137,14 +128,10 @@ def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
 
 def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float) -> float:
     """Return the variance of the mean noise over `rows`; the noise is AR(1) within scans."""
-    own = np.zeros(len(scan))
-    own[rows] = sd[rows]
-    variance = float(own @ own)
-    for lag in range(1, min(_longest_lag(rho), len(scan) - 1) + 1):
-        variance += 2 * rho**lag * float(np.sum(own[lag:] * own[:-lag] * (scan[lag:] == scan[:-lag])))
+    noise = np.zeros(len(scan))
+    noise[rows] = sd[rows]
+    variance = float(noise @ noise)
+    longest = math.ceil(math.log(_NEGLIGIBLE) / math.log(abs(rho))) if _NEGLIGIBLE < abs(rho) < 1 else 0
+    for lag in range(1, min(longest, len(scan) - 1) + 1):
+        variance += 2 * rho**lag * float(np.sum(noise[lag:] * noise[:-lag] * (scan[lag:] == scan[:-lag])))
     return max(variance, 0.0) / max(rows.size, 1) ** 2
-
-
-def _longest_lag(rho: float) -> int:
-    """Return the lag at which an AR(1) correlation falls below 0.01; 0 if |rho| is not between 0.01 and 1."""
-    return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0

@@ -1,4 +1,4 @@
-"""Covariates against which residuals are drawn: those with significant residuals, and that of the first figure."""
+"""Covariates of a diagnosis: names, units and values; and the views in which residuals are drawn against them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,85 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._words import unit_after_number
+from probewise._words import UNITS, unit_after_number, unit_of_name
 from probewise.diagnosis import ALARM, Diagnosis, Place
 from probewise.effects import RARE_EFFECTS, name_without_copy_suffix
 from probewise.recordings import Plan
-from probewise.report.covariate import (
-    axis_label,
-    category_name_by_value,
-    covariate_in_words_and_unit,
-    covariate_values_by_place,
-)
 from probewise.report.residual_means import ResidualMeans, mean_residuals
 from probewise.systems import RunTable
 
+_WORDS = {
+    "level": "predicted reading",
+    "slope": "slope of the predicted reading along the motion",
+    "place": "place along the scans",
+    "direction": "direction of motion",
+    "orientation": "orientation of the sensor",
+    "edge_distance": "distance from the edge",
+}
+_DIRECTIONS = {-1.0: "backwards", 0.0: "at rest", 1.0: "forwards"}
+_MOST_ORIENTATIONS = 24  # with a name each on the axis
 _SEEN = 2.3  # sds beyond which a mean visibly leaves the band
 _N_SAMPLES = 200  # posterior samples for the variance that the fit absorbs
 _ASTRAY = 0.01  # largest deviation of a scan from its line, as a share of its length
 _LEAST_PLACES = 3  # least number of places in a line
 _LEAST_PERIODS = 3.0  # least number of periods in a recording for folding it
+
+
+def covariate_in_words(name: str) -> str:
+    """Return the name of a light sensor's covariate in words, without its unit: "battery" for battery_mv."""
+    stem, _, suffix = name.rpartition("_")
+    without_unit = stem if stem and suffix in UNITS else name
+    return _WORDS.get(name, without_unit.replace("column:", "column ").replace("_", " "))
+
+
+def term_family_in_words(family: str) -> str:
+    """Write a family of bases in words: "time, scan by scan (locally)" for "time within scans, locally"."""
+    name, _, how = family.partition(", ")
+    stem = name.removesuffix(" within scans")
+    written = covariate_in_words(stem) + (", scan by scan" if stem != name else "")
+    return f"{written} ({how})" if how else written
+
+
+def covariate_in_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
+    """Return a covariate's name in words, and its unit, "" if none is known."""
+    words = diagnosis.apparatus.words
+    unit = unit_after_number(diagnosis.recording.plan.instrumentation.unit)
+    written = covariate_in_words(name) if words.covariates is None else words.covariate_in_words(name)
+    return written, words.units.get(name, unit_of_name(name)).replace("{reading}", unit)
+
+
+def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
+    """Return an axis label: the covariate in words, the scan (or run) if one is given, and the unit in brackets."""
+    written, unit = covariate_in_words_and_unit(diagnosis, name)
+    run = diagnosis.apparatus.words.run
+    written += f", {run} {scan}" if scan is not None and name != run else ""
+    return written + (f" ({unit_after_number(unit)})" if unit else "")
+
+
+def covariate_values(diagnosis: Diagnosis, place: Place) -> FloatArray:
+    """Return the values of a place's covariate, (n_points,), as diagnosed; NaN in unusable rows and where undefined."""
+    values = np.full(len(diagnosis.recording), np.nan)
+    if place.values is not None:
+        values[np.flatnonzero(diagnosis.recording.usable)] = place.values
+    return values
+
+
+def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
+    """Return the names, by value, of a place's covariate if it is scan, run, direction, or up to 24 orientations.
+
+    Values ascend. None for other covariates; of a table's covariates, only the run has names.
+    """
+    words = diagnosis.apparatus.words
+    if place.covariate == words.run:
+        return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}
+    if words.covariates is not None:
+        return None  # a table's column may be called as a covariate of a light sensor is
+    there = [] if place.values is None else _distinct_values(place.values)
+    if place.covariate == "direction":
+        return {sign: _DIRECTIONS[sign] for sign in there}
+    if place.covariate == "orientation" and len(there) <= _MOST_ORIENTATIONS:
+        return {angle: f"{angle:g}°" for angle in there}
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,27 +125,28 @@ class ResidualNoise:
     @classmethod
     def of_diagnosis(cls, diagnosis: Diagnosis) -> ResidualNoise:
         """Take the repaired model's noise sds and correlation, and posterior predictions of the calibrated model."""
-        found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
+        noise = {p.name: p.mean for p in diagnosis.report.noise.parameters}
         plan = diagnosis.recording.plan
         sd = float(diagnosis.repaired.noise_sd.mean()) * diagnosis.recording.relative_sd
-        sd = sd * np.array([found.get(f"values[{name}]", 1.0) for name in plan.scan_names])[plan.scan]
-        if "ratio" in found:
+        sd = sd * np.array([noise.get(f"values[{name}]", 1.0) for name in plan.scan_names])[plan.scan]
+        if "ratio" in noise:
             level = diagnosis.repair.after.readings
             share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
-            sd = sd * np.sqrt(1 + found["ratio"] * share)
-        sd = np.hypot(sd, found.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
-        if "sd_per_row" in found:  # beside a walk the readings leave the mean open, not the residuals
-            return cls(sd, found.get("rho", 0.0), None)
+            sd = sd * np.sqrt(1 + noise["ratio"] * share)
+        sd = np.hypot(sd, noise.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
+        if "sd_per_row" in noise:  # beside a walk the readings leave the mean open, not the residuals
+            return cls(sd, noise.get("rho", 0.0), None)
         null = diagnosis.null
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
-        return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, plan))
+        return cls(sd, noise.get("rho", 0.0), null.chain.predict(theta, plan))
 
     def mean_residuals(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
         """Average the calibrated model's residuals in bins of a view; with `after`, also the repaired model's."""
+        repair = diagnosis.repair
         return mean_residuals(
             view.at,
-            diagnosis.repair.before.residuals,
-            diagnosis.repair.after.residuals if after and diagnosis.repair.changes_predictions else None,
+            repair.before.residuals,
+            repair.after.residuals if after and repair.changes_predictions else None,
             sd=self.sd,
             rho=self.rho,
             scan=diagnosis.recording.plan.scan,
@@ -92,6 +154,10 @@ class ResidualNoise:
             window=None if view.names else view.window,
             absorbed=self.absorbed,
         )
+
+    def largest_mean_in_sds(self, diagnosis: Diagnosis, view: CovariateView) -> float:
+        """Return the calibrated model's largest mean residual in a view, in sds of that mean by chance."""
+        return self.mean_residuals(diagnosis, view, after=False).largest_mean_in_sds
 
 
 def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
@@ -102,18 +168,19 @@ def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> Cov
     Candidates in order: time, X or a column, folded at a named effect's period; covariates with significant residuals,
     those on which an unknown effect most probably depends first; last, the repair's change of the predicted readings.
     """
-    values = covariate_values_by_place(diagnosis)
     alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
-    places = sorted(alarming, key=lambda place: -_probability_unknown_depends_on(diagnosis, place))
-    found = _views_at_period(diagnosis)
-    for place in places:
-        found += _views_of_place(diagnosis, place, values[place.figure_name])
+    candidates = _views_at_period(diagnosis)
+    for place in sorted(alarming, key=lambda place: -_probability_unknown_depends_on(diagnosis, place)):
+        candidates += views_of_place(diagnosis, place)
+    before, after = diagnosis.repair.before, diagnosis.repair.after
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
-        found.append(_view_against_repair_change(diagnosis))
-    if not found:
-        return CovariateView(np.array(diagnosis.repair.before.readings), axis_label(diagnosis, "level"))
-    sizes = [chance.mean_residuals(diagnosis, view, after=False).largest_mean_in_sds for view in found]
-    return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
+        change = after.readings_with_walk - before.readings_with_walk
+        unit = diagnosis.recording.plan.instrumentation.unit_after_number
+        candidates.append(CovariateView(change, f"change that the repair makes ({unit})"))
+    if not candidates:
+        return CovariateView(np.array(before.readings), axis_label(diagnosis, "level"))
+    sizes = [chance.largest_mean_in_sds(diagnosis, view) for view in candidates]
+    return next((v for v, size in zip(candidates, sizes, strict=True) if size >= _SEEN), candidates[np.argmax(sizes)])
 
 
 def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
@@ -122,68 +189,63 @@ def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -
     First those whose covariate the unknown effect most probably depends on; then those with True; then the others. Of
     places that are the same interval, one is kept.
     """
-    values, seen = covariate_values_by_place(diagnosis), {}
-    for place in diagnosis.where:
-        views = _views_of_place(diagnosis, place, values[place.figure_name])
-        seen[place.figure_name] = any(
-            chance.mean_residuals(diagnosis, w, after=False).largest_mean_in_sds >= _SEEN for w in views
+    seen = {
+        place.figure_name: any(
+            chance.largest_mean_in_sds(diagnosis, view) >= _SEEN for view in views_of_place(diagnosis, place)
         )
-    ordered = sorted(
-        diagnosis.where, key=lambda p: (-_probability_unknown_depends_on(diagnosis, p), not seen[p.figure_name])
-    )
+        for place in diagnosis.where
+    }
     shown: list[Place] = []
-    for place in ordered:  # with one scan, a place in all scans and one in that scan are the same
-        if not any(_is_same_interval(values, place, other) for other in shown):
+    for place in sorted(
+        diagnosis.where, key=lambda p: (-_probability_unknown_depends_on(diagnosis, p), not seen[p.figure_name])
+    ):  # with one scan, a place in all scans and one in that scan are the same
+        if not any(_is_same_interval(diagnosis, place, other) for other in shown):
             shown.append(place)
     return [(place, seen[place.figure_name]) for place in shown]
 
 
-def _is_same_interval(values: Mapping[str, FloatArray], place: Place, other: Place) -> bool:
+def _is_same_interval(diagnosis: Diagnosis, place: Place, other: Place) -> bool:
     ends = (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
-    own, others = values[place.figure_name], values[other.figure_name]
-    return ends and place.start is not None and np.array_equal(own, others, equal_nan=True)
+    at, other_at = (covariate_values(diagnosis, each) for each in (place, other))
+    return ends and place.start is not None and np.array_equal(at, other_at, equal_nan=True)
 
 
-def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
+def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:
     """List a place's views: `view_along_scan` if it is a whole scan or run; then, for every place, along its covariate.
 
-    `at`, (n_points,), holds the covariate's values.
+    Residuals that change sign within a scan show in the former.
     """
-    by_covariate = view_along_place_covariate(diagnosis, place, at)
+    at, names = covariate_values(diagnosis, place), category_name_by_value(diagnosis, place)
+    label = axis_label(diagnosis, place.covariate, place.scan)
+    if place.without_effect:
+        unit = unit_after_number(diagnosis.recording.plan.instrumentation.unit)
+        label = f"reading to be expected without it ({unit})"
+    by_covariate = CovariateView(at, label, names, _shaded_interval(place, at, names), place)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
     return [view_along_scan(diagnosis, place.scan, place), by_covariate]
 
 
-def view_along_place_covariate(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
-    """Build the view of a place along its covariate, whose values are `at`, (n_points,)."""
-    unit = diagnosis.recording.plan.instrumentation.unit
-    label = axis_label(diagnosis, place.covariate, place.scan)
-    if place.without_effect:
-        label = f"reading to be expected without it ({unit_after_number(unit)})"
-    names = category_name_by_value(diagnosis, place)
-    return CovariateView(at, label, names, _shaded_interval(place, at, names), place)
-
-
 def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
     """Build the view of one scan along X or Y, whichever it spans more; along time if the scan is no line.
 
-    A run of a simulator's table is shown along its time or rows. Residuals that change sign within the scan show here.
+    A run of a simulator's table is shown along its time or rows.
     """
     plan = diagnosis.recording.plan
     rows = np.flatnonzero(np.isin(plan.scan, [k for k, name in enumerate(plan.scan_names) if name == scan]))
     if isinstance(plan, RunTable):
-        at = np.full(len(plan), np.nan)
-        at[rows] = plan.time_s[rows]
+        along = plan.time_s[rows]
         whole = scan if plan.run is not None else None
-        return CovariateView(at, axis_label(diagnosis, "time" if plan.has_varying_time else "row", whole), place=place)
-    x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
-    along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
-    if not is_scan_along_line(plan, rows):
-        along, label = plan.time_s[rows], "time (s)"
+        label = axis_label(diagnosis, "time" if plan.has_varying_time else "row", whole)
+    else:
+        x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
+        along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
+        if not is_scan_along_line(plan, rows):
+            along, label = plan.time_s[rows], "time (s)"
+        label = f"{label}, scan {scan}"
     at = np.full(len(plan), np.nan)
     at[rows] = along
-    return CovariateView(at, f"{label}, scan {scan}", place=place)
+    return CovariateView(at, label, place=place)
 
 
 def is_scan_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
@@ -214,46 +276,29 @@ def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
 
     Only where the recording spans more than three periods.
     """
-    plan, out = diagnosis.recording.plan, []
+    plan = diagnosis.recording.plan
+    folded: list[tuple[FloatArray, float, str, str]] = []
     for effect in diagnosis.effects:
-        found = {p.name: p.mean for p in effect.parameters}
+        means = {p.name: p.mean for p in effect.parameters}
+        hz = means.get("hz" if isinstance(plan, RunTable) else "alias_hz", 0.0)
+        period = means.get("period" if isinstance(plan, RunTable) else "period_mm", 0.0)
         if effect.name not in diagnosis.combination:
             continue
+        if hz > 0:
+            folded.append((plan.time_s, 1 / hz, *covariate_in_words_and_unit(diagnosis, "time")))
         if isinstance(plan, RunTable):
-            out += _covariates_and_periods_to_fold(diagnosis, plan, effect.name, found)
-            continue
-        if found.get("alias_hz", 0.0) > 0:
-            out.append((plan.time_s, 1 / found["alias_hz"], "time", "s"))
-        if found.get("period_mm", 0.0) > 0:
-            out.append((plan.x_mm, found["period_mm"], "X", "mm"))
+            if period > 0 and not hz > 0:
+                column = name_without_copy_suffix(effect.name).partition(":")[2]
+                folded.append((plan.covariates[column], period, column, ""))
+        elif period > 0:
+            folded.append((plan.x_mm, period, "X", "mm"))
     return [
         CovariateView(
             np.mod(values, period), f"{name} within one period of {period:.4g} {unit}" + (f" ({unit})" if unit else "")
         )
-        for values, period, name, unit in out
+        for values, period, name, unit in folded
         if np.ptp(values) > _LEAST_PERIODS * period
     ]
-
-
-def _covariates_and_periods_to_fold(
-    diagnosis: Diagnosis, table: RunTable, effect: str, found: Mapping[str, float]
-) -> list[tuple[FloatArray, float, str, str]]:
-    """List the covariate to fold for an effect on a simulator: values (n_points,), period, name, unit; empty if none.
-
-    A wave in time folds the time, a column's periodic error that column. `found`: the effect's parameters by name.
-    """
-    if found.get("hz", 0.0) > 0:
-        return [(table.time_s, 1 / found["hz"], *covariate_in_words_and_unit(diagnosis, "time"))]
-    column = name_without_copy_suffix(effect).partition(":")[2]
-    return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
-
-
-def _view_against_repair_change(diagnosis: Diagnosis) -> CovariateView:
-    unit = diagnosis.recording.plan.instrumentation.unit_after_number
-    return CovariateView(
-        diagnosis.repair.after.readings_with_walk - diagnosis.repair.before.readings_with_walk,
-        f"change that the repair makes ({unit})",
-    )
 
 
 def _shaded_interval(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:

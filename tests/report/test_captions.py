@@ -26,7 +26,7 @@ from probewise.inference import GaussianKnown
 from probewise.recordings import Disc, Instrumentation, read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
-from probewise.report.animation import animated_gif
+from probewise.report.pictures import animated_gif
 from probewise.scene import Circle, HypothesisScene, Rectangle, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture, footprint_of, mean_ssf_field
 from probewise.world import Blob, World, gaussian_spot

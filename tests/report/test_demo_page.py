@@ -14,12 +14,16 @@ from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
-from probewise.report import doubting_robot
-from probewise.report.demo import HEADER, search_comparison_lines
-from probewise.report.paper_view import fine_entropy_map, paper_view, window_around_runs_mm
-from probewise.report.plots import PAGE_IN
-from probewise.report.robot_search import RobotSearch
-from probewise.report.slides import join_side_by_side
+from probewise.report.demo import doubt_figure_drawers, doubt_section, doubt_sentence
+from probewise.report.plots import PAGE_IN, grid_of_axes
+from probewise.report.searches import (
+    HEADER,
+    RobotSearch,
+    fine_entropy_map,
+    paper_view,
+    search_comparison_lines,
+    window_around_runs_mm,
+)
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
@@ -61,37 +65,14 @@ def test_the_fine_map_agrees_with_the_robots_own_where_both_have_a_place(found):
 def test_the_view_shows_the_fifty_circles_and_the_place_chosen_from_them(found):
     window = window_around_runs_mm([found], 1)
     outline = np.array([[510.0, 260.0], [600.0, 350.0], [690.0, 260.0]])
-    ax = paper_view(found, 1, levels=(10.0, 60.0), truth_mm=outline, window_mm=window)
+    search = RobotSearch("SSF", found, {}, outline, (10.0, 60.0))
+    ax = paper_view(search, 1, window_mm=window, ax=grid_of_axes(1, 1, size_in=(8.2, 5.2))[0, 0])
     assert len(ax.collections[0].get_paths()) == 50
     green = ax.collections[-1].get_offsets()[0]
     assert tuple(green) == (found.readings[1].pose.x_mm, found.readings[1].pose.y_mm)
     left, right, low, high = window
     assert left < green[0] < right
     assert low < green[1] < high
-
-
-def picture(width, shade):
-    out = io.BytesIO()
-    Image.new("RGB", (width, 10), (shade,) * 3).save(out, "PNG")
-    return out.getvalue()
-
-
-def test_the_run_that_ended_first_stays_at_its_last_picture():
-    slides = join_side_by_side([picture(20, 0), picture(20, 100)], [picture(30, 200)])
-    opened = [Image.open(io.BytesIO(slide)).convert("RGB") for slide in slides]
-    assert [image.size for image in opened] == [(50, 10)] * 2
-    assert [(image.getpixel((0, 0))[0], image.getpixel((49, 9))[0]) for image in opened] == [(0, 200), (100, 200)]
-
-
-def test_a_colour_that_few_pixels_have_survives_in_a_slide():
-    """The next place is a green square of some fifty pixels in a map of all copper tones."""
-    tones = np.linspace([42, 26, 18], [255, 217, 168], 400 * 300).round().astype(np.uint8).reshape(300, 400, 3)
-    tones[100:107, 50:57] = (0, 224, 138)
-    out = io.BytesIO()
-    Image.fromarray(tones).save(out, "PNG")
-    (slide,) = join_side_by_side([out.getvalue()], [picture(5, 0)])
-    shown = Image.open(io.BytesIO(slide)).convert("RGB").getpixel((53, 103))
-    np.testing.assert_allclose(shown, (0, 224, 138), atol=16)
 
 
 def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(monkeypatch, tmp_path):
@@ -115,7 +96,7 @@ def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(m
 
 def test_the_demos_comparison_is_two_tables_each_with_its_caption(monkeypatch):
     rows = [("naive", "30", "9", "20.1", "0.67", "0.83", "12.5 mm", "x 1 mm"), ("SSF", *"12345", "2 mm", "x 2 mm")]
-    monkeypatch.setattr("probewise.report.demo.search_comparison_rows", lambda searches: rows)
+    monkeypatch.setattr("probewise.report.searches.search_comparison_rows", lambda searches: rows)
     first, second = "\n".join(search_comparison_lines([])).rstrip().split("\n\n")
     for text, header in ((first, HEADER[:-2]), (second, (HEADER[0], *HEADER[-2:]))):
         caption, names, *lines = text.splitlines()
@@ -131,12 +112,12 @@ def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
     outline = np.array([600.0, 260.0]) + 90.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
     searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("trusting", "doubting")]
-    drawn = {name: draw() for name, draw in doubting_robot.figure_drawers(searches).items()}
+    drawn = {name: draw() for name, draw in doubt_figure_drawers(searches).items()}
     assert list(drawn) == ["doubt.png", "belief.png"]
     widest = 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
     assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= widest
-    said = "".join(doubting_robot.section(searches, drawn).body)
+    said = "".join(doubt_section(searches, drawn).body)
     for row in ("trusting", "doubting"):
         assert f">{row}<" in said
-    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubting_robot.summary_sentence(searches)
+    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubt_sentence(searches)
     assert found.stop_reason in said

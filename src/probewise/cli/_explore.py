@@ -34,7 +34,7 @@ from probewise.errors import FileError, ParameterError, did_you_mean
 from probewise.experiment import Exploration, HiddenShape
 from probewise.recordings import read_recording, write_bytes_atomically
 from probewise.report import exploration as report
-from probewise.report.animation import animated_gif
+from probewise.report.pictures import animated_gif
 from probewise.scene import SHAPES, Card, Field
 
 if TYPE_CHECKING:

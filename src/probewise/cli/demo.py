@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis
     from probewise.experiment import Exploration, Model, Step
     from probewise.progress import Progress
-    from probewise.report.robot_search import RobotSearch
+    from probewise.report.searches import RobotSearch
     from probewise.scene import Circle
 
 _DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
@@ -71,7 +71,7 @@ def _run_demo(
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
-    from probewise.report import doubting_robot
+    from probewise.report.searches import search_comparison_lines
     from probewise.world.shipped import true_world as world_behind
 
     started = time.monotonic()
@@ -116,7 +116,7 @@ def _run_demo(
         started_alike=started_alike,
         geometry=read_geometry(shipped_geometry_path()),
     )
-    figures |= report.diagnosis_figure_drawers(diagnosis) | doubting_robot.figure_drawers(doubted)
+    figures |= report.diagnosis_figure_drawers(diagnosis) | report.doubt_figure_drawers(doubted)
     figures_of_diagnosis = diagnosis_report.figure_drawers(diagnosis)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     seconds = time.monotonic() - started
@@ -159,11 +159,11 @@ def _run_demo(
     )
     drawings.write_report(figures, page, progress=progress)
     return (
-        *report.search_comparison_lines(searches),
+        *search_comparison_lines(searches),
         report.summary_sentence(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
-        f"a concealed saturation: {doubting_robot.summary_sentence(doubted)}",
+        f"a concealed saturation: {report.doubt_sentence(doubted)}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
     )
 
@@ -174,7 +174,7 @@ def searches_with_true_circle(
     """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
     import numpy as np
 
-    from probewise.report.robot_search import RobotSearch
+    from probewise.report.searches import RobotSearch
     from probewise.scene import outlines
 
     means, circle = sensor.mean(), hypothesised_circle()
@@ -217,19 +217,10 @@ def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calib
 def _frame_png(search: RobotSearch, step: Step) -> bytes:
     """Draw the view of a search after a step; return a PNG."""
     from probewise._words import count_with_noun
-    from probewise.report import exploration as report
     from probewise.report.plots.canvas import grid_of_axes, png
 
-    ax = report.draw_robot_view(
-        step,
-        search.run.experiment,
-        [(r.pose.x_mm, r.pose.y_mm, r.value) for r in search.run.readings][: step.number],
-        levels=search.levels,
-        truth_mm=search.truth_mm,
-        title=f"{search.model} model, after {count_with_noun(step.number, 'reading')}",
-        ax=grid_of_axes(1, 1, size_in=(6.6, 4.0))[0, 0],
-    )
-    return png(ax, dpi=90)
+    title = f"{search.model} model, after {count_with_noun(step.number, 'reading')}"
+    return png(search.draw_view(step.number, title=title, ax=grid_of_axes(1, 1, size_in=(6.6, 4.0))[0, 0]), dpi=90)
 
 
 def random_pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
@@ -265,7 +256,7 @@ def search(
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run, run_from_place, surface_of
-    from probewise.report.doubting_robot import SATURATION
+    from probewise.report.demo import SATURATION
     from probewise.scene import Field
     from probewise.world import Saturation
     from probewise.world.shipped import true_world as world_behind

@@ -1,4 +1,4 @@
-"""The page of the demo: calibration, a search with each sensor model, and a diagnosis with its repair."""
+"""The page of the demo: calibration, searches with each sensor model, a diagnosis with its repair, a doubting robot."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from probewise._arrays import IntArray
 from probewise._words import count_with_noun
 from probewise.arm import Geometry
 from probewise.calibration import Calibration
 from probewise.diagnosis import Diagnosis
+from probewise.diagnosis.light_sensor import held_out_parts
+from probewise.experiment import left_out_after_step
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
-from probewise.report import doubting_robot
-from probewise.report import exploration as exploration_report
-from probewise.report.held_out import part_with_largest_gain
 from probewise.report.html import (
-    Markup,
     Section,
     definition_list,
     element,
@@ -27,9 +26,9 @@ from probewise.report.html import (
     slideshow,
     table,
 )
-from probewise.report.paper_view import paper_view, window_around_runs_mm
+from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
-from probewise.report.plots.canvas import AxesGrid, grid_of_axes, png
+from probewise.report.plots.canvas import png
 from probewise.report.plots.probabilities import hypothesis_probabilities
 from probewise.report.plots.readings import (
     quadrant_patterns,
@@ -37,23 +36,20 @@ from probewise.report.plots.readings import (
     residuals_by_scan,
     sensor_orientations,
 )
-from probewise.report.plots.search import information_gained, posterior_widths
-from probewise.report.robot_search import RobotSearch
-from probewise.report.slides import join_side_by_side
+from probewise.report.searches import (
+    RobotSearch,
+    draw_effect_probabilities,
+    draw_final_posteriors,
+    draw_paper_views,
+    draw_widths_and_information,
+    search_comparison_table,
+)
 from probewise.report.words import number_text, typeset_numbers
 
 FIRST = 3  # as in the paper's figure
-HEADER = (
-    "sensor model",
-    "readings",
-    "until the first white",
-    "bits",
-    "bits per reading",
-    "the paper's count",
-    "largest error",
-    "errors",
-)
 _LIKELY = 1e-3
+SATURATION = 40.0
+"""Reading at which the concealed effect of the third world, saturation, sets in; the model expects 60 over white."""
 _SENSOR = (
     "The sensor sees a blurred patch of the surface. Its spatial sensitivity function (SSF) is the weight that each "
     "point of the patch has in a reading; a calibration infers it from readings over patterns that are known."
@@ -99,39 +95,8 @@ def main_findings_by_key(
         "concealed": concealed,
         "diagnosis": diagnosis_report.summary_sentence(diagnosis),
         "reason": typeset_numbers(diagnosis.reason),
-        "doubt": doubting_robot.summary_sentence(doubt),
+        "doubt": doubt_sentence(doubt),
     }
-
-
-def search_comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
-    """Return the cells of the table of searches, in the order of `HEADER`, one row per search."""
-    return [
-        (
-            s.model,
-            str(len(s.run.steps)),
-            str(s.readings_until_first_white),
-            number_text(s.run.last.bits, 1),
-            number_text(s.run.bits_per_reading, 2),
-            number_text(s.run.paper_bits_per_reading, 2),
-            f"{number_text(s.largest_error_mm, 1)} mm",
-            exploration_report.errors_text(s.run, s.truth),
-        )
-        for s in searches
-    ]
-
-
-def search_comparison_table(searches: Sequence[RobotSearch], caption: str = "") -> Markup:
-    """Build the table that compares the robots' searches, a row each; the default caption explains bits and errors."""
-    return table(
-        HEADER,
-        search_comparison_rows(searches),
-        caption=caption
-        or (
-            "Bits: prior minus posterior differential entropy of the circle's parameters. The paper counts 25 bits for "
-            "the whole search, whatever the run. Errors: estimate minus truth, ± posterior sd (mm). One run each: the "
-            "number of readings varies from circle to circle, most of all until the first white reading."
-        ),
-    )
 
 
 def figure_drawers(
@@ -162,25 +127,18 @@ def figure_drawers(
         "arm.png": lambda: png(arm_and_sensor(geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden)),
         "orientations.png": lambda: png(sensor_orientations(recording)),
         "quadrants.png": lambda: png(quadrant_patterns(recording)),
-        "first_three.png": lambda: png(_draw_paper_views(started_alike, n_first)),
-        "equal_readings.png": lambda: png(_draw_paper_views(started_alike, [len(started_alike[-1].run.steps)])),
-        "progress.png": lambda: png(_draw_widths_and_information(searches)),
+        "first_three.png": lambda: png(draw_paper_views(started_alike, n_first)),
+        "equal_readings.png": lambda: png(draw_paper_views(started_alike, [len(started_alike[-1].run.steps)])),
+        "progress.png": lambda: png(draw_widths_and_information(searches)),
     }
 
 
-def _draw_widths_and_information(searches: Sequence[RobotSearch]) -> AxesGrid:
-    names = [f"{s.model} model" for s in searches]
-    axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
-    posterior_widths(
-        {n: np.array([step.largest_sd_mm for step in s.run.steps]) for n, s in zip(names, searches, strict=True)},
-        ax=axes[0, 0],
-    )
-    information_gained(
-        {n: np.array([step.bits for step in s.run.steps]) for n, s in zip(names, searches, strict=True)},
-        ax=axes[0, 1],
-    )
-    axes[0, 1].set_ylim(top=1.3 * axes[0, 1].get_ylim()[1])  # room for the legend above the lines
-    return axes
+def doubt_figure_drawers(doubt: Sequence[RobotSearch]) -> dict[str, Callable[[], bytes]]:
+    """List the figures on a trusting and a doubting robot by file name, as functions that draw PNGs."""
+    return {
+        "doubt.png": lambda: png(draw_final_posteriors(doubt)),
+        "belief.png": lambda: png(draw_effect_probabilities(doubt[-1].run)),
+    }
 
 
 def diagnosis_figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
@@ -192,7 +150,7 @@ def diagnosis_figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], byt
         "explanations.png": lambda: png(hypothesis_probabilities(labels, [h.probability for h in likely])),
         "scans.png": lambda: png(residuals_by_scan(recording, before, after)),
     }
-    best = part_with_largest_gain(diagnosis)
+    best = _part_with_largest_gain(diagnosis)
     if best is not None:
         name, gain, rows = best
         title = f"{name}: {gain:+.2f} nats per reading when it was held out"
@@ -202,22 +160,18 @@ def diagnosis_figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], byt
     return drawers
 
 
-def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
-    """Draw the paper's view after each of `numbers` readings (rows) of each search (columns); return the axes."""
-    window = window_around_runs_mm([s.run for s in searches], numbers[0])
-    across, up = window[1] - window[0], window[3] - window[2]
-    size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
-    axes = grid_of_axes(len(numbers), len(searches), size_in=size)
-    for row, n in zip(axes, numbers, strict=True):
-        for ax, search in zip(row, searches, strict=True):
-            k = search.step_number_after(n)
-            step = search.run.steps[k - 1]
-            taken, known = count_with_noun(k, "reading"), number_text(step.largest_sd_mm, 1)
-            title = f"{search.model} model, {taken}: known to {known} mm"
-            paper_view(
-                search.run, k, levels=search.levels, truth_mm=search.truth_mm, window_mm=window, title=title, ax=ax
-            )
-    return axes
+def _part_with_largest_gain(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
+    """Return the held-out part with the largest gain: name, gain in nats per reading, row numbers, (n_rows,).
+
+    None if the repair changes no prediction, or nothing could be held out.
+    """
+    gains = diagnosis.improvement.heldout_by_scan
+    if not diagnosis.repair.changes_predictions or not gains:
+        return None
+    name, gain = max(gains, key=lambda pair: pair[1])
+    part, names = held_out_parts(diagnosis.recording)
+    rows = np.flatnonzero(diagnosis.recording.usable)[part == names.index(name)]
+    return name, gain, rows
 
 
 def page_html(
@@ -248,7 +202,7 @@ def page_html(
     doubt
         The search of the robot that trusts its sensor model, and of the one that doubts it.
     drawn
-        From `figure_drawers`, `diagnosis_figure_drawers` and `report.doubting_robot.figure_drawers`.
+        From `figure_drawers`, `diagnosis_figure_drawers` and `doubt_figure_drawers`.
     concealed
         Name of the effect that the simulated world concealed in the second recording.
     seed, seconds
@@ -258,7 +212,7 @@ def page_html(
         _sensor_section(calibration, recording, prediction, drawn, seed),
         _search_section(searches, started_alike, frames, drawn),
         _diagnosis_section(diagnosis, drawn, concealed),
-        doubting_robot.section(doubt, drawn),
+        doubt_section(doubt, drawn),
         Section(
             "This run",
             (
@@ -425,20 +379,54 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
     return Section("A mismatch, found and repaired", said, (explanations, Section("The repair", (*repair, more))))
 
 
-def search_comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
-    """Write the comparison of searches as lines of text: a table of each one's cost, then another of its errors."""
-    rows = [HEADER, *search_comparison_rows(searches)]
-    costs, errors = [row[:-2] for row in rows], [(row[0], *row[-2:]) for row in rows]
-    return [
-        "A whole search, from an empty field (bits: information gained; the paper's count: 25 bits over the readings)",
-        *_aligned_lines(costs),
-        "",
-        "Errors of the circle that was found: estimate minus truth, ± posterior sd",
-        *_aligned_lines(errors),
-        "",
-    ]
+def doubt_sentence(searches: Sequence[RobotSearch]) -> str:
+    """Say in one sentence how both robots ended (readings, largest error, widest sd), the trusting one first."""
+    trusting, doubting = (
+        f"{count_with_noun(len(s.run.steps), 'reading')}, off by {number_text(s.largest_error_mm, 1)} mm "
+        f"(posterior sd up to {number_text(s.run.last.largest_sd_mm, 1)} mm)"
+        for s in searches
+    )
+    return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
 
 
-def _aligned_lines(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
+    """Build the demo's section from both searches, the trusting robot's first, and from `doubt_figure_drawers`."""
+    doubting = searches[-1].run
+    missing = left_out_after_step(doubting.last, doubting.experiment.trust)
+    introduction = paragraph(
+        f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
+        f"{number_text(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. "
+        f"The other expects with probability {1 - doubting.experiment.trust:.1g} that an effect is missing; "
+        "it compares the plain model with each effect that could act, and chooses its readings and its end under all "
+        "of them."
+    )
+    rows = table(
+        ("robot", "readings", "largest error", "widest posterior sd", "stopped because"),
+        (
+            (
+                s.model,
+                str(len(s.run.steps)),
+                f"{number_text(s.largest_error_mm, 1)} mm",
+                f"{number_text(s.run.last.largest_sd_mm, 1)} mm",
+                s.run.stop_reason,
+            )
+            for s in searches
+        ),
+        caption="Both robots look for the circle of the searches above, from the same first reading on it. One run "
+        "each; probewise study --concealed repeats it for many circles and effects.",
+    )
+    fields = figure(
+        drawn["doubt.png"],
+        "The posterior of each robot at its end: left the trusting robot, right the doubting one. Blue: 50 circles "
+        "drawn from the posterior. Dashed white: the hidden circle.",
+    )
+    belief = figure(
+        drawn["belief.png"],
+        "What the doubting robot believes about its sensor after each reading. A dashed line marks a reading that "
+        "changed the most probable effect.",
+    )
+    found = paragraph(f"At its end the doubting robot reports: {missing.sentence}")
+    return Section(
+        "A robot that doubts its sensor",
+        (introduction, paragraph(doubt_sentence(searches)), fields, rows, belief, found),
+    )

@@ -21,6 +21,7 @@ from probewise.experiment import (
     probability_of_length_off,
 )
 from probewise.experiment.state import stop_reason_with_checks
+from probewise.inquiry import UtilityMap
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots.canvas import grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
@@ -41,7 +42,9 @@ def draw_robot_view(
     *,
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
+    drawn: UtilityMap | None = None,
     title: str = "",
+    lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the robot's view of the field after a step, as in the paper; return the axes.
@@ -56,17 +59,19 @@ def draw_robot_view(
         Readings over black and white.
     truth_mm
         Outline of the true shape, (n_vertices, 2), where known.
+    drawn
+        The map drawn; by default that from which the robot chose.
     title
         Title; by default the number of readings and of bits known.
-    ax
-        Axes to draw on; a new figure without.
+    lego_scale
+        Whether to add the paper's coordinates at the top.
     """
     seen = np.asarray(readings, dtype=np.float64).reshape(-1, 3)
-    pose = step.next_pose
+    pose, drawn = step.next_pose, drawn or step.map
     return playing_field(
-        step.map.image,
-        experiment.grid.x_mm,
-        experiment.grid.y_mm,
+        drawn.image,
+        drawn.grid.x_mm,
+        drawn.grid.y_mm,
         outlines_mm=outlines(experiment.shape.region(step.samples)),
         places_mm=seen[:, :2],
         readings=seen[:, 2],
@@ -74,8 +79,9 @@ def draw_robot_view(
         next_mm=None if pose is None else (pose.x_mm, pose.y_mm),
         truth_mm=truth_mm,
         cards_mm=[card.corners_mm for card in experiment.cards],
-        utility_label=step.map.label,
+        utility_label=drawn.label,
         title=title or f"after {count_with_noun(step.number, 'reading')}, {number_text(step.bits, 1)} bits known",
+        lego_scale=lego_scale,
         ax=ax,
     )
 
@@ -155,7 +161,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, ± its posterior sd; those without a truth are left out."""
     step, truth = run.last, _truth_with_angles_near_estimate(run, truth)
     return ", ".join(
-        f"{words_without_unit(_without_shape_prefix(step, name))} "
+        f"{words_without_unit(name.removeprefix(f'{step.likely_shape}.'))} "
         f"{value_with_error(float(mean) - truth[name], float(sd), unit_of_name(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
@@ -180,12 +186,10 @@ def summary_sentence(run: Exploration) -> str:
     known = ", ".join(
         f"{words_without_unit(p.name)} {value_with_error(p.mean, p.sd, unit_of_name(p.name))}" for p in found.parameters
     )
-    if not run.reached:
-        taken = count_with_noun(len(run.steps), "reading")
-        return (
-            f"Not found to the target precision in {taken}; so far {_with_article(found.name)}{several} with {known}."
-        )
-    return f"Found in {count_with_noun(len(run.steps), 'reading')}: {_with_article(found.name)}{several} with {known}."
+    taken = count_with_noun(len(run.steps), "reading")
+    opening = f"Found in {taken}:" if run.reached else f"Not found to the target precision in {taken}; so far"
+    article = "an" if found.name[0] in "aeiou" else "a"
+    return f"{opening} {article} {found.name}{several} with {known}."
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
@@ -245,32 +249,19 @@ def page_html(
 ) -> str:
     """Return the HTML of an exploration's page.
 
-    Parameters
-    ----------
-    run
-        The run.
-    frames
-        PNG of each step.
-    seed, model
-        Seed of the run and name of the sensor model.
-    truth
-        Parameters of the true shape by name, where known.
-    beside
-        Steps of other sensor models, updated with the same readings, by name of the model.
-    unit
-        Unit of the readings.
+    `frames` are PNGs of the steps; `model` is the name of the sensor model; `truth` are the parameters of the true
+    shape by name, where known; `beside` are steps of other sensor models, updated with the same readings, by name of
+    the model; `unit` is the readings'.
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
-    spent = f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time"
-    gained = f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading"
     off = probability_text(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
     facts = [
         ("sensor model", MODEL_NAMES.get(model, model)),
         ("inference", run.experiment.inference_method.label),
         ("stopped because", run.stop_reason),
-        ("cost", spent),
-        ("information", gained),
+        ("cost", f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time"),
+        ("information", f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading"),
         (
             "the paper's count",
             f"{number_text(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)",
@@ -281,40 +272,29 @@ def page_html(
     ]
     if truth:
         facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run, truth)))
-    sensor = [
-        (words_without_unit(name), unit_of_name(name), *value_with_error(mean, sd).partition(" ± ")[::2])
-        for name, (mean, sd) in run.last.sensor.items()
-    ]
-    learnt = (table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."),)
-    shapes = (table(("shape", "probability"), ((n, probability_text(p)) for n, p in run.last.shapes.items())),)
+    shape: list[Markup] = [shape_table(run, truth)]
+    if run.last.shapes:
+        shape.append(table(("shape", "probability"), ((n, probability_text(p)) for n, p in run.last.shapes.items())))
+    shape.append(definition_list(facts))
+    if run.last.sensor:
+        sensor = [
+            (words_without_unit(name), unit_of_name(name), *value_with_error(mean, sd).partition(" ± ")[::2])
+            for name, (mean, sd) in run.last.sensor.items()
+        ]
+        shape.append(table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."))
+    widths = {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()}
+    bits = {name: np.array([s.bits for s in steps]) for name, steps in runs.items()}
     sections = [
-        Section(
-            "The shape and what it cost",
-            (
-                shape_table(run, truth),
-                *(shapes if run.last.shapes else ()),
-                definition_list(facts),
-                *(learnt if sensor else ()),
-                *(paragraph(f"Doubtful: {note}.") for note in run.notes),
-            ),
-        ),
+        Section("The shape and what it cost", (*shape, *(paragraph(f"Doubtful: {note}.") for note in run.notes))),
         *((_fault_section(run.steps, run.experiment.trust),) if run.experiment.trust < 1 else ()),
         Section(
             "How fast",
             (
                 figure(
-                    png(
-                        posterior_widths(
-                            {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()},
-                            target_mm=run.experiment.stop_sd_mm,
-                        )
-                    ),
+                    png(posterior_widths(widths, target_mm=run.experiment.stop_sd_mm)),
                     "Widest posterior sd of a length after each reading; dashed: the target precision.",
                 ),
-                figure(
-                    png(information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()})),
-                    _information_caption(run.experiment.trust),
-                ),
+                figure(png(information_gained(bits)), _information_caption(run.experiment.trust)),
                 steps_table(run, unit),
             ),
         ),
@@ -350,11 +330,3 @@ def _fit_in_words(p_value: float | None) -> str:
     if p_value is None:
         return "not tested: the most probable noise is not the declared one"
     return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
-
-
-def _without_shape_prefix(step: Step, name: str) -> str:
-    return name.removeprefix(f"{step.likely_shape}.")
-
-
-def _with_article(noun: str) -> str:
-    return f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"

@@ -94,18 +94,14 @@ def typeset_numbers(text: str) -> str:
     return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power_of_ten, together))
 
 
-_LONGER = (("minute", 1.0), ("hour", 60.0), ("day", 1440.0), ("month", 43_830.0), ("year", 525_960.0))
+_MINUTES = {"minute": 1.0, "hour": 60.0, "day": 1440.0, "month": 43_830.0, "year": 525_960.0}
 _LEAST_OF_A_UNIT = 3  # of the next larger unit, from which durations are written in it
 
 
 def duration_text(minutes: float) -> str:
     """Write a duration in the largest unit, from minutes to years, of which it has three or more; at least a minute."""
-    noun, length = max(
-        (unit for unit in _LONGER if minutes >= _LEAST_OF_A_UNIT * unit[1]),
-        key=lambda unit: unit[1],
-        default=_LONGER[0],
-    )
-    return count_with_noun(max(round(minutes / length), 1), noun)
+    noun = [unit for unit, length in _MINUTES.items() if unit == "minute" or minutes >= _LEAST_OF_A_UNIT * length][-1]
+    return count_with_noun(max(round(minutes / _MINUTES[noun]), 1), noun)
 
 
 def rounded_count_text(n: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,6 +24,7 @@ from probewise.scene import region_of
 
 _MM_PER_IN = 25.4
 _RULER_MM = 100
+_SHEETS_PER_COVER = 5
 _PIXEL_MM = 0.25  # pixel size for patterns that have no outline
 _ROUND = np.linspace(0.0, 2 * np.pi, 721)[:-1]
 _SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
@@ -31,47 +33,26 @@ _CROSS_MM = 15.0  # long enough to show beyond a block of two LEGO studs
 
 
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
-    """Draw cover pages with instructions, one per five sheets, then every sheet at true scale.
+    """Draw cover pages with instructions, one per five sheets, then every sheet at true scale on "a4" or "letter".
 
-    Parameters
-    ----------
-    sheets
-        Sheets to print.
-    paper
-        "a4" or "letter".
-    title
-        Title of the document.
-
-    Returns
-    -------
-    The PDF, reproducible byte for byte.
-
-    Raises
-    ------
-    ParameterError
-        If a sheet needs more than 400 pages, or the paper size is unknown.
+    Return the PDF, reproducible byte for byte. ParameterError if a sheet needs more than 400 pages, or for another
+    paper.
     """
     cut = [(sheet, tiles_of(sheet, paper)) for sheet in sheets]
-    n_covers = len(_batches_of_five(cut))
+    n_covers = -(-len(cut) // _SHEETS_PER_COVER)
+    firsts = list(itertools.accumulate((len(tiles) for _, tiles in cut), initial=1 + n_covers))
+    n_pages = firsts.pop() - 1
+    listed = list(zip(cut, firsts, strict=True))
     buffer = io.BytesIO()
     about = {"Title": title, "Creator": "probewise", "Producer": None, "CreationDate": None}
     with mpl.rc_context({"path.simplify": False}), PdfPages(buffer, metadata=about) as pdf:
-        number = 1 + n_covers
-        firsts = []
-        for _, tiles in cut:
-            firsts.append(number)
-            number += len(tiles)
-        n_pages = number - 1
-        for k, batch in enumerate(_batches_of_five(list(zip(cut, firsts, strict=True)))):
+        for k in range(n_covers):
+            batch = listed[k * _SHEETS_PER_COVER : (k + 1) * _SHEETS_PER_COVER]
             pdf.savefig(_draw_cover_page(batch, paper, title, f"page {k + 1} of {n_pages}"))
-        for (sheet, tiles), first in zip(cut, firsts, strict=True):
+        for (sheet, tiles), first in listed:
             for k, tile in enumerate(tiles):
                 pdf.savefig(_draw_page(sheet, tiles, tile, first, f"page {first + k} of {n_pages}"))
     return buffer.getvalue()
-
-
-def _batches_of_five(items: Sequence[Any]) -> list[Sequence[Any]]:
-    return [items[k : k + 5] for k in range(0, len(items), 5)]
 
 
 def _new_page_axes(page_mm: tuple[float, float]) -> Axes:
@@ -88,7 +69,7 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
     ax = _new_page_axes(page)
     top = page[1] - 18.0
     ax.text(LEFT_MM, top, title, fontsize=_LARGE, va="baseline")
-    told = (
+    instructions = (
         "Print at 100 % (actual size; no 'fit to page'), on matt paper, and measure the ruler: it is 100 mm long.",
         "A sheet of several pages: cut each page along the corner marks at its left and lower side, and glue it, mark",
         "on mark, on the strip that its neighbour prints beyond the marks. Each strip says which page lies there.",
@@ -97,34 +78,30 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
         "the field's. At orientation 0 the sensor's x' axis is along x, the photodiode on the side of y; it turns",
         "anticlockwise.",
     )
-    for k, line in enumerate(told):
+    for k, line in enumerate(instructions):
         ax.text(LEFT_MM, top - 8.0 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
-    y = top - 8.0 - 4.6 * len(told) - 4.0
+    y = top - 8.0 - 4.6 * len(instructions) - 4.0
     for (sheet, tiles), first in batch:
         _draw_thumbnail(ax, sheet, tiles, (LEFT_MM, y - _THUMB_MM))
         x = LEFT_MM + 72.0
         last = first + len(tiles) - 1
-        said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; page {first}"]
+        pages, grid = f"page {first}", []
         if len(tiles) > 1:
-            said = [
-                f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; pages {first} to {last}",
-                _page_grid_in_words(tiles),
-            ]
-        said += [*sheet.lines, f"origin: {sheet.frame}"]
+            columns, rows = tiles[-1].column + 1, tiles[-1].row + 1
+            pages = f"pages {first} to {last}"
+            grid = [f"{columns} side by side, {rows} one above the other, from the lower left"]
+        width, height = sheet.size_mm
+        lines = [f"{width:g} x {height:g} mm; {pages}", *grid, *sheet.lines, f"origin: {sheet.frame}"]
         if sheet.orientations_rad:
             turns = ", ".join(f"{np.degrees(turn):.4g}" for turn in sheet.orientations_rad)
-            said.append(f"the sensor stands at {turns} degrees")
+            lines.append(f"the sensor stands at {turns} degrees")
         ax.text(x, y - 5.0, sheet.name, fontsize=11, fontweight="bold", va="baseline")
-        for k, line in enumerate(said):
+        for k, line in enumerate(lines):
             ax.text(x, y - 10.5 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
         y -= _THUMB_MM + 6.0
     _draw_ruler(ax, LEFT_MM, 11.0)
     ax.text(page[0] - 12.0, 8.5, number, fontsize=_SMALL, ha="right")
     return ax.figure  # type: ignore[return-value]
-
-
-def _page_grid_in_words(tiles: Sequence[Tile]) -> str:
-    return f"{tiles[-1].column + 1} side by side, {tiles[-1].row + 1} one above the other, from the lower left"
 
 
 def _draw_thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float, float]) -> None:

@@ -216,13 +216,14 @@ def _signed_nats(nats: float, sd: float) -> str:
 
 
 def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
-    p_value, p = diagnosis.p_value, p_in_words(diagnosis.p_value)
+    p_value = diagnosis.p_value
     if p_value > _CHANCE:
-        often = f"with nothing missing, {100 * p_value:.0f} of 100 recordings look as odd as this ({p})"
+        often = f"{100 * p_value:.0f} of 100 recordings look"
     elif p_value > 1e-6:
-        often = f"with nothing missing, 1 recording in {rounded_count_text(1 / p_value)} looks as odd as this ({p})"
+        often = f"1 recording in {rounded_count_text(1 / p_value)} looks"
     else:
-        often = f"with nothing missing, less than 1 recording in a million looks as odd as this ({p})"
+        often = "less than 1 recording in a million looks"
+    often = f"with nothing missing, {often} as odd as this ({p_in_words(p_value)})"
     if diagnosis.verdict == "noise":
         gained = f"its log evidence over white noise is {diagnosis.improvement.log_evidence:.0f} nats"
         mean = "nothing significant" if p_value >= ALARM else "nothing that any effect explains better"
@@ -367,53 +368,42 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
 
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
-    changes = diagnosis.repair.changes_predictions
-    shown = (
-        (
-            figure(
-                drawn["gain.svg"],
-                f"Gain in log predictive density of each held-out {noun_of_held_out_part(diagnosis)}, both models "
-                "fitted to the others: blue where the repaired model predicts better, orange where worse. Grey: mean "
-                "over all, with standard error.",
-            ),
+    gain, changes = diagnosis.improvement, diagnosis.repair.changes_predictions
+    if "gain.svg" in drawn:
+        shown = figure(
+            drawn["gain.svg"],
+            f"Gain in log predictive density of each held-out {noun_of_held_out_part(diagnosis)}, both models "
+            "fitted to the others: blue where the repaired model predicts better, orange where worse. Grey: mean "
+            "over all, with standard error.",
         )
-        if "gain.svg" in drawn
-        else (paragraph(diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED),)
-    )
-    unit = f"{unit}{diagnosis.recording.weighting_in_words}"
-    held = f"{_signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)} per reading"
-    rms = f"{gain.rms_before:.3g} {unit} as calibrated, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
-    repaired = (("log evidence gained", f"{number_text(gain.log_evidence, 1)} nats"), ("rms of the residuals", rms))
-    return (
-        *shown,
-        definition_list(
-            (
-                *((("gain on held-out readings", held),) if gain.heldout_by_scan else ()),
-                *(
-                    repaired
-                    if diagnosis.repair.changes_predictions
-                    else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)
-                ),
-                ("test for further missing effects", typeset_numbers(p_in_words(gain.p_value_after))),
-            )
-        ),
-    )
+    else:
+        shown = paragraph(diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED)
+    unit = f"{diagnosis.recording.plan.instrumentation.unit_after_number}{diagnosis.recording.weighting_in_words}"
+    facts = []
+    if gain.heldout_by_scan:
+        per_reading = _signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)
+        facts.append(("gain on held-out readings", f"{per_reading} per reading"))
+    rms = f"{gain.rms_before:.3g} {unit}"
+    if changes:
+        facts.append(("log evidence gained", f"{number_text(gain.log_evidence, 1)} nats"))
+        rms += f" as calibrated, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
+    facts.append(("rms of the residuals", rms))
+    facts.append(("test for further missing effects", typeset_numbers(p_in_words(gain.p_value_after))))
+    return shown, definition_list(facts)
 
 
 def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     noise = diagnosis.report.noise
-    names = () if noise.model == "white" else tuple(noise.model.split("+"))
-    model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
-    rows = (
+    names = [] if noise.model == "white" else noise.model.split("+")
+    model = join_names([effect_in_words(name) for name in names]) if names else "white: independent, with one sd"
+    test = f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}."
+    rows = [
         (p.name.replace("_", " "), unit_after_number(p.unit), *_value_and_interval_texts(p)) for p in noise.parameters
-    )
+    ]
     beside = ", the random walk aside" if diagnosis.repair.after.has_walk else ""
     return (
-        paragraph(
-            typeset_numbers(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")
-        ),
-        *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
+        paragraph(typeset_numbers(test)),
+        *((table(("parameter", "unit", "value", "95 % interval"), rows),) if rows else ()),
         figure(
             drawn["noise.svg"],
             f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "

@@ -49,7 +49,7 @@ def test_what_a_tab_offers_is_there_and_nothing_else_is_offered():
     assert [name for name in offered if name.startswith("_")] == ["__version__"]
     for name in offered:
         assert getattr(probewise, name) is not None
-    assert probewise.nested.run.__module__ == "probewise.nested.run"
+    assert probewise.nested.run.__module__ == "probewise.nested.sampler"
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         _ = probewise.calibrat
 

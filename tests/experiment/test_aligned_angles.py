@@ -10,7 +10,7 @@ from probewise.experiment import run
 from probewise.experiment.aligned_angles import with_aligned_angles
 from probewise.experiment.method import SequentialMonteCarlo
 from probewise.experiment.stopping_rule import probability_of_length_off, shape_moments_and_probabilities
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 
 FIELD = Field(400.0, 300.0)

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.errors import ParameterError
 from probewise.inquiry import bits_gained, neighbour_entropy, prior_entropy
-from probewise.nested.run import run
+from probewise.nested import run
 from probewise.priors import Normal, Product, Uniform
 
 

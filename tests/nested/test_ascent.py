@@ -10,9 +10,8 @@ import pytest
 from nested_sampling import hard, problems
 
 from probewise.nested import NestedResult
-from probewise.nested.ascent import climb_to_top, gaussian_of_last_live_points
-from probewise.nested.evaluate import Evaluator
-from probewise.nested.missed_hills import find_missed_hills
+from probewise.nested.missed import climb_to_top, find_missed_hills, gaussian_of_last_live_points
+from probewise.nested.problem import Evaluator
 from probewise.nested.sampler import run_once
 
 

@@ -35,7 +35,7 @@ from probewise.nested import (
     Tally,
     run,
 )
-from probewise.nested.checkpoint import BirthRecords, CheckpointFile, LivePoints, RunState, settings_of_run
+from probewise.nested.save import BirthRecords, CheckpointFile, LivePoints, RunState, settings_of_run
 from probewise.priors import Normal, Product, Uniform
 
 SEED = 20240229
@@ -695,7 +695,7 @@ def test_saving_takes_a_tenth_of_the_time_at_most(path: Path, monkeypatch: pytes
     """Whatever `checkpoint_every_s` above 0 says; by a clock that ticks at every look."""
     settings = settings_of_run(("p0",), 10, 5, SliceMove(), RemainingEvidence(), "{}")
     clock = itertools.count(0.0, 3.0)
-    monkeypatch.setattr("probewise.nested.checkpoint.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("probewise.nested.save.time.monotonic", lambda: next(clock))
     keeper = CheckpointFile(path, 1.0, settings, _last_saving=0.0)
     live = LivePoints(_points(10, 1), BirthRecords.of_prior_draws(10), 0.0)
     saved = []

@@ -12,7 +12,6 @@ from nested_sampling import problems
 
 from probewise.errors import ParameterError
 from probewise.nested import NestedResult, merge, run
-from probewise.nested.conversions import _log_likelihoods_without_ties
 from probewise.priors import Empty, Product, Uniform
 
 WHY = "{0} is an optional package: pip install {0}"
@@ -45,7 +44,7 @@ def result(request: pytest.FixtureRequest) -> NestedResult:
 
 
 def test_levels_become_strict_in_the_order_of_labels_and_hardly_move(result: NestedResult) -> None:
-    death, birth = _log_likelihoods_without_ties(result)
+    death, birth = result._log_likelihoods_without_ties()
     assert (np.diff(death) > 0).all()
     assert death == pytest.approx(result.log_likelihood + result.log_start, rel=1e-9, abs=1e-9)
     assert (birth < death).all()

@@ -15,7 +15,7 @@ from scipy.special import i0e
 
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
 from probewise.nested import NestedResult, SliceMove, make_problem, refine, run
-from probewise.nested.evaluate import Bound, Evaluator
+from probewise.nested.problem import Bound, Evaluator
 from probewise.priors import Joint, Normal, Product, Uniform
 
 SD = 0.3

@@ -10,8 +10,7 @@ import pytest
 from nested_sampling import hard, problems
 
 from probewise.nested import check
-from probewise.nested.hills import HillEstimate, log_evidence_of_unmet_hills
-from probewise.nested.missed_hills import MissedHills, find_missed_hills
+from probewise.nested.missed import HillEstimate, MissedHills, find_missed_hills, log_evidence_of_unmet_hills
 from probewise.nested.moves import SliceMove
 from probewise.nested.sampler import least_live, run_once
 

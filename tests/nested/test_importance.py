@@ -13,15 +13,15 @@ from scipy.stats import chi2, norm
 
 from probewise._arrays import FloatArray
 from probewise.nested import FunctionProblem, NestedResult, Weighted, refine, run, update
-from probewise.nested.evaluate import Evaluator
+from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
-    HeldOutSamples,
     _bridge_sampling_estimate,
     draw_and_weigh,
-    with_error_of_lost_parts,
+    fit_wide_and_narrow_proposals,
+    mixture_of_proposals,
 )
-from probewise.nested.proposal import find_disconnected_clusters, fit_wide_and_narrow_proposals, mixture_of_proposals
-from probewise.nested.space import unbounded_space_of
+from probewise.nested.problem import Evaluator, unbounded_space_of
+from probewise.nested.refine import with_error_of_lost_parts
 from probewise.priors import Normal, Product
 
 FALSE_ALARM = 1e-4
@@ -98,7 +98,7 @@ def test_any_share_of_draws_from_the_prior_gives_the_evidence(prior_share: float
     space = unbounded_space_of(likelihood.prior)
     proposal = fit_wide_and_narrow_proposals(space.enter(0.8 + 0.45 * rng.standard_normal((200, 1))), rng=rng)[-1]
     evaluate = Evaluator(likelihood)
-    found = draw_and_weigh(proposal, prior_share, HeldOutSamples.empty(), space, evaluate, n_draws=2000, rng=rng)
+    found = draw_and_weigh(proposal, prior_share, None, space, evaluate, n_draws=2000, rng=rng)
     assert evaluate.n_calls == 2000
     assert found.log_z == pytest.approx(norm.logpdf(1.0, 0.0, math.hypot(1.0, 0.5)), abs=4.5 * found.log_z_error)
     assert found.log_z_error < 0.05

@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import kstest, multivariate_normal
 
 from probewise.errors import ParameterError
-from probewise.nested.evaluate import Bound, Evaluator
-from probewise.nested.kernels import KernelMove, Kernels
-from probewise.nested.run import run
+from probewise.nested import run
+from probewise.nested.moves import KernelMove, Kernels
+from probewise.nested.problem import Bound, Evaluator
 from probewise.priors import Product, Uniform
 
 

@@ -13,10 +13,9 @@ from scipy.special import logsumexp
 from probewise.nested import NestedResult, SliceMove, refine
 from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import Clusters
-from probewise.nested.evaluate import Bound, Evaluator, Samplable
-from probewise.nested.hills import log_evidence_of_unmet_hills
-from probewise.nested.hops import HoppingMove
-from probewise.nested.missed_hills import MissedHills, find_missed_hills
+from probewise.nested.missed import MissedHills, find_missed_hills, log_evidence_of_unmet_hills
+from probewise.nested.moves import HoppingMove
+from probewise.nested.problem import Bound, Evaluator, Samplable
 from probewise.nested.sampler import run_once
 
 SHARE = 0.6

@@ -101,25 +101,17 @@ def test_quantiles_of_equal_weights_are_the_plain_ones(result: NestedResult) -> 
         plain.mean(lambda t: t[:3])
     with pytest.raises(ShapeError, match=r"shape \(\)"):
         plain.mean(lambda t: t.sum())
-    with pytest.raises(ParameterError, match="block is 0"):
-        plain.mean(lambda t: t, block=0)
 
 
-def test_a_mean_field_by_blocks_is_the_mean_field_and_holds_one_block_at_a_time(result: NestedResult) -> None:
-    """A bump on 20 x 30 pixels about each sample: the tensor of all of them is never made."""
+def test_a_mean_field_is_the_weighted_sum_of_fields(result: NestedResult) -> None:
+    """A bump on 20 x 30 pixels about each sample."""
     y, x = np.mgrid[-3:3:20j, -3:3:30j]
-    handed = []
 
     def field(theta: np.ndarray) -> np.ndarray:
-        handed.append(len(theta))
         return np.exp(-((x - theta[:, 0, None, None]) ** 2) - (y - theta[:, 1, None, None]) ** 2)
 
     whole = result.mean(field)
-    assert handed == [result.n_dead]
     assert whole.shape == (20, 30)
-    assert result.mean(field, block=64) == pytest.approx(whole, rel=1e-12)
-    assert max(handed[1:]) == 64
-    assert sum(handed[1:]) == result.n_dead
     by_hand = sum(w * field(t[None])[0] for w, t in zip(result.weight, result.theta, strict=True))
     assert whole == pytest.approx(by_hand, rel=1e-9)
 
@@ -167,4 +159,3 @@ def test_the_summary_names_what_matters(result: NestedResult) -> None:
 def test_a_result_cannot_be_changed(result: NestedResult) -> None:
     with pytest.raises(ValueError, match="read-only"):
         result.theta[0, 0] = 1.0
-    assert result.maximum_likelihood_theta() == pytest.approx(result.theta[np.argmax(result.log_likelihood)])

@@ -30,10 +30,10 @@ from probewise.nested import (
     run,
     update,
 )
-from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import insertion_p_value, integrate
 from probewise.nested.sampler import replace_worst_live_points, run_once
+from probewise.nested.save import BirthRecords, LivePoints
 from probewise.priors import Empty, Normal, Product
 
 # A right sampler is further off than this many of its own errors less than once in 10 000 runs.

@@ -32,8 +32,7 @@ from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.calibration.smc import SMCResult
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
-from probewise.nested import NestedResult, StopRule
-from probewise.nested.sampler import least_live
+from probewise.nested import NestedResult, StopRule, least_live
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_patterns_described, require_recording
 from probewise.sensor import SSFField

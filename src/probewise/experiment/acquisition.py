@@ -27,7 +27,7 @@ from probewise.inquiry import (
     utility_map,
 )
 from probewise.inquiry.forecast import resampled_rows_and_weights
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 
 _MISSING_REACH = 0.1  # of the field's diagonal: from there on, a missing reading hardly counts
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from probewise._arrays import FloatArray
 from probewise.experiment.configuration import Experiment
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 from probewise.scene.symmetry import mean_angles, with_angles_near
 
 

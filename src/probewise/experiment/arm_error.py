@@ -26,7 +26,7 @@ from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.state import ArmError
 from probewise.inference.problem import checked_log_prob
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
 from probewise.scene.any_of import AnyOf, shape_and_columns
 from probewise.scene.symmetry import with_angles_near

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.experiment.kernels import LocalKernels
 from probewise.inference.problem import SensorProblem
-from probewise.nested.importance import Weighted, pareto_k
+from probewise.nested import Weighted, pareto_k
 from probewise.nested.weights import n_effective, resampled_rows
 
 _WIDE = 3.0  # factor on the width of some kernels, so that draws extend beyond the samples

@@ -51,7 +51,7 @@ from probewise.experiment.stopping_rule import (
 )
 from probewise.experiment.utility_near_end import utility_map_and_must_continue
 from probewise.inquiry import Goal, bits_gained, prior_entropy
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 from probewise.sensor.commanded import require_possible_commands
 
 

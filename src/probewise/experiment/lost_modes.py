@@ -17,7 +17,7 @@ from probewise.experiment.particles import particles_from_posterior
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.sampled_anew import SolverFromScratch, sample_from_scratch
 from probewise.inference.problem import SensorProblem
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 
 _LOST = 0.05  # share of a posterior that may lie beyond all of a kind's samples, besides what chance leaves there
 

@@ -14,12 +14,7 @@ from probewise.experiment.posterior import Posterior
 from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
 from probewise.experiment.sampled_anew import SolverFromScratch
 from probewise.inference.problem import SensorProblem
-from probewise.nested.importance import Weighted
-from probewise.nested.kernels import KernelMove
-from probewise.nested.result import NestedResult
-from probewise.nested.run import run
-from probewise.nested.sampler import LIVE_PER_PARAM
-from probewise.nested.stop import RemainingEvidence
+from probewise.nested import LIVE_PER_PARAM, KernelMove, NestedResult, RemainingEvidence, Weighted, run
 from probewise.recordings.plan import Recording
 
 _DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z

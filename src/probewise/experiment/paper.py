@@ -43,8 +43,8 @@ from probewise.nested import (
     StopRule,
     Weighted,
     diversify,
+    run,
 )
-from probewise.nested.run import run
 from probewise.nested.weights import resampled_rows
 from probewise.recordings import Recording
 from probewise.recordings import Uniform as UniformPattern

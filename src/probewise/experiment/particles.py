@@ -21,8 +21,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
 from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
 from probewise.inference.problem import SensorProblem, checked_log_prob
-from probewise.nested.importance import Weighted, pareto_k
-from probewise.nested.result import NestedResult
+from probewise.nested import NestedResult, Weighted, pareto_k
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Prior
 

@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import Particles, prior_particles
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 
 IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
 _FEWER = 3  # times

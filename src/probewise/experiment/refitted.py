@@ -22,7 +22,7 @@ from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.pace import EACH_S, paced_time_s
 from probewise.inference.problem import SensorProblem
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 from probewise.nested.weights import resampled_rows
 from probewise.priors import Prior
 

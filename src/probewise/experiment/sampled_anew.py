@@ -17,8 +17,7 @@ from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import Particles
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.inference.problem import SensorProblem
-from probewise.nested.importance import Weighted
-from probewise.nested.result import NestedResult
+from probewise.nested import NestedResult, Weighted
 
 _REPRODUCED = 5  # of the starts, which must lead to fits as good as the best: otherwise better ones may be missed
 WELL_FOUND = 100.0  # effective draws from which on samples need not be taken anew until a reading strains them

@@ -19,7 +19,7 @@ from probewise.experiment.journal import recording_of
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
 from probewise.inquiry import UtilityMap
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 from probewise.recordings.plan import Instrumentation, Recording
 
 PAPER_BITS = 25.0

@@ -13,7 +13,7 @@ from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inference.rounded import ScaleEnds
 from probewise.inquiry import UtilityMap
-from probewise.nested.importance import Weighted
+from probewise.nested import Weighted
 from probewise.scene.any_of import AnyOf
 
 OFF_SDS = 3.0

@@ -6,8 +6,8 @@ twice as long and compresses by few nats: it runs from a prior near the posterio
 Where the posterior fills so much of the prior that this saves nothing, it is a small run of the same problem.
 
 Two things escape both estimates: a narrow peak whose likelihood exceeds the rest only where both have ended, and a part
-of the posterior without live points. `missed_hills` looks for both. Where a part without live points would raise log Z
-noticeably, the run is repeated with moves that hop between the known parts.
+of the posterior without live points. `probewise.nested.missed` looks for both. Where a part without live points would
+raise log Z noticeably, the run is repeated with moves that hop between the known parts.
 """
 
 from __future__ import annotations
@@ -24,14 +24,19 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError, message_of
 from probewise.nested.clusters import Clusters
-from probewise.nested.evaluate import Samplable
-from probewise.nested.hills import HillEstimate, log_evidence_of_unmet_hills
-from probewise.nested.hops import HoppingMove
-from probewise.nested.missed_hills import DISAGREE, MissedHills, find_missed_hills, log_z_rise_in_errors
-from probewise.nested.moves import Move, SliceMove
+from probewise.nested.evidence import warning_of_few_lineages, warning_of_few_possible_draws
+from probewise.nested.missed import (
+    DISAGREE,
+    HillEstimate,
+    MissedHills,
+    find_missed_hills,
+    log_evidence_of_unmet_hills,
+    log_z_rise_in_errors,
+)
+from probewise.nested.moves import HoppingMove, Move, SliceMove
+from probewise.nested.problem import Samplable, space_of
 from probewise.nested.repartition import Repartitioned, repartitioned, split_into_clusters
-from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible_draws
-from probewise.nested.space import space_of
+from probewise.nested.result import Check, NestedResult
 
 # Above this many errors the second estimate is repeated with more live points.
 _APART = 2.0
@@ -89,7 +94,7 @@ class _EvidenceRoute:
     @property
     def least_calls_to_start(self) -> int:
         """Fewest evaluations with which a run is worth a start: its first live points, and twice those of one round."""
-        n_steps = max(self.chain.fewest_steps, math.ceil(self.chain.steps_per_param * len(self.problem.prior.names)))
+        n_steps = self.chain.n_steps(len(self.problem.prior.names))
         return math.ceil(self.n_live * (1 + n_steps * self.chain.target))
 
 

@@ -1,19 +1,21 @@
-"""Find clusters among live points, so that moves can use the mean and covariance of each."""
+"""Clusters of points, by mean and covariance: of live points, posterior samples, or modes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.nested.problem import Rows
 
 _MOST_CLUSTERS = 32
 _N_REFINEMENTS = 4
+_LINKS = 10  # of a sample to its nearest neighbours
 
 
 @dataclass(frozen=True, eq=False)
-class Clusters:
+class Clusters(Rows):
     """Clusters of points, by mean and covariance; `assign` divides all space between them.
 
     `mean` (n_clusters, n_params); `root`, the Cholesky factors of the covariances, and `inverse_root`, their inverses,
@@ -42,8 +44,7 @@ class Clusters:
         mean = np.stack([g.mean(axis=0) for g in groups])
         root = np.stack([_cholesky_of_covariance(g) for g in groups])
         inverse = np.asarray(np.linalg.inv(root), dtype=np.float64)
-        log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        return Clusters(mean, root, inverse, log_det, np.array([len(g) for g in groups]))
+        return Clusters(mean, root, inverse, _log_dets(root), np.array([len(g) for g in groups]))
 
     def map_with_log_volume_ratio(self, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
         """Map points of clusters `home` to clusters `goal` by the affine map between the Gaussians.
@@ -53,11 +54,6 @@ class Clusters:
         z = np.matmul(self.inverse_root[home], (u - self.mean[home])[:, :, None])
         moved = self.mean[goal] + np.matmul(self.root[goal], z)[:, :, 0]
         return moved, self.log_det[goal] - self.log_det[home]
-
-    def followed_by(self, other: Clusters) -> Clusters:
-        """Return these clusters followed by the others."""
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-        return Clusters(*map(np.concatenate, pairs))
 
     def home_clusters_without_each_point(self, u: FloatArray, home: IntArray) -> Clusters:
         """Recompute for each point, (n, n_params), its cluster `home`, (n,), with the point itself left out.
@@ -72,24 +68,22 @@ class Clusters:
         z = np.einsum("nij,nj->ni", self.inverse_root[home], off)
         share = np.einsum("ni,ni->n", z, z) * (n / (n - 1.0) ** 2)[:, 0]
         z *= np.sqrt(np.minimum(1.0, (1.0 - 1e-6) / np.maximum(share, 1e-300)))[:, None]
-        n_params = u.shape[1]
-        inner = np.eye(n_params) - z[:, :, None] * z[:, None, :] * (n / (n - 1.0) ** 2)[:, :, None]
+        inner = np.eye(u.shape[1]) - z[:, :, None] * z[:, None, :] * (n / (n - 1.0) ** 2)[:, :, None]
         factor = root @ np.linalg.cholesky(inner) * np.sqrt((n - 1.0) / np.maximum(n - 2.0, 1.0))[:, :, None]
-        log_det = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
         mean = self.mean[home] - off / (n - 1.0)
-        return Clusters(mean, factor, np.linalg.inv(factor), log_det, self.size[home] - 1)
+        return Clusters(mean, factor, np.linalg.inv(factor), _log_dets(factor), self.size[home] - 1)
 
 
 def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
     """Split points, (n, n_params), recursively while two Gaussians fit better than one; return at most 32 clusters.
 
-    `least`: fewest points of a cluster; by default 2 n_params + 2.
+    `least`: fewest points of a cluster; by default 2 n_params + 2, so that its covariance is well determined.
 
     The gain in log likelihood must exceed the number of additional parameters (Akaike's criterion), plus 10 nats
     against chance, plus 0.15 nats per point: halving a uniform box gains less, two equal modes 5 sd apart gain 0.25
     nats per point. A false split costs little: the moves are exact however space is divided.
     """
-    least = _least_points_of_cluster(points.shape[1]) if least is None else least
+    least = 2 * points.shape[1] + 2 if least is None else least
     queue, done = [points], list[FloatArray]()
     while queue:
         group = queue.pop()
@@ -128,8 +122,7 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
         for _ in range(_N_REFINEMENTS):
             if not least <= side.sum() <= n - least:
                 break
-            pair = Clusters.from_groups([points[~side], points[side]])
-            refined = pair.assign(points) == 1
+            refined = Clusters.from_groups([points[~side], points[side]]).assign(points) == 1
             if np.array_equal(refined, side):
                 break
             side = refined
@@ -146,9 +139,30 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
     return halves
 
 
-def _least_points_of_cluster(n_params: int) -> int:
-    """Fewest points of a cluster, so that its covariance is well determined."""
-    return 2 * n_params + 2
+def find_disconnected_clusters(x: FloatArray) -> Clusters:
+    """Split samples, (n_samples, n_params), into disconnected pieces, each piece into clusters; return all clusters.
+
+    Pieces are the connected components of the nearest-neighbour graph, so they are found at any scale and in any number
+    (also a lattice of modes, which pairs of Gaussians do not split). Pieces too small for a covariance join the
+    nearest.
+    """
+    # Imported here: they take a quarter of a second, and most runs of the program do not need them.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    n_samples, n_params = x.shape
+    if n_samples <= _LINKS:
+        return Clusters.from_groups([x])
+    white = (x - x.mean(axis=0)) @ Clusters.from_groups([x]).inverse_root[0].T
+    near = np.asarray(cKDTree(white).query(white, k=_LINKS + 1)[1])[:, 1:].ravel()
+    links = coo_array((np.ones(near.size), (np.repeat(np.arange(n_samples), _LINKS), near)), 2 * (n_samples,))
+    n_pieces, piece = connected_components(links, directed=False)
+    large = [k for k in range(n_pieces) if (piece == k).sum() > 2 * n_params + 1]
+    if len(large) < 2:
+        return find_clusters(x)
+    home = Clusters.from_groups([x[piece == k] for k in large]).assign(x)
+    return Clusters.join(*(find_clusters(x[home == k]) for k in range(len(large))))
 
 
 def _cholesky_of_covariance(points: FloatArray) -> FloatArray:
@@ -156,7 +170,6 @@ def _cholesky_of_covariance(points: FloatArray) -> FloatArray:
     n_params = points.shape[1]
     centred = points - points.mean(axis=0)
     covariance = centred.T @ centred / max(len(points) - 1, 1)
-    # The ridge keeps the covariance positive definite where a direction has no extent.
     ridge = 1e-10 * np.diag(covariance) + 1e-24 + 1e-13 * np.trace(covariance) / n_params
     return np.linalg.cholesky(covariance + np.diag(ridge))
 
@@ -164,3 +177,7 @@ def _cholesky_of_covariance(points: FloatArray) -> FloatArray:
 def _log_det_of_covariance_cholesky(points: FloatArray) -> float:
     """Log determinant of the Cholesky factor: half the log determinant of the covariance."""
     return float(np.log(np.diag(_cholesky_of_covariance(points))).sum())
+
+
+def _log_dets(root: FloatArray) -> FloatArray:
+    return np.asarray(np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1))

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise._kinds import checked_whole, require_rng
 from probewise.errors import ParameterError, ShapeError
-from probewise.nested.evaluate import Evaluator, Samplable
+from probewise.nested.problem import Evaluator, Samplable
 from probewise.priors import require_prior
 
 _N_PRIOR_DRAWS = 200

@@ -1,47 +1,41 @@
-"""Importance sampling: weighted draws for `refine`, and `update` of a posterior with new readings.
+"""Importance sampling: draws from a density fitted to posterior samples, weighted against prior and likelihood.
 
-Nested sampling locates the posterior; the error of its log evidence is sqrt(H / n_live), with H the information in
-nats. Importance sampling from a density fitted to its samples estimates the same evidence and posterior independently,
-often with a hundredth of the error for a few thousand more evaluations (Cameron & Pettitt 2014; Lange 2023 with neural
-networks). The Pareto k of the weights' tail tells whether they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry
-2024).
+From such draws evidence and posterior are estimated independently of prior volumes, often with a hundredth of a run's
+error for a few thousand evaluations (Cameron & Pettitt 2014; Lange 2023 with neural networks); the error of a run is
+sqrt(H / n_live), with H the information in nats. The Pareto k of the weights' tail tells whether they are reliable
+(Vehtari, Simpson, Gelman, Yao & Gabry 2024). `probewise.nested.refine` uses them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import expit, logsumexp
+from scipy.special import expit, gammaln, logsumexp
 
-from probewise._arrays import FloatArray, own_arithmetic, read_only_floats
-from probewise._kinds import checked_number, checked_whole, require_callable, require_rng
-from probewise.errors import ParameterError
-from probewise.nested.evaluate import Evaluator, Samplable
-from probewise.nested.proposal import Proposal, find_disconnected_clusters, fit_wide_and_narrow_proposals
-from probewise.nested.result import NestedResult
-from probewise.nested.space import Space, unbounded_space_of
-from probewise.nested.weighted_samples import WeightedSamples
-from probewise.nested.weights import n_effective, resampled_rows
+from probewise._arrays import FloatArray, read_only_floats
+from probewise.nested.clusters import Clusters, find_disconnected_clusters
+from probewise.nested.problem import Evaluator, Space
+from probewise.nested.result import NestedResult, Samples
+from probewise.nested.weights import n_effective
 
 # Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
 _MOST_K = 0.7
 _FEW_EFFECTIVE = 100.0
-_MOST_FITTED = 2000
-_SURPRISED = 0.01
 _MOST_LOST = 0.2
-_HELD_OUT = 1 / 3
-_MOST_HELD = 1000
 _BRIDGE_STEPS = 20
-# Draws whose log Z is this many errors from that of the refined run disagree with it.
-_APART = 4.0
+# Heavier tails than a Gaussian's keep the weights bounded where the fit is too narrow.
+DEGREES_OF_FREEDOM = 8.0
+_MOST_KERNELS = 400
+_FEW = 40
+_SCALES = (1.0, 0.5, 0.2, 0.05, 0.01)
+_BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
-class Weighted(WeightedSamples):
+class Weighted(Samples):
     """Weighted posterior samples and the evidence, from importance sampling.
 
     Attributes
@@ -80,7 +74,7 @@ class Weighted(WeightedSamples):
     n_eff: float
     n_calls: int
     pareto_k: float
-    run: NestedResult | None = field(default=None)
+    run: NestedResult | None = None
     missed: float = 0.0
     lost: float = 0.0
     inherited: tuple[str, ...] = ()
@@ -110,12 +104,6 @@ class Weighted(WeightedSamples):
         )
         return (*(words for so, words in reasons if so), *self.inherited)
 
-    @own_arithmetic
-    def mean(self, f: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
-        """Posterior mean of the parameters, (n_params,), or of `f(theta)`, (n, ...), of the trailing shape."""
-        values = self.theta if f is None else np.asarray(f(self.theta))
-        return np.asarray(np.tensordot(self.weight, values, axes=(0, 0)))
-
     def summary(self) -> str:
         """Describe evidence and posterior in plain text."""
         lines = [
@@ -131,114 +119,117 @@ class Weighted(WeightedSamples):
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.doubts)])
 
 
-Posterior: TypeAlias = NestedResult | Weighted
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A mixture of Student-t kernels, of one shape within each cluster.
 
-
-def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
-    """Return the doubts about `result`, which `found` refines, in words.
-
-    For a run also where its log Z, or that of its check, is more than four errors from that of `found`.
+    `centres` in each cluster's whitened frame, one array (n_kernels, n_params) per cluster; `width` of the kernels in
+    that frame; `share` of the draws for each cluster, (n_clusters,).
     """
-    if isinstance(result, Weighted):
-        return result.doubts
-    routes = [("the run", result.log_z, result.log_z_error)]
-    if result.check is not None:
-        routes.append((result.check.route, result.check.log_z, result.check.log_z_error))
-    apart = tuple(
-        f"{name} gives log Z = {log_z:.2f} ± {error:.2f}, the draws {found.log_z:.2f} ± {found.log_z_error:.2f}"
-        for name, log_z, error in routes
-        if not abs(log_z - found.log_z) <= _APART * math.hypot(error, found.log_z_error)
+
+    clusters: Clusters
+    centres: tuple[FloatArray, ...]
+    width: tuple[float, ...]
+    share: FloatArray
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, n_params)."""
+        n_params = self.clusters.mean.shape[1]
+        which = rng.choice(len(self.share), size=n, p=self.share)
+        white = rng.standard_normal((n, n_params))
+        white *= np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, size=(n, 1)))
+        out = np.empty((n, n_params))
+        for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
+            rows = np.flatnonzero(which == k)
+            place = centres[rng.integers(len(centres), size=rows.size)] + width * white[rows]
+            out[rows] = self.clusters.mean[k] + place @ self.clusters.root[k].T
+        return out
+
+    def widened(self, factor: float) -> Proposal:
+        """Return the same mixture with kernels wider by a factor."""
+        return replace(self, width=tuple(factor * width for width in self.width))
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """Natural log of the density, (n, n_params) -> (n,)."""
+        blocks = np.array_split(x, max(1, -(-len(x) // _BLOCK)))
+        return np.concatenate([self._log_density_of_block(block) for block in blocks])
+
+    def _log_density_of_block(self, x: FloatArray) -> FloatArray:
+        n_params, nu = x.shape[1], DEGREES_OF_FREEDOM
+        constant = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
+        parts = []
+        for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
+            white = (x - self.clusters.mean[k]) @ self.clusters.inverse_root[k].T
+            square = (white**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2.0 * white @ centres.T
+            kernel = -0.5 * (nu + n_params) * np.log1p(np.maximum(square, 0.0) / (nu * width**2))
+            norm = constant - self.clusters.log_det[k] - n_params * math.log(width) - math.log(len(centres))
+            parts.append(logsumexp(kernel, axis=1) + norm + math.log(self.share[k]))
+        return np.asarray(logsumexp(parts, axis=0))
+
+
+def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
+    """Combine proposals into one mixture with the shares `share`, which need not be normalised."""
+    total = math.fsum(share)
+    return Proposal(
+        Clusters.join(*(p.clusters for p in proposals)),
+        tuple(centres for p in proposals for centres in p.centres),
+        tuple(width for p in proposals for width in p.width),
+        np.concatenate([s / total * p.share for p, s in zip(proposals, share, strict=True)]),
     )
-    return (*result.warnings, *apart)
 
 
-@own_arithmetic
-def update(
-    previous: Posterior,
-    problem: Samplable,
-    *,
-    rng: np.random.Generator,
-    fall_back: Callable[[], NestedResult],
-    n_draws: int = 2000,
-    prior_share: float = 0.1,
-) -> Weighted:
-    """Update a posterior with new readings by importance sampling.
+def single_student_t(mean: FloatArray, covariance: FloatArray) -> Proposal:
+    """Return one Student t distribution of this mean, (n_params,), and scale matrix, (n_params, n_params)."""
+    # A small ridge where there is no extent.
+    variance = np.diag(covariance)
+    ridge = 1e-10 * variance + 1e-13 * variance.mean() + 1e-24
+    root = np.linalg.cholesky(covariance + ridge * np.eye(len(mean)))
+    log_det = np.log(np.diag(root)).sum()
+    shape = Clusters(mean[None], root[None], np.linalg.inv(root)[None], np.array([log_det]), np.ones(1, dtype=np.int64))
+    return Proposal(shape, (np.zeros((1, len(mean))),), (1.0,), np.ones(1))
 
-    The previous samples are reweighted by the new readings' likelihood, and a proposal is fitted to the samples. Draws
-    from a mixture of the proposal and the prior are weighted against the whole new problem, so the evidence is absolute
-    and errors do not accumulate from reading to reading. Where the new readings are surprising (too few effective
-    samples or too heavy a tail of the weights), `fall_back` starts from scratch.
 
-    Parameters
-    ----------
-    previous
-        Posterior of the same parameters given fewer readings.
-    problem
-        Prior, and likelihood of all readings.
-    rng
-        Source of randomness.
-    fall_back
-        Function that solves the new problem, for instance `lambda: run(problem, rng=rng)`.
-    n_draws
-        Number of draws; the cost is this many evaluations plus one per old sample, at most 1000.
-    prior_share
-        Share of the draws that come from the prior, 0 to below 1: they cover regions without samples of the old
-        posterior, and bound the weights.
+def fit_wide_and_narrow_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal, ...]:
+    """Fit two proposals to samples, (n_samples, n_params): the best wide form, then the best narrow form.
 
-    Returns
-    -------
-    Weighted
-        With the samples and `run` of the fallback where it was used.
-
-    Raises
-    ------
-    ParameterError
-        If `previous` has other parameters, an option is out of range, or the prior has neither `to_unit_cube` nor
-        coordinates.
-    NotConvergedError
-        If the likelihood fails.
+    Wide: one kernel per cluster, as wide as the cluster. Narrow: kernels at the samples, of Silverman's width or less.
+    Either with or without clusters. Of each form the variant with the greatest held-out likelihood (fit to one half,
+    score on the other) is fitted to all samples. The caller decides between the two by weighted draws: the likelihood
+    favours a close fit, the weights a wide one. Fewer than 80 samples give one wide kernel only.
     """
-    require_rng(rng)
-    require_callable(
-        "fall_back", fall_back, "a function that solves the problem, such as lambda: run(problem, rng=rng)"
-    )
-    n_draws = checked_whole("n_draws", n_draws)
-    if not 0 <= checked_number("prior_share", prior_share) < 1:
-        raise ParameterError("prior_share", prior_share, "0 or more, below 1")
-    evaluate = Evaluator(problem)
-    if previous.names != evaluate.names:
-        raise ParameterError("previous.names", previous.names, f"the problem's names {evaluate.names}")
-    space = unbounded_space_of(problem.prior)
-    rows = np.unique(previous.draw_rows(1000, rng=rng))
-    theta = previous.theta[rows]
-    log_likelihood = evaluate.log_likelihood(theta)
-    log_weight = previous.log_weight[rows] + log_likelihood - previous.log_likelihood[rows]
-    # Rows of weight above 1 / 1000 were drawn several times and kept once: their weight makes up for it.
-    log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
-    n_eff, k = n_effective(log_weight), math.inf
-    # Without parameters there is no density to fit: the fallback evaluates the only hypothesis.
-    if evaluate.names and n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
-        proposal = fit_wide_and_narrow_proposals(
-            resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
-        )[-1]
-        found = draw_and_weigh(proposal, prior_share, HeldOutSamples.empty(), space, evaluate, n_draws=n_draws, rng=rng)
-        found = with_error_of_lost_parts(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
-        if found.sound:
-            return found
-        k = found.pareto_k
-    fallen = fall_back()
-    return Weighted(
-        fallen.names,
-        fallen.theta,
-        log_likelihood=fallen.log_likelihood,
-        log_weight=fallen.log_weight,
-        log_z=fallen.log_z,
-        log_z_error=fallen.log_z_error,
-        n_eff=fallen.n_eff,
-        n_calls=evaluate.n_calls + fallen.n_calls,
-        pareto_k=k,
-        run=fallen,
-    )
+    x = x[rng.permutation(len(x))]
+    half = len(x) // 2
+    if half < _FEW:
+        return (_fit_kernels(x, False, None),)
+
+    def held_out_score(form: tuple[bool, float | None]) -> float:
+        return float(_fit_kernels(x[:half], *form).log_density(x[half:]).mean())
+
+    wide: list[tuple[bool, float | None]] = [(False, None), (True, None)]
+    narrow: list[tuple[bool, float | None]] = [(split, scale) for split in (False, True) for scale in _SCALES]
+    return tuple(_fit_kernels(x, *max(forms, key=held_out_score)) for forms in (wide, narrow))
+
+
+def _fit_kernels(x: FloatArray, split: bool, scale: float | None) -> Proposal:
+    """Fit one form of proposal: by cluster if `split`; one kernel per cluster if `scale` is None, else at samples.
+
+    `scale`: width of the kernels in units of Silverman's.
+    """
+    clusters = find_disconnected_clusters(x) if split else Clusters.from_groups([x])
+    home = clusters.assign(x)
+    n_params = x.shape[1]
+    centres, width = [], []
+    for k in range(len(clusters)):
+        part = x[home == k]
+        if scale is None or len(part) < 2:
+            centres.append(np.zeros((1, n_params)))
+            width.append(1.0)
+        else:
+            kept = part[:_MOST_KERNELS]
+            centres.append((kept - clusters.mean[k]) @ clusters.inverse_root[k].T)
+            width.append(scale * (4 / (n_params + 2) / len(kept)) ** (1 / (n_params + 4)))
+    size = np.maximum(np.bincount(home, minlength=len(clusters)), 1)
+    return Proposal(clusters, tuple(centres), tuple(width), size / size.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,81 +245,21 @@ class HeldOutSamples:
     log_likelihood: FloatArray
     n_independent: float
 
-    @classmethod
-    def empty(cls) -> HeldOutSamples:
-        """Return an empty set, for plain importance sampling."""
-        return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
-
-
-def effective_lineages(found: Posterior) -> float:
-    """Return the number of independent samples that would give the share of a mode as precisely as this posterior.
-
-    Many samples of a run descend from one live point. The log evidence of a mode has the error sqrt(H memory / n_live),
-    with H the information and `memory` the variance factor of correlated chains; a share estimated from n independent
-    samples has the relative error 1 / sqrt(n). So n is n_live / (H memory); for `Weighted` without a run it is `n_eff`.
-    """
-    if isinstance(found, Weighted):
-        return found.n_eff if found.run is None else effective_lineages(found.run)
-    return found.n_live / max(found.information * found.memory, 1.0)
-
-
-def split_off_held_out(
-    found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
-) -> tuple[FloatArray, HeldOutSamples]:
-    """Split samples at random, two to one, into those for fitting a density and held-out ones.
-
-    The first are (n, n_params), in coordinates of `space`, resampled by weight. `n_lineages`: effective number of all.
-    """
-    lot = rng.random(len(found.theta)) < _HELD_OUT
-    chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
-    weight = np.exp(found.log_weight[chosen])
-    rows = chosen[resampled_rows(weight, min(_MOST_HELD, chosen.size), rng)]
-    x = space.enter(found.theta[rows])
-    held = HeldOutSamples(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
-    return resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
-
-
-def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
-    """Resample for fitting a density; return distinct samples in coordinates of `space`, (n, n_params).
-
-    As many are drawn by weight as the effective sample size, at most 2000, and a third as many by the square root of
-    the weights: a proposal must have wider tails than the posterior.
-    """
-    weight = np.exp(log_weight - log_weight.max())
-    n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
-    rows = [resampled_rows(weight, n, rng), resampled_rows(np.sqrt(weight), n // 3, rng)]
-    return space.enter(theta[np.unique(np.concatenate(rows))])
-
-
-def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
-    """Set `lost`, the share of the posterior that a run of `n_lineages` effective samples may have lost.
-
-    It is added to `log_z_error` in quadrature.
-    """
-    if not found.n_eff > 1:
-        return found
-    n = int(min(found.n_eff, 1000))
-    parts = find_disconnected_clusters(space.enter(found.theta[np.unique(found.draw_rows(n, rng=rng))]))
-    share = parts.size / parts.size.sum()
-    lost = float(share @ np.exp(-n_lineages * share))
-    return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
-
 
 def draw_and_weigh(
     proposal: Proposal,
     prior_share: float,
-    held: HeldOutSamples,
+    held: HeldOutSamples | None,
     space: Space,
     evaluate: Evaluator,
     *,
     n_draws: int,
     rng: np.random.Generator,
-    tail: float = 3.0,
 ) -> Weighted:
     """Draw from a mixture of a proposal and the prior, evaluate, and weight the draws.
 
     `prior_share`: share of the `n_draws` from the prior. `held`: posterior samples that correct the evidence by bridge
-    sampling. `tail` as for `pareto_k`. If no draw is possible, log Z is -inf.
+    sampling, or None. If no draw is possible, log Z is -inf.
     """
     # At least one draw is the proposal's: a share below 1, such as 0.9999 of 2000, may round to all of them.
     n_prior = min(round(prior_share * n_draws), n_draws - 1)
@@ -362,11 +293,12 @@ def draw_and_weigh(
             pareto_k=math.inf,
         )
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
-    k = pareto_k(log_ratio, tail)
-    held_ratio = np.empty(0)
-    if len(held.x):
+    k = pareto_k(log_ratio)
+    held_ratio, n_held = np.empty(0), 0.0
+    if held is not None and len(held.x):
         held_ratio = held.log_density + held.log_likelihood - log_proposal(held.x, held.log_density)
-    log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, held.n_independent)
+        n_held = held.n_independent
+    log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, n_held)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
     n_eff = n_effective(log_weight)
@@ -411,16 +343,16 @@ def _bridge_sampling_estimate(
     return log_z, math.sqrt(spread + kept_error**2), missed, cut - float(logsumexp(cut))
 
 
-def pareto_k(log_weight: FloatArray, tail: float = 3.0) -> float:
+def pareto_k(log_weight: FloatArray) -> float:
     """Estimate the Pareto shape k of the tail of importance weights, from log weights of any scale, (n,).
 
-    A generalised Pareto distribution is fitted to the largest weights, `tail` sqrt(n) of them but at most a fifth, with
-    the estimator of Zhang & Stephens (2009), as in Vehtari et al. (2024). Below 0.5 the weights have a finite variance;
+    A generalised Pareto distribution is fitted to the largest weights, 3 sqrt(n) of them but at most a fifth, with the
+    estimator of Zhang & Stephens (2009), as in Vehtari et al. (2024). Below 0.5 the weights have a finite variance;
     above 0.7 their mean converges too slowly to be used. k is infinite for fewer than 25 weights, and minus infinity
     where fewer than five of the tail exceed the rest.
     """
     n = len(log_weight)
-    n_tail = int(min(0.2 * n, tail * math.sqrt(n)))
+    n_tail = int(min(0.2 * n, 3.0 * math.sqrt(n)))
     if n_tail < 5:
         return math.inf
     weight = np.sort(np.exp(log_weight - log_weight.max()))

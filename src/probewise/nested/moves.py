@@ -1,20 +1,25 @@
-"""Draw new points uniformly from the part of the prior above a likelihood bound."""
+"""Moves: ways to draw new points uniformly from the part of the prior above a likelihood bound."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError
-from probewise.nested.evaluate import Bound, Evaluator, Points
-from probewise.nested.slice_chains import AXIS, DIFFERENCE, FRAME, HOP, SliceChains
+from probewise.nested.clusters import Clusters
+from probewise.nested.problem import Bound, Evaluator, Points
+from probewise.nested.slice import AXIS, DIFFERENCE, FRAME, HOP, SliceChains
 
 # With three steps in three dimensions the chains stay correlated: ln Z scattered by 1.3 of its claimed errors.
 _FEWEST_STEPS = 6
+_HOPS = 3
+_BLOCK = 4096  # proposals evaluated at a time: their predictions stay in the cache
+_DENSITY_BLOCK = 1024
+_MOST_KERNELS = 100
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class PriorRejection:
         wanted, found, parts, n_evaluated = len(start), 0, [], 0
         while found < wanted:
             batch = int(1.1 * (wanted - found) / self.volume) + 1
-            tried = evaluate.draw_from_prior(batch, rng)
+            tried = evaluate(evaluate.space.draw(batch, rng=rng), rng)
             kept = tried.take_rows(bound.mask_above(tried.log_likelihood, tried.label))
             parts.append(kept)
             found += len(kept)
@@ -138,7 +143,7 @@ class SliceMove:
     width: float = 5.0
     axes: float = 0.7
     differences: float = 0.1
-    hops: int = 3
+    hops: int = _HOPS
     target: float = 2.5
     fewest_steps: int = _FEWEST_STEPS
 
@@ -152,24 +157,22 @@ class SliceMove:
         if self.fewest_steps < 1:
             raise ParameterError("fewest_steps", self.fewest_steps, "1 or more")
 
+    def n_steps(self, n_params: int) -> int:
+        """Return the number of steps of a chain, without hops."""
+        return max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
+
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
         """Return the ends of one chain from each start, and the tally; see `Move`."""
-        n_chains, n_params = start.u.shape
         chains = SliceChains(start, live, evaluate.space, width=self.width)
-        n_lines = max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if chains.are_in_clusters else 0
-        chains.run(self._draw_kinds_of_steps(n_chains, n_lines + n_hops, n_hops, rng), bound, evaluate, rng)
-        n_stuck = int((~chains.moved).sum())
-        return chains.points(), Tally(chains.n_evaluated, chains.n_taken, n_stuck, chains.n_tried)
-
-    def _draw_kinds_of_steps(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
-        """Draw the kind of every step (`FRAME`, `AXIS`, `DIFFERENCE` or `HOP`), (n_chains, n_steps)."""
-        lot = rng.random((n_chains, n_steps))
-        kind = np.where(lot < self.axes, AXIS, np.where(lot < self.axes + self.differences, DIFFERENCE, FRAME))
-        kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = HOP
-        return kind
+        n_steps = self.n_steps(start.u.shape[1]) + n_hops
+        lot = rng.random((len(start), n_steps))
+        kinds = np.where(lot < self.axes, AXIS, np.where(lot < self.axes + self.differences, DIFFERENCE, FRAME))
+        kinds[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = HOP
+        chains.run(kinds, bound, evaluate, rng)
+        return chains.points(), Tally(chains.n_evaluated, chains.n_taken, int((~chains.moved).sum()), chains.n_tried)
 
     def with_twice_the_steps(self) -> SliceMove:
         """Return the move with twice as many steps per chain."""
@@ -179,3 +182,199 @@ class SliceMove:
         """Return the move with its bracket width adapted towards `target` candidates per step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
+
+
+@dataclass(frozen=True, eq=False)
+class HoppingMove:
+    """A move that hops between modes, then runs the chains of `chains`, so that no mode dies out among the live points.
+
+    A hop takes a point to its counterpart in another mode, by the affine map between their covariances, and is accepted
+    with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes with enough live points for a
+    covariance; here `modes` are clusters of the posterior, in the sampling coordinates. Level sets of a mode keep about
+    the same shape far below its top, so the maps serve from where modes separate.
+    """
+
+    chains: SliceMove
+    modes: Clusters
+
+    def draw(
+        self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
+    ) -> tuple[Points, Tally]:
+        """Return the ends of one chain from each start, and the tally; see `Move`."""
+        n_before, now = evaluate.n_calls, start.copy()
+        for _ in range(_HOPS):
+            self._hop_in_place(now, bound, evaluate, rng)
+        n_hops = evaluate.n_calls - n_before
+        new, tally = self.chains.draw(now, bound, live, evaluate, rng)
+        return new, replace(tally, n_evaluated=tally.n_evaluated + n_hops)
+
+    def _hop_in_place(self, now: Points, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
+        """Try one hop of each point to a mode chosen at random from the others; overwrite the points that succeed."""
+        modes = self.modes
+        home = modes.assign(now.u)
+        goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
+        u, log_growth = modes.map_with_log_volume_ratio(now.u, home, goal)
+        # The way back must be the same map.
+        able = evaluate.space.inside_mask(u) & (modes.assign(u) == goal)
+        level = now.log_density - log_growth - rng.standard_exponential(len(home))
+        rows = able.nonzero()[0]
+        theta, log_density = evaluate.space.leave(u[rows])
+        dense = (log_density >= level[rows]).nonzero()[0]
+        rows = rows[dense]
+        tried = evaluate.evaluate_mapped(u[rows], theta[dense], log_density[dense], rng)
+        won = bound.mask_above(tried.log_likelihood, tried.label).nonzero()[0]
+        now.overwrite_rows(rows[won], tried, won)
+
+    def adapted(self, tally: Tally) -> HoppingMove:
+        """Return the move with its chains adapted; see `SliceMove`."""
+        return HoppingMove(self.chains.adapted(tally), self.modes)
+
+
+@dataclass(frozen=True, eq=False)
+class Kernels:
+    """A kernel density of Gaussians about points: half of the mass with sd `width`, half with a third of it.
+
+    `centre_rows` are the points whitened by their `mean` and the Cholesky `root` of their covariance, (n_kernels,
+    n_params); `width` is in that frame. The wide kernels lead to other modes and into corners without points, the
+    narrow ones follow a thin or curved region.
+    """
+
+    mean: FloatArray
+    root: FloatArray
+    centre_rows: FloatArray
+    width: float
+
+    @classmethod
+    def at_points(cls, points: FloatArray, *, rng: np.random.Generator) -> Kernels:
+        """Place kernels at up to a hundred of the points, (n_points, n_params), whitened by the covariance of all."""
+        n_points, n_params = points.shape
+        mean = points.mean(axis=0)
+        covariance = np.atleast_2d(np.cov(points, rowvar=False))
+        scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        correlation = covariance / np.outer(scale, scale)
+        root = scale[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(n_params))
+        rows = rng.permutation(n_points)[:_MOST_KERNELS]
+        centre_rows = np.linalg.solve(root, (points[rows] - mean).T).T
+        # Silverman's rule: the optimal width for Gaussian points.
+        return cls(mean, root, centre_rows, (4 / (n_params + 2) / len(rows)) ** (1 / (n_params + 4)))
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, n_params)."""
+        rows = rng.integers(len(self.centre_rows), size=n)
+        width = np.where(rng.random(n) < 0.5, self.width, self.width / 3)
+        white = self.centre_rows[rows] + width[:, None] * rng.standard_normal((n, self.root.shape[0]))
+        return np.asarray(self.mean + white @ self.root.T)
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Natural log of the density up to a constant, (n, n_params) -> (n,)."""
+        white = np.linalg.solve(self.root, (points - self.mean).T).T / (math.sqrt(2) * self.width)
+        blocks = np.array_split(white, max(1, -(-len(white) // _DENSITY_BLOCK)))
+        return np.concatenate([self._log_density_of_block(block) for block in blocks])
+
+    def _log_density_of_block(self, white: FloatArray) -> FloatArray:
+        # Single precision (1e-5, enough for a proposal) halves the time of the exponentials.
+        centres = (self.centre_rows / (math.sqrt(2) * self.width)).astype(np.float32)
+        rows = white.astype(np.float32)
+        square = (rows * rows).sum(axis=1)[:, None] + (centres * centres).sum(axis=1) - 2.0 * rows @ centres.T
+        nearest = np.maximum(square.min(axis=1), 0.0)
+        # Relative to the nearest kernel, so that far points do not underflow.
+        wide = np.exp(nearest[:, None] - square)
+        power = np.square(np.square(np.square(wide)))  # the ninth power is a kernel a third as wide
+        power *= wide
+        fall = nearest.astype(np.float64)
+        narrow = power.sum(axis=1).astype(np.float64) * 3.0 ** len(self.mean)
+        return np.asarray(np.log(wide.sum(axis=1).astype(np.float64) + narrow * np.exp(-8.0 * fall)) - fall)
+
+
+@dataclass(frozen=True)
+class KernelMove:
+    """A move that draws above a bound by independent proposals from kernels about the live points.
+
+    Every chain starts at a live point and accepts or rejects its proposals in turn (independence Metropolis-Hastings;
+    Hastings 1970; Tierney 1994), so the prior above the bound is left invariant; with `moves` accepted on average it
+    forgets its start. Proposals that do not depend on a chain's position are evaluated in one batch: for a robot that
+    infers after every reading, the overhead per call exceeds the cost of the likelihood. Suited to few parameters,
+    where many proposals lie above the bound. Where fewer than one in `patience` is accepted, the chains of `otherwise`
+    go on from the ends.
+
+    Parameters
+    ----------
+    moves
+        Target number of accepted proposals per chain, on average. A chain with none stays at its start, which is valid;
+        about exp(-moves) of the chains do.
+    n_proposals
+        Number of proposals per chain, tuned to that target.
+    patience
+        Largest number of proposals per acceptance.
+    otherwise
+        The move used where kernels are inefficient.
+    """
+
+    moves: float = 10.0
+    n_proposals: int = 16
+    patience: float = 60.0
+    otherwise: SliceMove = field(default_factory=SliceMove)
+
+    def __post_init__(self) -> None:
+        if not self.moves > 0:
+            raise ParameterError("moves", self.moves, "greater than 0")
+        if not self.n_proposals >= 1:
+            raise ParameterError("n_proposals", self.n_proposals, "1 or more")
+        if not self.patience >= 1:
+            raise ParameterError("patience", self.patience, "1 or more")
+
+    def draw(
+        self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
+    ) -> tuple[Points, Tally]:
+        """Return the ends of one chain from each start, and the tally; see `Move`."""
+        n_chains, space = len(start), evaluate.space
+        kernels = Kernels.at_points(live, rng=rng)
+        n_tries = n_chains * self.n_proposals
+        u = kernels.draw(n_tries, rng=rng)
+        log_target = -kernels.log_density(u)
+        inside = np.flatnonzero(((u >= space.low) & (u <= space.high)).all(axis=1))
+        parts = [evaluate(u[rows], rng) for rows in np.array_split(inside, max(1, -(-inside.size // _BLOCK)))]
+        tried = Points.join(*parts)
+        log_target[inside] += tried.log_density
+        admitted = np.zeros(n_tries, dtype=bool)
+        admitted[inside] = bound.mask_above(tried.log_likelihood, tried.label)
+        log_odds = np.log(rng.random((self.n_proposals, n_chains)))
+        log_now = start.log_density - kernels.log_density(start.u)
+        last, n_accepted = _accept_in_turn(admitted, log_target, log_now, log_odds)
+        where = np.empty(n_tries, dtype=np.int64)
+        where[inside] = np.arange(inside.size)
+        moved = last >= 0
+        ends = start.copy()
+        ends.overwrite_rows(moved, tried, where[last[moved]])
+        tally = Tally(inside.size, n_accepted)
+        if n_accepted * self.patience < n_tries:
+            ends, more = self.otherwise.draw(ends, bound, live, evaluate, rng)
+            tally = Tally(inside.size + more.n_evaluated, n_accepted, more.n_stuck)
+        return ends, tally
+
+    def adapted(self, tally: Tally) -> KernelMove:
+        """Return the move with its number of proposals adapted towards `moves` accepted ones."""
+        share = max(tally.n_accepted, 1) / max(tally.n_evaluated, 1)
+        wanted = min(self.moves / share, 2.0 * self.n_proposals, 2.0 * self.patience)
+        return replace(self, n_proposals=max(8, math.ceil(wanted)))
+
+
+def _accept_in_turn(
+    possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray
+) -> tuple[np.ndarray, int]:
+    """Let every chain accept or reject its proposals in turn (Metropolis-Hastings with independent proposals).
+
+    `possible`, whether each proposal lies above the bound, and `log_target`, the log of target over proposal density,
+    are (n_steps * n_chains,), steps first; `log_now` is that log at the starts, (n_chains,). `log_odds`: logs of
+    uniform numbers, (n_steps, n_chains). Return the index of the proposal that each chain accepted last, -1 for none,
+    (n_chains,), and the number of acceptances.
+    """
+    n_steps, n_chains = log_odds.shape
+    log_target = np.where(possible, log_target, -np.inf).reshape(n_steps, n_chains)
+    now, index, n_accepted = log_now.copy(), np.full(n_chains, -1), 0
+    for k in range(n_steps):
+        accept = log_odds[k] < log_target[k] - now
+        now[accept] = log_target[k][accept]
+        index[accept] = k * n_chains + np.flatnonzero(accept)
+        n_accepted += int(accept.sum())
+    return index, n_accepted

@@ -1,32 +1,39 @@
-"""Refine the evidence and the posterior of a run by importance sampling; see `probewise.nested.importance`."""
+"""Refine a run's evidence and posterior by importance sampling, or update them with new readings."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
+from scipy.special import logsumexp
 
-from probewise._arrays import own_arithmetic
-from probewise._kinds import checked_whole, require_rng
+from probewise._arrays import FloatArray, own_arithmetic
+from probewise._kinds import checked_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError
-from probewise.nested.evaluate import Evaluator, Samplable
+from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     HeldOutSamples,
-    Posterior,
     Weighted,
     draw_and_weigh,
-    effective_lineages,
-    inherited_doubts,
-    resampled_for_fit,
-    split_off_held_out,
-    with_error_of_lost_parts,
+    fit_wide_and_narrow_proposals,
+    mixture_of_proposals,
 )
-from probewise.nested.missed_hills import find_missed_hills
-from probewise.nested.proposal import fit_wide_and_narrow_proposals, mixture_of_proposals
+from probewise.nested.missed import find_missed_hills
+from probewise.nested.problem import Evaluator, Samplable, Space, unbounded_space_of
 from probewise.nested.result import NestedResult
-from probewise.nested.space import unbounded_space_of
+from probewise.nested.weights import n_effective, resampled_rows
 
+_MOST_FITTED = 2000
+_SURPRISED = 0.01
+_HELD_OUT = 1 / 3
+_MOST_HELD = 1000
+_APART = 4.0  # errors between the log Z of draws and of the refined run, above which they disagree
 _FIRST = 0.75  # share of the better form of density in the mixture
+
+Posterior: TypeAlias = NestedResult | Weighted
 
 
 @own_arithmetic
@@ -97,8 +104,7 @@ def refine(
     for _ in range(n_pilots):
         proposals = fit_wide_and_narrow_proposals(np.concatenate(known), rng=rng)
         pilots = [
-            draw_and_weigh(p, 0.0, HeldOutSamples.empty(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
-            for p in proposals
+            draw_and_weigh(p, 0.0, None, space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals
         ]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         better = pilots[first]
@@ -117,3 +123,164 @@ def refine(
         found = replace(found, n_calls=found.n_calls + missing.n_calls)
         doubts = (*doubts, *missing.doubts(found))
     return replace(found, inherited=doubts)
+
+
+@own_arithmetic
+def update(
+    previous: Posterior,
+    problem: Samplable,
+    *,
+    rng: np.random.Generator,
+    fall_back: Callable[[], NestedResult],
+    n_draws: int = 2000,
+    prior_share: float = 0.1,
+) -> Weighted:
+    """Update a posterior with new readings by importance sampling.
+
+    The previous samples are reweighted by the new readings' likelihood, and a proposal is fitted to the samples. Draws
+    from a mixture of the proposal and the prior are weighted against the whole new problem, so the evidence is absolute
+    and errors do not accumulate from reading to reading. Where the new readings are surprising (too few effective
+    samples or too heavy a tail of the weights), `fall_back` starts from scratch.
+
+    Parameters
+    ----------
+    previous
+        Posterior of the same parameters given fewer readings.
+    problem
+        Prior, and likelihood of all readings.
+    rng
+        Source of randomness.
+    fall_back
+        Function that solves the new problem, for instance `lambda: run(problem, rng=rng)`.
+    n_draws
+        Number of draws; the cost is this many evaluations plus one per old sample, at most 1000.
+    prior_share
+        Share of the draws that come from the prior, 0 to below 1: they cover regions without samples of the old
+        posterior, and bound the weights.
+
+    Returns
+    -------
+    Weighted
+        With the samples and `run` of the fallback where it was used.
+
+    Raises
+    ------
+    ParameterError
+        If `previous` has other parameters, an option is out of range, or the prior has neither `to_unit_cube` nor
+        coordinates.
+    NotConvergedError
+        If the likelihood fails.
+    """
+    require_rng(rng)
+    require_callable(
+        "fall_back", fall_back, "a function that solves the problem, such as lambda: run(problem, rng=rng)"
+    )
+    n_draws = checked_whole("n_draws", n_draws)
+    if not 0 <= checked_number("prior_share", prior_share) < 1:
+        raise ParameterError("prior_share", prior_share, "0 or more, below 1")
+    evaluate = Evaluator(problem)
+    if previous.names != evaluate.names:
+        raise ParameterError("previous.names", previous.names, f"the problem's names {evaluate.names}")
+    space = unbounded_space_of(problem.prior)
+    rows = np.unique(previous.draw_rows(1000, rng=rng))
+    theta = previous.theta[rows]
+    log_likelihood = evaluate.log_likelihood(theta)
+    log_weight = previous.log_weight[rows] + log_likelihood - previous.log_likelihood[rows]
+    # Rows of weight above 1 / 1000 were drawn several times and kept once: their weight makes up for it.
+    log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
+    n_eff, k = n_effective(log_weight), math.inf
+    # Without parameters there is no density to fit: the fallback evaluates the only hypothesis.
+    if evaluate.names and n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
+        proposal = fit_wide_and_narrow_proposals(
+            resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
+        )[-1]
+        found = draw_and_weigh(proposal, prior_share, None, space, evaluate, n_draws=n_draws, rng=rng)
+        found = with_error_of_lost_parts(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
+        if found.sound:
+            return found
+        k = found.pareto_k
+    fallen = fall_back()
+    return Weighted(
+        fallen.names,
+        fallen.theta,
+        log_likelihood=fallen.log_likelihood,
+        log_weight=fallen.log_weight,
+        log_z=fallen.log_z,
+        log_z_error=fallen.log_z_error,
+        n_eff=fallen.n_eff,
+        n_calls=evaluate.n_calls + fallen.n_calls,
+        pareto_k=k,
+        run=fallen,
+    )
+
+
+def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
+    """Return the doubts about `result`, which `found` refines, in words.
+
+    For a run also where its log Z, or that of its check, is more than four errors from that of `found`.
+    """
+    if isinstance(result, Weighted):
+        return result.doubts
+    routes = [("the run", result.log_z, result.log_z_error)]
+    if result.check is not None:
+        routes.append((result.check.route, result.check.log_z, result.check.log_z_error))
+    apart = tuple(
+        f"{name} gives log Z = {log_z:.2f} ± {error:.2f}, the draws {found.log_z:.2f} ± {found.log_z_error:.2f}"
+        for name, log_z, error in routes
+        if not abs(log_z - found.log_z) <= _APART * math.hypot(error, found.log_z_error)
+    )
+    return (*result.warnings, *apart)
+
+
+def effective_lineages(found: Posterior) -> float:
+    """Return the number of independent samples that would give the share of a mode as precisely as this posterior.
+
+    Many samples of a run descend from one live point. The log evidence of a mode has the error sqrt(H memory / n_live),
+    with H the information and `memory` the variance factor of correlated chains; a share estimated from n independent
+    samples has the relative error 1 / sqrt(n). So n is n_live / (H memory); for `Weighted` without a run it is `n_eff`.
+    """
+    if isinstance(found, Weighted):
+        return found.n_eff if found.run is None else effective_lineages(found.run)
+    return found.n_live / max(found.information * found.memory, 1.0)
+
+
+def split_off_held_out(
+    found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
+) -> tuple[FloatArray, HeldOutSamples]:
+    """Split samples at random, two to one, into those for fitting a density and held-out ones.
+
+    The first are (n, n_params), in coordinates of `space`, resampled by weight. `n_lineages`: effective number of all.
+    """
+    lot = rng.random(len(found.theta)) < _HELD_OUT
+    chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
+    weight = np.exp(found.log_weight[chosen])
+    rows = chosen[resampled_rows(weight, min(_MOST_HELD, chosen.size), rng)]
+    x = space.enter(found.theta[rows])
+    held = HeldOutSamples(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
+    return resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
+
+
+def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
+    """Resample for fitting a density; return distinct samples in coordinates of `space`, (n, n_params).
+
+    As many are drawn by weight as the effective sample size, at most 2000, and a third as many by the square root of
+    the weights: a proposal must have wider tails than the posterior.
+    """
+    weight = np.exp(log_weight - log_weight.max())
+    n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
+    rows = [resampled_rows(weight, n, rng), resampled_rows(np.sqrt(weight), n // 3, rng)]
+    return space.enter(theta[np.unique(np.concatenate(rows))])
+
+
+def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
+    """Set `lost`, the share of the posterior that a run of `n_lineages` effective samples may have lost.
+
+    It is added to `log_z_error` in quadrature.
+    """
+    if not found.n_eff > 1:
+        return found
+    n = int(min(found.n_eff, 1000))
+    parts = find_disconnected_clusters(space.enter(found.theta[np.unique(found.draw_rows(n, rng=rng))]))
+    share = parts.size / parts.size.sum()
+    lost = float(share @ np.exp(-n_lineages * share))
+    return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))

@@ -21,8 +21,7 @@ from scipy.special import gammaln, stdtr, stdtrit
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.clusters import find_clusters
-from probewise.nested.evaluate import Samplable
-from probewise.nested.space import Space, unbounded_space_of
+from probewise.nested.problem import Samplable, Space, unbounded_space_of
 from probewise.priors import Prior
 
 _DEGREES_OF_FREEDOM = 5.0

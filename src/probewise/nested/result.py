@@ -1,44 +1,126 @@
-"""The result of a run of nested sampling, with everything needed to judge it."""
+"""Weighted posterior samples, and the result of a run of nested sampling with everything needed to judge it."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import io
 import json
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import scipy
 
-from probewise._arrays import FloatArray, IntArray, frozen_int
-from probewise._kinds import checked_path
+from probewise._arrays import FloatArray, IntArray, frozen_int, own_arithmetic, read_only_floats
+from probewise._display import ShowsItself
+from probewise._kinds import checked_number, checked_path, checked_whole, require_rng
 from probewise._version import __version__
-from probewise.errors import FileError
-from probewise.nested import conversions
-from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, checked_array_of_length
-from probewise.nested.weights import weighted_quantiles
+from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.nested.evidence import birth_rows, log_volumes
+from probewise.nested.weights import resampled_rows, weighted_quantiles
 from probewise.recordings.atomic import write_bytes_atomically
 
 _FORMAT = "nested-result/4"
-# Lineage variance above which the run descends from too few lineages to estimate its own error.
-_MOST_MEMORY = 10.0
-_FEWEST_STEPS = 30.0  # between floating-point numbers, from quartile to quartile
+_FLOATS = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
+_COUNTS = ("parent", "n_at_death")
 _PER_INSERTION = ("insertion_rank", "insertion_n_ranked")
-_ARRAYS = ("theta", *PER_POINT, *COUNTS, *_PER_INSERTION)
+_ARRAYS = ("theta", *_FLOATS, *_COUNTS, *_PER_INSERTION)
 
 
-def software_versions() -> dict[str, str]:
-    """Return the versions of the software on which a run's numbers depend, by name."""
-    return {
-        "probewise": __version__,
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "python": platform.python_version(),
-    }
+class Samples(ShowsItself):
+    """Weighted samples of a posterior: base of results with `names`, `theta` and weights that sum to one.
+
+    Attributes
+    ----------
+    names
+        Parameter names, one per column of theta.
+    theta
+        Parameters of each sample, (n, n_params).
+    log_likelihood, log_weight
+        Of each sample, (n,).
+    log_z, log_z_error
+        Natural log of the evidence and its standard error.
+    n_eff
+        Kish's effective sample size.
+    n_calls
+        Number of likelihood evaluations.
+    """
+
+    names: tuple[str, ...]
+    theta: FloatArray
+    log_likelihood: FloatArray
+    log_weight: FloatArray
+    log_z: float
+    log_z_error: float
+    n_eff: float
+    n_calls: int
+
+    @property
+    @own_arithmetic
+    def weight(self) -> FloatArray:
+        """Posterior weights, summing to one, (n,)."""
+        return np.asarray(np.exp(self.log_weight))
+
+    @own_arithmetic
+    def draw_rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
+        """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
+        require_rng(rng)
+        n = checked_whole("n", n)
+        return np.asarray(rng.permutation(resampled_rows(self.weight, n, rng)))
+
+    def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
+
+        Systematic resampling: a point of weight w occurs n w times, rounded up or down, so points
+        repeat only where a weight exceeds 1 / n; `diversify` makes repeated samples distinct.
+        """
+        return np.asarray(self.theta[self.draw_rows(n, rng=rng)])
+
+    @own_arithmetic
+    def mean(self, f: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
+        """Average the parameters, (n_params,), or any function of them, over the posterior.
+
+        `f`: from theta, (n, n_params), to values (n, ...), for instance sensitivity fields; the mean has the trailing
+        shape. ShapeError for another number of rows.
+        """
+        values = self.theta if f is None else np.asarray(f(self.theta))
+        if values.shape[:1] != (len(self.theta),):
+            rows = f"{len(self.theta)} rows, as many as theta has"
+            raise ShapeError(f"f(theta) has shape {values.shape}; allowed: {rows}")
+        return np.asarray(np.tensordot(self.weight, values, axes=(0, 0)))
+
+    @own_arithmetic
+    def sd(self) -> FloatArray:
+        """Posterior standard deviation of the parameters, (n_params,)."""
+        return np.asarray(np.sqrt(self.weight @ (self.theta - self.mean()) ** 2))
+
+    @own_arithmetic
+    def covariance(self) -> FloatArray:
+        """Posterior covariance of the parameters, (n_params, n_params)."""
+        centred = self.theta - self.mean()
+        return np.asarray((centred * self.weight[:, None]).T @ centred)
+
+    @own_arithmetic
+    def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
+        """Weighted quantiles of each parameter at levels 0 to 1, (n_q,) -> (n_q, n_params); ParameterError outside."""
+        return weighted_quantiles(self.theta, self.weight, q)
+
+    def interval(self, mass: float = 0.95) -> FloatArray:
+        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper.
+
+        ParameterError unless 0 < mass < 1.
+        """
+        share = "greater than 0, less than 1"
+        columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
+        if not 0 < checked_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
+            raise ParameterError("mass", mass, share)
+        return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
 
 
 @dataclass(frozen=True)
@@ -94,70 +176,33 @@ class Check:
     n_calls: int
 
 
-def warning_of_few_possible_draws(log_start: float, log_start_error: float, n_live: int) -> str | None:
-    """Return a warning if fewer possible hypotheses than live points were drawn from the prior, else None.
-
-    A share s of the prior, estimated from m possible hypotheses, has the relative error sqrt((1 - s) / m).
-    """
-    if log_start_error <= 0:
-        return None
-    share = math.exp(log_start)
-    found = round((1.0 - share) / log_start_error**2)
-    if found >= n_live:
-        return None
-    return f"only {found} of {round(found / share)} hypotheses drawn from the prior are possible"
-
-
-def warning_of_coarse_coordinates(names: Sequence[str], u: FloatArray, weight: FloatArray) -> str | None:
-    """Return a warning if the posterior is too narrow in the sampling coordinates for floating-point numbers, or None.
-
-    Just below 1 numbers are 1e-16 apart, so this is the case about 8 sds above the mean of a normal prior. Below the
-    mean, near 0, there are numbers enough.
-
-    Parameters
-    ----------
-    names
-        Names of the parameters.
-    u, weight
-        Points in the sampling coordinates, (n, n_params), and their posterior weights, (n,), sum 1.
-    """
-    low, high = weighted_quantiles(u, weight, [0.25, 0.75])
-    steps = (high - low) / np.spacing(np.abs(low))
-    narrowest = int(np.argmin(steps))
-    if steps[narrowest] >= _FEWEST_STEPS:
-        return None
-    return (
-        f"half of the posterior of {names[narrowest]} lies within {steps[narrowest]:.0f} steps between floating-point "
-        "numbers, where its prior is mapped to 0 to 1: log Z and samples may be far off; take a prior with more "
-        "probability there"
-    )
-
-
-def warning_of_few_lineages(memory: float) -> str | None:
-    """Return a warning if the lineage variance exceeds 10, so that the error from it is uncertain; else None."""
-    if memory <= _MOST_MEMORY:
-        return None
-    return (
-        f"memory is {memory:.0f}: so few lineages lead to the posterior that the error is itself uncertain; "
-        "use more steps_per_param or more n_live"
-    )
-
-
 @dataclass(frozen=True, eq=False)
-class NestedResult(DeadPoints):
-    """The evidence, the weighted samples and the record of the run.
-
-    The samples, their means and quantiles, are those of `DeadPoints`, whose attributes come first.
+class NestedResult(Samples):
+    """The evidence, the weighted samples and the record of a run of nested sampling.
 
     Attributes
     ----------
-    log_start_error
-        Standard error of `log_start`.
+    names
+        Parameter names, one per column of theta.
+    theta
+        Dead points in order of death, followed by the last live points, (n_dead, n_params).
+    log_likelihood, label, log_weight
+        Of each: log likelihood, the number from 0 to 1 that orders points of equal likelihood,
+        and log posterior weight (the weights sum to one), all (n_dead,).
+    log_birth, birth_label
+        Log likelihood and label of the dead point above which each was drawn, (n_dead,);
+        minus infinity and 1 for draws from the whole prior.
+    parent
+        Row of the point at which each point's chain began; -1 for the initial draws from the prior, (n_dead,).
+    n_at_death
+        Number of points alive when each died, itself included, (n_dead,).
+    log_start, log_start_error
+        Natural log of the share of the prior with nonzero likelihood, and its standard error.
     log_z, log_z_error
         Natural log of the evidence, and its standard error: from simulated shrinkages, times the root of `memory`.
     memory
         Lineage variance: variance of log Z relative to independent points, 1 or more; see
-        `probewise.nested.relative_lineage_variance`.
+        `probewise.nested.evidence.relative_lineage_variance`.
     information
         Kullback-Leibler divergence of posterior from prior, nats.
     n_eff
@@ -184,6 +229,16 @@ class NestedResult(DeadPoints):
         A second estimate of the evidence; None if there is none.
     """
 
+    names: tuple[str, ...]
+    theta: FloatArray
+    log_likelihood: FloatArray
+    label: FloatArray
+    log_weight: FloatArray
+    log_birth: FloatArray
+    birth_label: FloatArray
+    parent: IntArray
+    n_at_death: IntArray
+    log_start: float
     log_start_error: float
     log_z: float
     log_z_error: float
@@ -204,12 +259,28 @@ class NestedResult(DeadPoints):
     check: Check | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in _PER_INSERTION:
-            values = checked_array_of_length(
-                name, frozen_int(getattr(self, name)), np.size(self.insertion_rank), "inserted point"
-            )
-            object.__setattr__(self, name, values)
+        for name in ("theta", *_FLOATS):
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
+        for name in (*_COUNTS, *_PER_INSERTION):
+            object.__setattr__(self, name, frozen_int(getattr(self, name)))
+        if self.theta.ndim != 2 or self.theta.shape[1] != len(self.names):
+            allowed = f"(n_dead, {len(self.names)}) for {self.names}"
+            raise ShapeError(f"theta has shape {self.theta.shape}; allowed: {allowed}")
+        for name in _ARRAYS[1:]:
+            per_insertion, shape = name in _PER_INSERTION, getattr(self, name).shape
+            n, one = (self.insertion_rank.size, "inserted point") if per_insertion else (self.n_dead, "row of theta")
+            if shape != (n,):
+                raise ShapeError(f"{name} has shape {shape}; allowed: ({n},), one per {one}")
+
+    @property
+    def n_dead(self) -> int:
+        """Number of weighted samples."""
+        return len(self.theta)
+
+    @property
+    def log_volume(self) -> FloatArray:
+        """Expected natural log of the prior share (volume X) with a likelihood above each sample's, (n_dead,)."""
+        return log_volumes(self.n_at_death, self.log_start)
 
     @property
     def calls_per_live_point_and_nat(self) -> float:
@@ -223,12 +294,13 @@ class NestedResult(DeadPoints):
 
     def summary(self) -> str:
         """Describe the run and its posterior in plain text."""
+        each = self.calls_per_live_point_and_nat
         lines = [
             f"log Z        {self.log_z:.2f} ± {self.log_z_error:.2f}",
             f"information  {self.information:.2f} nats",
             f"samples      {self.n_dead}, effective sample size {self.n_eff:.0f}",
             f"cost         {self.n_calls} likelihood evaluations, {self.n_live} live points"
-            f"{self._efficiency_in_words()}",
+            + (f", {each:.3g} for each live point and nat" if math.isfinite(each) else ""),
             f"memory       {self.memory:.2f} times the variance of independent points",
             f"stopped      {self.stop_reason}",
             f"insertion    p = {self.insertion_p_value:.2g}",
@@ -255,19 +327,32 @@ class NestedResult(DeadPoints):
             ]
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.warnings)])
 
-    def _efficiency_in_words(self) -> str:
-        each = self.calls_per_live_point_and_nat
-        return f", {each:.3g} for each live point and nat" if math.isfinite(each) else ""
-
     def to_anesthetic(self) -> Any:
-        """Convert to `anesthetic.NestedSamples`; see `probewise.nested.conversions.to_anesthetic`."""
-        return conversions.to_anesthetic(self)
+        """Convert to `anesthetic.NestedSamples`: parameters, `logL` and `logL_birth` of every dead point.
+
+        anesthetic recomputes the number of live points from births and deaths, and knows no labels. On a plateau of the
+        likelihood the levels are therefore made distinct by single units in the last place, in the order of the labels.
+        anesthetic does not know impossible hypotheses (zero likelihood) either: its prior is that of the possible ones.
+        To restore the evidence, `log_start` (log of the possible share of the prior) is added to every level.
+        ImportError if anesthetic is not installed.
+        """
+        anesthetic = _import_optional("anesthetic")
+        death, birth = self._log_likelihoods_without_ties()
+        return anesthetic.NestedSamples(
+            data=np.array(self.theta), columns=list(self.names), logL=death, logL_birth=birth, label="probewise"
+        )
 
     def to_arviz(self, *, rng: np.random.Generator, n: int | None = None) -> Any:
-        """Convert to ArviZ's container of `n` samples; see `probewise.nested.conversions.to_arviz`.
+        """Convert to ArviZ's container (`arviz.InferenceData`; `xarray.DataTree` from ArviZ 1.0 on).
 
-        By default as many as the effective sample size, so that few are repeated.
+        It holds one chain of `n` equally weighted samples, by default as many as the effective sample size, so that few
+        are repeated. Group `posterior` has a variable for each parameter; `sample_stats` has each sample's log
+        likelihood `log_l`, the level `log_l_birth` above which it was drawn, and its `row` in the result. Attributes
+        are those of the run. ImportError if arviz is not installed; ParameterError if there are no parameters.
         """
+        arviz = _import_optional("arviz")
+        if not self.names:
+            raise ParameterError("names", self.names, "one parameter or more; without any there are no samples")
         attributes = {
             "inference_library": "probewise",
             "inference_library_version": self.versions["probewise"],
@@ -280,7 +365,31 @@ class NestedResult(DeadPoints):
             "stop_reason": self.stop_reason,
             "warnings": json.dumps(self.warnings),
         }
-        return conversions.to_arviz(self, attributes, rng=rng, n=max(1, int(self.n_eff)) if n is None else n)
+        rows = self.draw_rows(max(1, int(self.n_eff)) if n is None else n, rng=rng)
+        groups = {
+            "posterior": {name: self.theta[None, rows, i] for i, name in enumerate(self.names)},
+            "sample_stats": {
+                "log_l": self.log_likelihood[None, rows],
+                "log_l_birth": self.log_birth[None, rows],
+                "row": rows[None, :],
+            },
+        }
+        # ArviZ 1.0 takes all groups as one mapping, earlier versions one argument per group.
+        if "data" in inspect.signature(arviz.from_dict).parameters:
+            return arviz.from_dict(groups, attrs={"/": attributes})
+        return arviz.from_dict(**groups, attrs=attributes)
+
+    def _log_likelihoods_without_ties(self) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods at death and birth, (n_dead,) each, plus `log_start`; ties are broken by label."""
+        order = np.lexsort((self.label, self.log_likelihood))
+        strict = self.log_likelihood[order] + self.log_start
+        for i in range(1, len(strict)):
+            if strict[i] <= strict[i - 1]:
+                strict[i] = np.nextafter(strict[i - 1], np.inf)
+        death = np.empty_like(strict)
+        death[order] = strict
+        born = birth_rows(self.log_likelihood, self.label, self.log_birth, self.birth_label)
+        return death, np.where(born >= 0, strict[born], -np.inf)
 
     def save(self, path: str | Path) -> None:
         """Write the result to one .npz file, atomically; FileError if it cannot be written."""
@@ -289,22 +398,15 @@ class NestedResult(DeadPoints):
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         head["check"] = None if self.check is None else asdict(self.check)
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        text = np.array(json.dumps({"format": _FORMAT, **head}))
         buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer, allow_pickle=False, head=np.array(json.dumps({"format": _FORMAT, **head})), **arrays
-        )
+        np.savez_compressed(buffer, allow_pickle=False, head=text, **arrays)
         write_bytes_atomically(path, buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> NestedResult:
-        """Read a file written by `save`.
-
-        Raises
-        ------
-        FileError
-            If there is no such file, or it is damaged, or not a result in this version of the format.
-        """
-        path = checked_path("path", path)
+        """Read a file written by `save`; FileError if there is none, or it is damaged or of another format."""
+        path, wanted = checked_path("path", path), "a file written by NestedResult.save"
         try:
             # Opened here, since np.load leaves a damaged file open.
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -313,22 +415,40 @@ class NestedResult(DeadPoints):
                 # Check before reading the arrays, which another version may store under other names.
                 arrays = {name: file[name] for name in _ARRAYS} if found == _FORMAT else {}
         except FileNotFoundError as error:
-            raise FileError(path, "there is no such file", "a file written by NestedResult.save") from error
+            raise FileError(path, "there is no such file", wanted) from error
         except Exception as error:  # a damaged archive can raise whatever its parts do
             # NumPy takes any other file for a pickle, and its message would advise to load it.
             why = "no NumPy archive" if "pickle" in str(error) else error
-            raise FileError(path, f"unreadable ({why})", "a file written by NestedResult.save") from error
+            raise FileError(path, f"unreadable ({why})", wanted) from error
         if found != _FORMAT:
             raise FileError(path, f"format {found!r}", f"{_FORMAT!r}; make the file anew with this version")
-        wanted = {f.name for f in fields(cls)} - set(_ARRAYS)
-        if set(head) != wanted:
-            odd = ", ".join(sorted(set(head) ^ wanted))
-            raise FileError(path, f"fields {odd} missing or unknown", "the fields that NestedResult.save writes")
+        odd = set(head) ^ ({f.name for f in fields(cls)} - set(_ARRAYS))
+        if odd:
+            names = ", ".join(sorted(odd))
+            raise FileError(path, f"fields {names} missing or unknown", "the fields that NestedResult.save writes")
         head["names"], head["warnings"] = tuple(head["names"]), tuple(head["warnings"])
         head["check"] = None if head["check"] is None else Check(**head["check"])
         runs = head["agreement"]
         if runs is not None:
-            head["agreement"] = Agreement(
-                tuple(runs["log_z"]), tuple(runs["log_z_error"]), runs["chi_square"], runs["p_value"]
-            )
+            each = {name: tuple(runs[name]) for name in ("log_z", "log_z_error")}
+            head["agreement"] = Agreement(**(runs | each))
         return cls(**head, **arrays)
+
+
+def software_versions() -> dict[str, str]:
+    """Return the versions of the software on which a run's numbers depend, by name."""
+    return {
+        "probewise": __version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _import_optional(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f"{name} is an optional package that cannot be imported ({error}); install it with: pip install {name}"
+        ) from error

@@ -1,20 +1,29 @@
-"""The nested sampling loop (Skilling 2006): remove the worst live points, shrink the volume, draw new ones above."""
+"""Nested sampling (Skilling 2006): remove the worst live points, shrink the volume, draw new ones above.
+
+`run` is the entry point, `replace_worst_live_points` the step, and `RemainingEvidence` and `EvidenceChange` say when to
+stop.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
 
+from probewise._arrays import own_arithmetic
 from probewise._kinds import (
     checked_finite_number,
+    checked_number,
     checked_path,
     checked_whole,
     require_callable,
@@ -22,27 +31,31 @@ from probewise._kinds import (
     require_like,
     require_rng,
 )
-from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested.checkpoint import (
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.nested.check import check_and_repeat
+from probewise.nested.evidence import (
+    DOUBTFUL_P_VALUE,
+    birth_rows,
+    insertion_p_value,
+    integrate,
+    log_volumes,
+    relative_lineage_variance,
+    warning_of_coarse_coordinates,
+    warning_of_few_lineages,
+    warning_of_few_possible_draws,
+)
+from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
+from probewise.nested.problem import AnyPrior, Bound, Evaluator, OutOfCallsError, Points, Samplable, as_problem
+from probewise.nested.result import NestedResult, software_versions
+from probewise.nested.save import (
     BirthRecords,
     CheckpointFile,
     DeadPointsOfRound,
     LivePoints,
     RunState,
+    as_json,
     settings_of_run,
 )
-from probewise.nested.evaluate import Bound, Evaluator, OutOfCallsError, Points, Samplable
-from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
-from probewise.nested.genealogy import relative_lineage_variance
-from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import (
-    NestedResult,
-    software_versions,
-    warning_of_coarse_coordinates,
-    warning_of_few_lineages,
-    warning_of_few_possible_draws,
-)
-from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
@@ -57,28 +70,212 @@ _MIXING = 10
 _MOST_BYTES = 2**28  # of one array of each kind for all live points; the points that die take tens of times as much
 
 
+@dataclass(frozen=True)
+class RoundSummary:
+    """Summary of a run after a round, passed to `progress` and to the stopping rule.
+
+    `n_dead`, `n_calls`: dead points and likelihood evaluations so far. `log_z` counts the dead points only.
+    `log_z_remaining` is the log of an upper bound on the live points' evidence: the best likelihood times the remaining
+    volume; `log_ratio_remaining` is the log of that bound over the evidence so far. `last_change` is the increase of
+    `log_z` by the last dead point; `log_volume` the log of the remaining share of the prior; `level` whether all live
+    points have the same likelihood.
+    """
+
+    n_dead: int
+    n_calls: int
+    log_z: float
+    log_z_remaining: float
+    log_ratio_remaining: float
+    last_change: float
+    log_volume: float
+    best_log_likelihood: float
+    level: bool = False
+
+
+StopRule: TypeAlias = Callable[[RoundSummary], "str | None"]
+
+
+@dataclass(frozen=True)
+class RemainingEvidence:
+    """Stopping rule: the live points can raise log Z by less than `dlogz`; their contribution is added at the end."""
+
+    dlogz: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0 < self.dlogz < math.inf:
+            raise ParameterError("dlogz", self.dlogz, "greater than 0, finite")
+
+    def __call__(self, state: RoundSummary) -> str | None:
+        """Return the reason to stop, or None."""
+        excess = state.log_ratio_remaining
+        gain = math.log1p(math.exp(excess)) if excess < 700 else excess
+        return f"live points can raise log Z by less than {self.dlogz:g}" if gain < self.dlogz else None
+
+
+@dataclass(frozen=True)
+class EvidenceChange:
+    """Stopping rule of the paper: consecutive values of log Z differ by less than `tolerance`, 1e-8.
+
+    On a plateau there is nothing to climb to: once all live points have the same likelihood and can raise log Z by less
+    than 0.05, the rule ends the run too. Further deaths would leave copies of a few points.
+    """
+
+    tolerance: float = 1e-8
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tolerance < math.inf:
+            raise ParameterError("tolerance", self.tolerance, "greater than 0, finite")
+
+    def __call__(self, state: RoundSummary) -> str | None:
+        """Return the reason to stop, or None."""
+        if state.last_change < self.tolerance:
+            return f"consecutive values of log Z differ by less than {self.tolerance:g}"
+        rest = RemainingEvidence()(state) if state.level else None
+        return rest and f"all live points have the same likelihood, and {rest}"
+
+
+NestedStop: TypeAlias = Literal["change", "remaining"]
+
+NESTED_STOP: dict[NestedStop, StopRule] = {"change": EvidenceChange(), "remaining": RemainingEvidence()}
+"""Rules by name: the paper's, a change of ln Z below 1e-8; and what remains, at most 0.05 of ln Z."""
+
+
+@own_arithmetic
+def run(
+    problem: Samplable | Callable[..., Any],
+    prior: AnyPrior | None = None,
+    *,
+    names: Sequence[str] | None = None,
+    vectorized: bool = False,
+    pass_dict: bool = False,
+    periodic: Sequence[str] = (),
+    rng: np.random.Generator,
+    n_live: int = 300,
+    stop: StopRule | None = None,
+    move: Move | None = None,
+    n_replaced: int | None = None,
+    progress: Callable[[RoundSummary], None] | None = None,
+    max_calls: int | None = None,
+    max_cost: float = 5.0,
+    checkpoint: str | Path | None = None,
+    checkpoint_every_s: float = 10.0,
+    executor: Executor | None = None,
+    n_workers: int | None = None,
+    return_interrupted: bool = True,
+) -> NestedResult:
+    """Compute the evidence and posterior samples of a problem (paper, section on SSF estimation).
+
+    Parameters
+    ----------
+    problem
+        A problem with prior and log likelihood, which is evaluated in batches; or a log likelihood, a function of one
+        point.
+    prior
+        With a log likelihood: a prior, distributions by name or in order, or a function from the unit cube.
+    names, vectorized, pass_dict, periodic
+        With a log likelihood: how the functions are called; see `make_problem`.
+    rng
+        Source of randomness; its state is stored in the result.
+    n_live
+        Number of live points: the error of log Z falls as one over its root, the cost rises in proportion.
+    stop
+        Stopping rule; default `RemainingEvidence(0.05)`. The paper's rule is `EvidenceChange(1e-8)`.
+    move
+        How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior
+        is alive, points are drawn from the prior itself.
+    n_replaced
+        Points replaced per round; default half of `n_live`. The shrinkage is counted exactly for any
+        number. With half, batches are large; compared with one at a time, 28 % fewer points are drawn and
+        the variance of log Z is 44 % greater.
+    progress
+        Called with a `RoundSummary` after every round.
+    max_calls
+        Limit of likelihood evaluations; at the limit the run ends with a warning.
+    max_cost
+        Limit of all evaluations in units of those of the first run; 1 means no check. First, modes that died out among
+        the live points are looked for; if some of them matter, the run is repeated with hops to them. Then the evidence
+        is estimated again, at about a fifth of the first run's cost. Where the two disagree, a more precise second
+        estimate and a run with chains twice as long follow. A disagreement or a lost mode that remains is reported as a
+        warning, and so is a second estimate that does not end within the limits.
+    checkpoint
+        File to which the state is saved atomically as the run proceeds; its folder is created if missing. If the file
+        exists, the run resumes and ends bit for bit as if it had not been interrupted or killed; `rng` must be in
+        the state of the run's start, made from the same seed. `max_calls` may differ.
+    checkpoint_every_s
+        Least seconds between savings, but no less than ten times the saving time. 0: save after every round.
+    executor
+        Evaluates a slow likelihood in parallel; by default it is evaluated in this process. Each batch is
+        split into `n_workers` parts. The result is the same to the last bit if a hypothesis' likelihood
+        does not depend on its batch (for matrix products in NumPy it may).
+    n_workers
+        Parts of a batch; default the number of processors.
+    return_interrupted
+        Whether Ctrl-C returns the result so far, with a warning; otherwise it raises `KeyboardInterrupt`.
+
+    Returns
+    -------
+    NestedResult
+        A doubtful result comes with warnings, which it also stores.
+
+    Raises
+    ------
+    ParameterError
+        If an option is out of range.
+    NotConvergedError
+        If the likelihood fails (`partial` holds the result so far, if there is one), or every
+        hypothesis drawn from the prior is impossible.
+    FileError
+        Before anything is evaluated: if the checkpoint is damaged, belongs to another problem, other settings or
+        another seed, or cannot be written. If a later saving fails, the run goes on with a warning.
+    """
+    require_rng(rng)
+    posed = as_problem(problem, prior, names, vectorized, pass_dict, periodic)
+    if not checked_number("max_cost", max_cost) >= 1:
+        raise ParameterError("max_cost", max_cost, "1 (no check) or more")
+    moving: Move = SliceMove() if move is None else move
+    once = partial(
+        run_once, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
+    )
+    result = once(
+        posed,
+        rng=rng,
+        n_live=n_live,
+        stop=stop,
+        move=moving,
+        n_replaced=n_replaced,
+        max_calls=max_calls,
+        checkpoint=checkpoint,
+        checkpoint_every_s=checkpoint_every_s,
+    )
+    if max_cost > 1 and result.names and result.complete:
+        # A separate generator that depends only on the state after the run, hence is the same after a resumption.
+        checking = np.random.default_rng(rng.integers(2**63, size=4))
+        try:
+            result = check_and_repeat(
+                result,
+                posed,
+                moving,
+                partial(once, return_interrupted=False),
+                max_cost=max_cost,
+                max_calls=max_calls,
+                least_live=least_live(len(result.names)),
+                rng=checking,
+                executor=executor,
+                n_workers=n_workers,
+            )
+        except KeyboardInterrupt:
+            if not return_interrupted:
+                raise
+            note = "interrupted while a second estimate checked the evidence"
+            result = replace(result, warnings=(*result.warnings, note))
+    for note in result.warnings:
+        warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
+    return result
+
+
 def least_live(n_params: int) -> int:
     """Return the least number of live points for a problem: two per parameter, 10 at least."""
     return max(LIVE_PER_PARAM * n_params, 10)
-
-
-def checked_n_live(n_live: object, n_params: int) -> int:
-    """Return a number of live points for a problem; raise ParameterError where they are too few, or fill the memory."""
-    least, most = least_live(n_params), _MOST_BYTES // (8 * (2 * n_params + 3))
-    number = checked_whole("n_live", n_live, least=None, most=None)
-    if number < least:
-        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
-    if number > most:
-        way_out = "for a smaller error merge the results of several runs: nested.merge"
-        allowed = f"up to {most:,} for {n_params} parameters, whose arrays take {_MOST_BYTES >> 20} MB; {way_out}"
-        raise ParameterError("n_live", n_live, allowed)
-    return number
-
-
-def move_at_volume(move: Move, log_volume: float) -> Move:
-    """Return a move that draws from the whole prior while more than a twentieth of its volume is left, then `move`."""
-    volume = math.exp(log_volume)
-    return move if volume <= _PRIOR_VOLUME else PriorRejection(volume)
 
 
 def replace_worst_live_points(
@@ -140,137 +337,6 @@ def run_once(
     `probewise.nested.run` documents the parameters and errors; here doubts are stored in the result without a warning.
     """
     require_rng(rng)
-    _require_options(
-        stop=stop,
-        move=move,
-        progress=progress,
-        checkpoint=checkpoint,
-        checkpoint_every_s=checkpoint_every_s,
-        executor=executor,
-        return_interrupted=return_interrupted,
-    )
-    if n_workers is not None:
-        n_workers = checked_whole("n_workers", n_workers)
-    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers, most_calls=max_calls)
-    n_params = len(evaluate.names)
-    n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)
-    rule = RemainingEvidence() if stop is None else stop
-    seed_state = json.dumps(generator_state_as_json(rng.bit_generator.state))
-    if n_params == 0:
-        return _result_of_problem_without_parameters(evaluate, n_live, seed_state)
-    moving: Move = SliceMove() if move is None else move
-    keeper = None
-    if checkpoint is not None:
-        settings = settings_of_run(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
-        with contextlib.suppress(OSError):  # `CheckpointFile` reports a folder that cannot be created
-            Path(checkpoint).parent.mkdir(parents=True, exist_ok=True)
-        keeper = CheckpointFile(Path(checkpoint), checkpoint_every_s, settings)
-    resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
-    now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
-    if len(now.live.points) < n_live:  # a run with more calls begins anew
-        keeper = None
-    if keeper is not None and resumed is None:
-        keeper.save_if_due(now)
-    under_way = _RunUnderWay(
-        evaluate, rng, n_live=n_live, n_replaced=n_replaced, rule=rule, seed_state=seed_state, keeper=keeper, now=now
-    )
-    try:
-        return under_way.run_to_end(max_calls, progress)
-    except NotConvergedError as error:
-        if under_way.now.dead:
-            error.partial = under_way.finish("the likelihood failed", f"the likelihood failed: {error}")
-        else:
-            under_way.save()
-        raise
-    except KeyboardInterrupt:
-        if not under_way.now.dead or not return_interrupted:
-            under_way.save()
-            raise
-        if under_way.now.ended is not None:
-            return under_way.finish(under_way.now.ended)
-        return under_way.finish("interrupted", "interrupted; log Z lacks what a full run would have found")
-    except BaseException:
-        # `progress`, `stop` or a signal handler raised.
-        under_way.save()
-        raise
-
-
-@dataclass
-class _RunUnderWay:
-    """A run of nested sampling under way; `now` is its state after the last whole round."""
-
-    evaluate: Evaluator
-    rng: np.random.Generator
-    n_live: int
-    n_replaced: int
-    rule: StopRule
-    seed_state: str
-    keeper: CheckpointFile | None
-    now: RunState
-
-    def save(self) -> None:
-        if self.keeper is not None:
-            self.keeper.save(self.now)
-
-    def finish(self, reason: str, *more_notes: str) -> NestedResult:
-        """Save the state and compute the result from it."""
-        self.save()
-        noted = replace(self.now, notes=(*self.now.notes, *more_notes))
-        # Depends only on the state after the last round: not on where in a round an interruption came, nor on
-        # the generator's seed sequence, which its state does not include.
-        self.rng.bit_generator.state = self.now.rng_state
-        summing = np.random.default_rng(self.rng.integers(2**63, size=4))
-        return _final_result(self.evaluate, noted, self.n_live, reason, self.seed_state, summing)
-
-    def run_to_end(self, max_calls: int | None, progress: Callable[[RoundSummary], None] | None) -> NestedResult:
-        """Do rounds until the rule ends the run or the next round might exceed `max_calls`; return the result."""
-        while self.now.ended is None:
-            # A round can cost twice the last one: the volume halves while points are drawn from the prior.
-            few = max_calls is not None and self.evaluate.n_calls + 2 * self.now.last_cost > max_calls
-            if few or len(self.now.live.points) < self.n_live:
-                return self._finish_out_of_calls(max_calls)
-            try:
-                after, state = _do_round(self.now, self.evaluate, self.n_replaced, self.rng)
-            except OutOfCallsError:  # the first round, or one that costs more than twice the last
-                return self._finish_out_of_calls(max_calls)
-            # One assignment, so that an interruption leaves a round either complete or not begun.
-            self.now = replace(after, ended=self.rule(state))
-            if progress is not None:
-                progress(state)
-            if self.keeper is not None:
-                self.keeper.save_if_due(self.now)
-        return self.finish(self.now.ended)
-
-    def _finish_out_of_calls(self, max_calls: int | None) -> NestedResult:
-        """Compute the result of the whole rounds so far, with a warning."""
-        reason = f"stopped at {self.evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
-        return self.finish(reason, f"{reason}; log Z lacks what a full run would have found")
-
-
-def _checked_n_live_and_n_replaced(
-    n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int
-) -> tuple[int, int]:
-    """Return the number of live points and that of those replaced per round, or raise ParameterError."""
-    n_live = checked_n_live(n_live, n_params)
-    n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
-    if not 1 <= n_replaced <= n_live // 2:
-        raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
-    if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
-        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
-    return n_live, n_replaced
-
-
-def _require_options(
-    *,
-    stop: object,
-    move: object,
-    progress: object,
-    checkpoint: object,
-    checkpoint_every_s: object,
-    executor: object,
-    return_interrupted: object,
-) -> None:
-    """Raise ParameterError for an option of the wrong type, before anything is evaluated."""
     if stop is not None:
         require_callable("stop", stop, "a rule such as RemainingEvidence(dlogz=0.1), of probewise.nested, or None")
     if move is not None:
@@ -279,7 +345,7 @@ def _require_options(
         allowed = "a function called with a RoundSummary after every round, or None; a run shows no bar by itself"
         require_callable("progress", progress, allowed)
     if checkpoint is not None:
-        checked_path("checkpoint", checkpoint)
+        checkpoint = checked_path("checkpoint", checkpoint)
     if not checked_finite_number("checkpoint_every_s", checkpoint_every_s) >= 0:
         raise ParameterError("checkpoint_every_s", checkpoint_every_s, "0 or more")
     if executor is not None:
@@ -288,6 +354,97 @@ def _require_options(
         )
         require_like("executor", executor, ("map", "submit"), allowed)
     require_flag("return_interrupted", return_interrupted)
+    if n_workers is not None:
+        n_workers = checked_whole("n_workers", n_workers)
+    evaluate = Evaluator(problem, executor=executor, n_parts=n_workers, most_calls=max_calls)
+    n_params = len(evaluate.names)
+    n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)
+    rule = RemainingEvidence() if stop is None else stop
+    seed_state = json.dumps(rng.bit_generator.state, default=as_json)
+    moving: Move = SliceMove() if move is None else move
+    if n_params == 0:
+        return _result_of_problem_without_parameters(evaluate, moving, n_live, seed_state)
+    keeper = None
+    if checkpoint is not None:
+        settings = settings_of_run(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
+        with contextlib.suppress(OSError):  # `CheckpointFile` reports a folder that cannot be created
+            checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        keeper = CheckpointFile(checkpoint, checkpoint_every_s, settings)
+    resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
+    now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
+    if len(now.live.points) < n_live:  # a run with more calls begins anew
+        keeper = None
+    if keeper is not None and resumed is None:
+        keeper.save_if_due(now)
+
+    def save() -> None:
+        if keeper is not None:
+            keeper.save(now)
+
+    def finish(reason: str, *more_notes: str) -> NestedResult:
+        save()
+        # Depends only on the state after the last round: not on where in a round an interruption came, nor on
+        # the generator's seed sequence, which its state does not include.
+        rng.bit_generator.state = now.rng_state
+        summing = np.random.default_rng(rng.integers(2**63, size=4))
+        noted = replace(now, notes=(*now.notes, *more_notes))
+        return _final_result(evaluate, noted, n_live, reason, seed_state, summing)
+
+    try:
+        while now.ended is None:
+            # A round can cost twice the last one: the volume halves while points are drawn from the prior.
+            few = max_calls is not None and evaluate.n_calls + 2 * now.last_cost > max_calls
+            try:
+                if few or len(now.live.points) < n_live:
+                    raise OutOfCallsError
+                after, state = _do_round(now, evaluate, n_replaced, rng)
+            except OutOfCallsError:  # also the first round, or one that costs more than twice the last
+                reason = f"stopped at {evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
+                return finish(reason, f"{reason}; log Z lacks what a full run would have found")
+            # One assignment, so that an interruption leaves a round either complete or not begun.
+            now = replace(after, ended=rule(state))
+            if progress is not None:
+                progress(state)
+            if keeper is not None:
+                keeper.save_if_due(now)
+        return finish(now.ended)
+    except NotConvergedError as error:
+        if now.dead:
+            error.partial = finish("the likelihood failed", f"the likelihood failed: {error}")
+        else:
+            save()
+        raise
+    except KeyboardInterrupt:
+        if not now.dead or not return_interrupted:
+            save()
+            raise
+        if now.ended is not None:
+            return finish(now.ended)
+        return finish("interrupted", "interrupted; log Z lacks what a full run would have found")
+    except BaseException:
+        # `progress`, `stop` or a signal handler raised.
+        save()
+        raise
+
+
+def _checked_n_live_and_n_replaced(
+    n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int
+) -> tuple[int, int]:
+    """Return the number of live points and that of those replaced per round, or raise ParameterError."""
+    least, most = least_live(n_params), _MOST_BYTES // (8 * (2 * n_params + 3))
+    n_live = checked_whole("n_live", n_live, least=None, most=None)
+    if n_live < least:
+        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
+    if n_live > most:
+        way_out = "for a smaller error merge the results of several runs: nested.merge"
+        allowed = f"up to {most:,} for {n_params} parameters, whose arrays take {_MOST_BYTES >> 20} MB; {way_out}"
+        raise ParameterError("n_live", n_live, allowed)
+    n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
+    if not 1 <= n_replaced <= n_live // 2:
+        raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
+    if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
+        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
+    return n_live, n_replaced
 
 
 def _do_round(
@@ -295,8 +452,9 @@ def _do_round(
 ) -> tuple[RunState, RoundSummary]:
     """Replace the worst points once and add the dead ones to the evidence; return the new state and its summary."""
     live, moving = now.live, now.moving
-    move = move_at_volume(moving, live.log_volume)
-    chains = move is moving
+    volume = math.exp(live.log_volume)
+    chains = volume <= _PRIOR_VOLUME  # else new points are drawn from the whole prior
+    move = moving if chains else PriorRejection(volume)
     fresh, gone, tally = replace_worst_live_points(live, move, evaluate, n_replaced=n_replaced, rng=rng)
     edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
     # Relative to the best likelihood: volumes would vanish in the rounding of a log likelihood such as -1e100.
@@ -348,7 +506,7 @@ def _initial_run_state(
     while found < n_live and drawn < most:
         share = max(found, 0.5) / drawn if drawn else 1.0
         batch = min(int(1.1 * (n_live - found) / share) + 1 if drawn else n_live, 4 * n_live, most - drawn)
-        tried = evaluate.draw_from_prior(batch, rng)
+        tried = evaluate(evaluate.space.draw(batch, rng=rng), rng)
         possible = np.flatnonzero(np.isfinite(tried.log_likelihood))
         if found + possible.size > n_live:
             possible = possible[: n_live - found]
@@ -395,16 +553,14 @@ def _final_result(
     if now.n_stuck > _STUCK_SHARE * n_dead:
         notes = (*notes, f"{now.n_stuck} of {n_dead} chains could not leave their start")
     order = live.points.rows_by_rising_likelihood()
-    parts = [*(d.points for d in dead), live.points.take_rows(order)]
-    theta = np.concatenate([part.theta for part in parts])
-    log_likelihood, label = (np.concatenate([getattr(p, name) for p in parts]) for name in ("log_likelihood", "label"))
+    points = Points.join(*(d.points for d in dead), live.points.take_rows(order))
     n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(len(live.points), 0, -1)])
     evidence = integrate(
-        log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
+        points.log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )
     births = BirthRecords.join(*(d.births for d in dead), live.births.take_rows(order))
     parent = np.where(births.parent >= 0, np.argsort(births.ident)[births.parent], -1)
-    born = birth_rows(log_likelihood, label, births.log_birth, births.birth_label)
+    born = birth_rows(points.log_likelihood, points.label, births.log_birth, births.birth_label)
     remembered = relative_lineage_variance(parent, born, n_at_death, evidence.log_weight)
     empty = np.empty(0, dtype=np.int64)
     rank = np.concatenate([empty, *(d.rank for d in dead)])
@@ -418,18 +574,19 @@ def _final_result(
         )
     if (uncertain := warning_of_few_lineages(remembered)) is not None:
         notes = (*notes, uncertain)
-    if evidence.n_eff < _FEW_EFFECTIVE:
+    if not evaluate.names:
+        pass  # the evidence is exact
+    elif evidence.n_eff < _FEW_EFFECTIVE:
         notes = (*notes, f"only {evidence.n_eff:.0f} effective samples: use more n_live")
     else:
-        u = np.concatenate([part.u for part in parts])
-        coarse = warning_of_coarse_coordinates(evaluate.names, u, np.exp(evidence.log_weight))
+        coarse = warning_of_coarse_coordinates(evaluate.names, points.u, np.exp(evidence.log_weight))
         notes = notes if coarse is None else (*notes, coarse)
     return NestedResult(
         names=evaluate.names,
-        theta=theta,
-        log_likelihood=log_likelihood,
+        theta=points.theta,
+        log_likelihood=points.log_likelihood,
         log_weight=evidence.log_weight,
-        label=label,
+        label=points.label,
         log_birth=births.log_birth,
         birth_label=births.birth_label,
         parent=parent,
@@ -454,44 +611,15 @@ def _final_result(
     )
 
 
-def _result_of_problem_without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> NestedResult:
+def _result_of_problem_without_parameters(
+    evaluate: Evaluator, move: Move, n_live: int, seed_state: str
+) -> NestedResult:
     """Return the result of a problem without free parameters; NotConvergedError if its likelihood is zero."""
-    theta = np.empty((1, 0))
-    log_likelihood = evaluate.log_likelihood(theta)
+    only = np.empty((1, 0))
+    log_likelihood = evaluate.log_likelihood(only)
     if not np.isfinite(log_likelihood[0]):
         raise NotConvergedError("the only hypothesis has zero likelihood: it excludes what was measured")
-    return NestedResult(
-        names=(),
-        theta=theta,
-        log_likelihood=log_likelihood,
-        log_weight=np.zeros(1),
-        label=np.zeros(1),
-        log_birth=np.full(1, -np.inf),
-        birth_label=np.ones(1),
-        parent=np.full(1, -1),
-        n_at_death=np.ones(1, dtype=np.int64),
-        log_start=0.0,
-        log_start_error=0.0,
-        log_z=float(log_likelihood[0]),
-        log_z_error=0.0,
-        memory=1.0,
-        information=0.0,
-        n_eff=1.0,
-        n_calls=1,
-        n_live=n_live,
-        complete=True,
-        stop_reason="no free parameters: the likelihood is the evidence",
-        insertion_rank=np.empty(0, dtype=np.int64),
-        insertion_n_ranked=np.empty(0, dtype=np.int64),
-        insertion_p_value=1.0,
-        seed_state=seed_state,
-        versions=software_versions(),
-        warnings=(),
-    )
-
-
-def generator_state_as_json(value: object) -> object:
-    """Convert a generator's state to JSON types."""
-    if isinstance(value, dict):
-        return {str(key): generator_state_as_json(item) for key, item in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    live = LivePoints(Points(only, only, np.zeros(1), log_likelihood, np.zeros(1)), BirthRecords.of_prior_draws(1), 0.0)
+    reason = "no free parameters: the likelihood is the evidence"
+    now = RunState(live, (), move, 0.0, 0.0, (), ended=reason)
+    return _final_result(evaluate, now, n_live, reason, seed_state, np.random.default_rng(0))

@@ -49,10 +49,7 @@ def weighted_quantiles(
 ) -> FloatArray:
     """Weighted quantiles of each column, (n, n_columns) with weights (n,) and levels (n_q,) -> (n_q, n_columns).
 
-    Raises
-    ------
-    ParameterError
-        If a level is not between 0 and 1.
+    ParameterError if a level is not between 0 and 1.
     """
     levels = np.asarray(q, dtype=np.float64)
     if levels.ndim != 1 or not ((levels >= 0) & (levels <= 1)).all():
@@ -60,7 +57,6 @@ def weighted_quantiles(
     out = np.empty((levels.size, values.shape[1]))
     for i in range(values.shape[1]):
         order = np.argsort(values[:, i])
-        own = weight[order]
-        ladder = (np.cumsum(own) - 0.5 * own) / own.sum()
-        out[:, i] = np.interp(levels, ladder, values[order, i])
+        mass = weight[order]
+        out[:, i] = np.interp(levels, (np.cumsum(mass) - 0.5 * mass) / mass.sum(), values[order, i])
     return out

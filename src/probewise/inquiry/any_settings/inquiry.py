@@ -17,7 +17,7 @@ from probewise.inquiry.any_settings.posterior import InstrumentModel, ReadingsPr
 from probewise.inquiry.any_settings.settings import Settings
 from probewise.inquiry.choice import choose
 from probewise.nested import Weighted, make_problem
-from probewise.nested.function_problem import AnyPrior
+from probewise.nested.problem import AnyPrior
 from probewise.nested.weights import resampled_rows
 from probewise.priors import require_prior
 

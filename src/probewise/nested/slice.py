@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.nested.clusters import Clusters, find_clusters
-from probewise.nested.evaluate import Bound, Evaluator, Points
-from probewise.nested.space import Space
+from probewise.nested.problem import Bound, Evaluator, Points, Space
 
 FRAME, AXIS, DIFFERENCE, HOP = 0, 1, 2, 3
 """Kinds of steps: along random orthonormal directions, axes, differences of live points; and hops between clusters."""
@@ -56,7 +54,11 @@ class SliceChains:
     """
 
     def __init__(self, start: Points, live: FloatArray, space: Space, *, width: float) -> None:
-        self._space, self._walls, self._width = space, _bounds_of_coordinates(space), width
+        self._space, self._width = space, width
+        # Lower and upper bounds of the coordinates, None without any; periodic ones are not bounded.
+        low, high = space.low, space.high
+        low[list(space.periodic)], high[list(space.periodic)] = -np.inf, np.inf
+        self._walls = (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
         self._periodic = _PeriodicAxes.cut_where_empty(space.periodic, live)
         if self._periodic is not None:
             live = self._periodic.wrapped_at_cut(live)
@@ -108,7 +110,7 @@ class SliceChains:
     def _begin_step(self, rows: IntArray, rng: np.random.Generator) -> None:
         """Set up the line, the bracket and the level of the next step of the chains `rows`."""
         at = self._step[rows]
-        kinds, measure = self._kinds[rows, at], self._metrics.covariance_row_of_each_chain(rows, self._home[rows])
+        kinds, measure = self._kinds[rows, at], self._metrics.row_of_each_chain(rows, self._home[rows])
         toward = np.zeros((rows.size, self._line.shape[1]))
         turned, along, follow = ((kinds == one).nonzero()[0] for one in (FRAME, AXIS, DIFFERENCE))
         if turned.size:
@@ -161,9 +163,8 @@ class SliceChains:
             first = (hopping & candidates.possible).nonzero()[0]
             who = candidates.chain[first]
             goal[first] = (self._home[who] + rng.integers(1, len(self._clusters), size=who.size)) % len(self._clusters)
-            to, log_growth = self._metrics.map_with_log_volume_ratio(
-                who, self._now.u[who], self._home[who], goal[first]
-            )
+            home, there = (self._metrics.row_of_each_chain(who, k) for k in (self._home[who], goal[first]))
+            to, log_growth = self._metrics.each.map_with_log_volume_ratio(self._now.u[who], home, there)
             candidates.u[first] = to
             if self._periodic is not None:
                 # Across the cut of a circle the reverse hop would differ.
@@ -189,7 +190,9 @@ class SliceChains:
             tried = evaluate.evaluate_mapped(candidates.u.take(pending, axis=0), theta, log_density, rng)
             accepted[pending] = bound.mask_above(tried.log_likelihood, tried.label)
             self.n_evaluated += pending.size
-        n_needed, delivered = _count_candidates_used(accepted.reshape(-1, candidates.n_ahead))
+        by_chain = accepted.reshape(-1, candidates.n_ahead)
+        delivered = np.asarray(by_chain.any(axis=1))
+        n_needed = np.where(delivered, np.argmax(by_chain, axis=1) + 1, candidates.n_ahead)
         won = delivered.nonzero()[0]
         if won.size:
             taken, which = candidates.rows[won], won * candidates.n_ahead + n_needed[won] - 1
@@ -217,12 +220,6 @@ def _draw_candidates_ahead(
         ahead = here > 0
         low, high = np.where(ahead, low, here), np.where(ahead, here, high)
     return t, low, high
-
-
-def _count_candidates_used(ok: BoolArray) -> tuple[IntArray, BoolArray]:
-    """Count the candidates each step used, given which are accepted, (n, n_ahead); also whether any is, (n,) each."""
-    delivered = np.asarray(ok.any(axis=1))
-    return np.where(delivered, np.argmax(ok, axis=1) + 1, ok.shape[1]), delivered
 
 
 def _random_orthonormal_directions(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
@@ -273,7 +270,7 @@ class _ClusterCovariancesByChain:
         )
         # A start that is not a live point is in no cluster.
         own_home = np.where(same.any(axis=1), home, -1)
-        each = clusters.followed_by(clusters.home_clusters_without_each_point(u, home))
+        each = Clusters.join(clusters, clusters.home_clusters_without_each_point(u, home))
         conditional = 1.0 / np.sqrt((each.inverse_root**2).sum(axis=1))
         return cls(
             each,
@@ -284,20 +281,12 @@ class _ClusterCovariancesByChain:
             np.argmax(same, axis=1),
         )
 
-    def covariance_row_of_each_chain(self, rows: IntArray, home: IntArray) -> IntArray:
+    def row_of_each_chain(self, rows: IntArray, home: IntArray) -> IntArray:
         """Return the row of `each` for cluster `home` of the chains `rows`, (n,).
 
         For the cluster in which a chain began it is the version without the chain's start.
         """
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
-
-    def map_with_log_volume_ratio(
-        self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Map points of chains `rows` from clusters `home` to `goal`; also return the log of the volume ratio, (n,)."""
-        return self.each.map_with_log_volume_ratio(
-            u, self.covariance_row_of_each_chain(rows, home), self.covariance_row_of_each_chain(rows, goal)
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,18 +324,12 @@ class _PeriodicAxes:
         return u
 
 
-Walls: TypeAlias = tuple[FloatArray, FloatArray]
-
-
-def _bounds_of_coordinates(space: Space) -> Walls | None:
-    """Return the lower and upper bounds, (n_params,), infinite for periodic coordinates; None if none is bounded."""
-    low, high = space.low.copy(), space.high.copy()
-    low[list(space.periodic)], high[list(space.periodic)] = -np.inf, np.inf
-    return (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
-
-
 def _random_bracket(
-    u: FloatArray, rows: IntArray, line: FloatArray, walls: Walls | None, rng: np.random.Generator
+    u: FloatArray,
+    rows: IntArray,
+    line: FloatArray,
+    walls: tuple[FloatArray, FloatArray] | None,
+    rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
     """Place a bracket of length one at random about each point `u[rows]`, truncated where the line leaves the space.
 

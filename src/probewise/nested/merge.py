@@ -6,7 +6,6 @@ import json
 import math
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
@@ -15,13 +14,14 @@ from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import weighted_mean_and_error
-from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
-from probewise.nested.missed_hills import DISAGREE
+from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate
+from probewise.nested.missed import DISAGREE
 from probewise.nested.result import Agreement, Check, NestedResult, software_versions
 
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
 _LEAST_ERROR = 1e-12
+_LEVELS = ("log_likelihood", "label", "log_birth", "birth_label")
 
 
 @own_arithmetic
@@ -57,32 +57,36 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     require_rng(rng)
     parts = tuple(results)
     seeds = _seed_states_of_mergeable_runs(parts)
-    record = JoinedRecord.from_records([(r.log_likelihood, r.label, r.log_birth, r.birth_label) for r in parts])
+    together = [np.concatenate([getattr(r, name) for r in parts]) for name in _LEVELS]
+    order = np.lexsort((together[1], together[0]))
+    log_likelihood, label, log_birth, birth_label = levels = tuple(each[order] for each in together)
+    n_at_death = n_alive_at_death(*levels)
     first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
     parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
+    parent = np.where(parent >= 0, np.argsort(order)[parent], -1)[order]
     # Each run has its own estimate: in the joined record a run is never complete between two rounds.
     remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
     log_start, log_start_error = _pooled_log_possible_share(parts)
-    evidence = integrate(
-        record.log_likelihood, record.n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error
-    )
+    evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
     agreement = agreement_of(parts)
     check = _averaged_check(parts, evidence.log_z, evidence.log_z_error(remembered))
-    p_value = combined_p_value([r.insertion_p_value for r in parts])
+    # Fisher's method combines independent p values.
+    fisher = -2.0 * float(np.log(np.maximum([r.insertion_p_value for r in parts], 1e-300)).sum())
+    p_value = float(chdtrc(2 * len(parts), fisher))
     error, doubts = _error_and_doubts(agreement, check, p_value, evidence.log_z, evidence.log_z_error(remembered))
     for doubt in doubts:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     inherited = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
     return NestedResult(
         names=parts[0].names,
-        theta=np.concatenate([r.theta for r in parts])[record.order],
-        log_likelihood=record.log_likelihood,
-        label=record.label,
+        theta=np.concatenate([r.theta for r in parts])[order],
+        log_likelihood=log_likelihood,
+        label=label,
         log_weight=evidence.log_weight,
-        log_birth=record.log_birth,
-        birth_label=record.birth_label,
-        parent=record.parents_in_joined_order(parent),
-        n_at_death=record.n_at_death,
+        log_birth=log_birth,
+        birth_label=birth_label,
+        parent=parent,
+        n_at_death=n_at_death,
         log_start=log_start,
         log_start_error=log_start_error,
         log_z=evidence.log_z,
@@ -116,7 +120,7 @@ def _error_and_doubts(
             f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
             "the error is widened to their scatter; use more n_live or longer chains"
         )
-    error = error_with_scatter_of_runs(error, agreement)
+        error = max(error, agreement.log_z_sd)
     if p_value < DOUBTFUL_P_VALUE:
         doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
     if check is not None and abs(check.distance) > DISAGREE:
@@ -126,11 +130,6 @@ def _error_and_doubts(
             "does not average out; use longer chains"
         )
     return error, doubts
-
-
-def error_with_scatter_of_runs(error: float, agreement: Agreement) -> float:
-    """Return an error of the joint log Z, widened to the scatter of the runs where they disagree."""
-    return max(error, agreement.log_z_sd) if agreement.p_value < _DISAGREE else error
 
 
 def agreement_of(results: Iterable[NestedResult]) -> Agreement:
@@ -152,60 +151,16 @@ def agreement_of(results: Iterable[NestedResult]) -> Agreement:
     return Agreement(tuple(log_z), tuple(log_z_error), chi_square, float(chdtrc(len(log_z) - 1, chi_square)))
 
 
-@dataclass(frozen=True, eq=False)
-class JoinedRecord:
-    """The births and deaths of several runs in order of death, (n_dead,) each.
-
-    `order`: row of each point in the runs' concatenated records; `n_at_death`: points of all runs alive at its death.
-    """
-
-    order: IntArray
-    log_likelihood: FloatArray
-    label: FloatArray
-    log_birth: FloatArray
-    birth_label: FloatArray
-    n_at_death: IntArray
-
-    @classmethod
-    def from_records(cls, parts: Sequence[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]) -> JoinedRecord:
-        """Join the runs' records: of each log likelihood, label, log birth and birth label, (n_dead of the run,)."""
-        together = [np.concatenate(each) for each in zip(*parts, strict=True)]
-        order = np.lexsort((together[1], together[0]))
-        log_likelihood, label, log_birth, birth_label = (each[order] for each in together)
-        n_at_death = n_alive_at_death(log_likelihood, label, log_birth, birth_label)
-        return cls(order, log_likelihood, label, log_birth, birth_label, n_at_death)
-
-    def parents_in_joined_order(self, parent: IntArray) -> IntArray:
-        """Convert parents' rows in the concatenated records, -1 for none, to rows in order of death, (n_dead,)."""
-        place = np.argsort(self.order)
-        return np.asarray(np.where(parent >= 0, place[parent], -1)[self.order])
-
-
 def n_alive_at_death(
     log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
 ) -> IntArray:
-    """Count the points alive at each death from the levels of birth and death.
+    """Count the points alive at each death, itself included, from the levels of birth and death, all (n_dead,).
 
-    Parameters
-    ----------
-    log_likelihood, label
-        Level of each point's death, (n_dead,); ties of likelihood are ordered by label.
-    log_birth, birth_label
-        Level above which each point was drawn, (n_dead,).
-
-    Returns
-    -------
-    Number of points born strictly below each death and not yet dead, itself included, (n_dead,).
+    A level is a log likelihood and a label, which orders equal ones; deaths are in order of level. A point is alive
+    from the deaths on that lie strictly above its birth.
     """
-    n = len(log_likelihood)
-    born = np.repeat([0, 1], n)  # a death comes before the births at its own level
-    levels, labels = np.concatenate([log_likelihood, log_birth]), np.concatenate([label, birth_label])
-    order = np.lexsort((born, labels, levels))
-    # Add the point itself back: the cumulative sum counts it as dead.
-    alive = np.cumsum(2 * born[order] - 1) + (1 - born[order])
-    out = np.empty(2 * n, dtype=np.int64)
-    out[order] = alive
-    return out[:n]
+    birth, death = birth_rows(log_likelihood, label, log_birth, birth_label), np.arange(len(label))
+    return np.asarray(np.searchsorted(np.sort(birth), death) - death)
 
 
 def _averaged_check(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
@@ -230,14 +185,14 @@ def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object
     for number, result in enumerate(parts, start=1):
         if result.names != names:
             raise ParameterError(f"names of run {number}", result.names, f"those of the first run, {names}")
-        record = (result.log_likelihood, result.label, result.log_birth, result.birth_label)
-        if not np.array_equal(n_alive_at_death(*record), result.n_at_death):
+        if not np.array_equal(n_alive_at_death(*(getattr(result, name) for name in _LEVELS)), result.n_at_death):
             raise ParameterError(
                 f"n_at_death of run {number}",
                 "not what births and deaths give",
                 "complete runs of nested sampling, in the order of log likelihood and label",
             )
-        for one in generator_states_of(result):
+        state = json.loads(result.seed_state)
+        for one in state if isinstance(state, list) else [state]:
             if one in seeds:
                 raise ParameterError(
                     f"seed_state of run {number}",
@@ -246,12 +201,6 @@ def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object
                 )
             seeds.append(one)
     return seeds
-
-
-def generator_states_of(result: NestedResult) -> list[object]:
-    """Return the states of the random generators that a result began with: one per run or addition joined in it."""
-    state = json.loads(result.seed_state)
-    return state if isinstance(state, list) else [state]
 
 
 def _pooled_log_possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
@@ -268,9 +217,3 @@ def _pooled_log_possible_share(parts: Sequence[NestedResult]) -> tuple[float, fl
         drawn += possible / share
     share = found / drawn
     return math.log(share), math.sqrt(max(1.0 - share, 0.0) / found)
-
-
-def combined_p_value(p_values: Sequence[float]) -> float:
-    """Combine independent p values into one (Fisher's method)."""
-    statistic = -2.0 * float(np.log(np.maximum(p_values, 1e-300)).sum())
-    return float(chdtrc(2 * len(p_values), statistic))

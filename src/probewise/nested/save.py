@@ -18,18 +18,30 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import FileError, NotSavedWarning, ParameterError
-from probewise.nested.evaluate import Evaluator, Points
 from probewise.nested.moves import Move
-from probewise.nested.stop import StopRule
+from probewise.nested.problem import Evaluator, Points, Rows
 from probewise.recordings.atomic import write_bytes_atomically
 
 _FORMAT = "nested-checkpoint/3"
 _ROUNDING = 1e-6
 _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
+_BIRTHS = ("log_birth", "birth_label", "ident", "parent")
+_RECORD = ("n_at_death", "rank", "n_ranked")
+_PLAIN = (
+    "log_start",
+    "log_start_error",
+    "notes",
+    "best",
+    "log_z_over_best",
+    "n_stuck",
+    "last_cost",
+    "n_calls",
+    "ended",
+)
 
 
 @dataclass(frozen=True, eq=False)
-class BirthRecords:
+class BirthRecords(Rows):
     """How points were born; all arrays are (n,).
 
     `log_birth`, `birth_label`: log likelihood and label of the bound above which each was drawn. `ident`: its number in
@@ -45,15 +57,6 @@ class BirthRecords:
     def of_prior_draws(cls, n: int) -> BirthRecords:
         """Return the records of `n` draws from the prior, numbered from 0."""
         return cls(np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
-
-    def take_rows(self, rows: IntArray) -> BirthRecords:
-        """Select records by row number."""
-        return BirthRecords(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    @classmethod
-    def join(cls, *parts: BirthRecords) -> BirthRecords:
-        """Return the records of all parts, in order."""
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +109,11 @@ class RunState:
 
 
 def settings_of_run(
-    names: tuple[str, ...], n_live: int, n_replaced: int, move: Move, stop: StopRule, seed_state: str
+    names: tuple[str, ...], n_live: int, n_replaced: int, move: Move, stop: object, seed_state: str
 ) -> dict[str, object]:
     """Return the settings that a resumed run must share with the interrupted one, by name.
 
-    Raises
-    ------
-    ParameterError
-        If the move is not a dataclass, which a checkpoint requires.
+    ParameterError if the move is not a dataclass, which a checkpoint requires.
     """
     _numeric_fields_of_move(move)
     return {
@@ -189,16 +189,16 @@ class CheckpointFile:
             "rng_state": now.rng_state,
             **{name: getattr(now, name) for name in _PLAIN},
         }
-        arrays = {f"live_{name}": getattr(now.live.points, name) for name in _POINTS}
-        arrays |= {f"live_{name}": getattr(now.live.births, name) for name in _BIRTHS}
+        arrays = {f"live_{name}": array for name, array in (vars(now.live.points) | vars(now.live.births)).items()}
         if now.dead:
-            dead = Points.join(*(d.points for d in now.dead))
-            arrays |= {f"dead_{name}": getattr(dead, name) for name in _POINTS}
-            births = BirthRecords.join(*(d.births for d in now.dead))
-            arrays |= {f"dead_{name}": getattr(births, name) for name in _BIRTHS}
+            dead, births = (
+                Points.join(*(d.points for d in now.dead)),
+                BirthRecords.join(*(d.births for d in now.dead)),
+            )
+            arrays |= {f"dead_{name}": array for name, array in (vars(dead) | vars(births)).items()}
             arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_json_default)), **arrays)
+        np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=as_json)), **arrays)
         return buffer.getvalue()
 
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> RunState | None:
@@ -277,42 +277,27 @@ class CheckpointFile:
             )
 
 
-_PLAIN = (
-    "log_start",
-    "log_start_error",
-    "notes",
-    "best",
-    "log_z_over_best",
-    "n_stuck",
-    "last_cost",
-    "n_calls",
-    "ended",
-)
-_BIRTHS = ("log_birth", "birth_label", "ident", "parent")
-_RECORD = ("n_at_death", "rank", "n_ranked")
-
-
-def _run_state_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> RunState:
+def _run_state_from_file(head: dict[str, Any], arrays: dict[str, np.ndarray], move: Move) -> RunState:
     """Rebuild the state of a run from the JSON head and the arrays of a checkpoint.
 
     `move`: the one given on resuming; it gets the tuned numbers of the file.
     """
+
+    def rows_of(which: str, rows: slice) -> tuple[Points, BirthRecords]:
+        columns = (tuple(arrays[f"{which}_{name}"][rows] for name in names) for names in (_POINTS, _BIRTHS))
+        return Points(*next(columns)), BirthRecords(*next(columns))
+
     ends = np.cumsum(np.asarray(head["sizes"], dtype=np.int64))
     dead = []
     for end, size in zip(ends, np.diff(ends, prepend=0), strict=True):
         rows = slice(int(end - size), int(end))
-        points = Points(*(arrays[f"dead_{name}"][rows] for name in _POINTS))
-        births = BirthRecords(*(arrays[f"dead_{name}"][rows] for name in _BIRTHS))
-        dead.append(DeadPointsOfRound(points, births, *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
-    live = LivePoints(
-        Points(*(arrays[f"live_{name}"] for name in _POINTS)),
-        BirthRecords(*(arrays[f"live_{name}"] for name in _BIRTHS)),
-        float(str(head["log_volume"])),
-    )
-    plain = {name: head[name] for name in _PLAIN}
-    plain["notes"] = tuple(plain["notes"])  # type: ignore[arg-type]
-    moving = _move_with_numeric_fields(move, head["moving"])
-    return RunState(live, tuple(dead), moving, rng_state=_generator_state_with_arrays(head["rng_state"]), **plain)  # type: ignore[arg-type]
+        dead.append(DeadPointsOfRound(*rows_of("dead", rows), *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
+    if not is_dataclass(move) or not isinstance(head["moving"], dict):
+        raise ValueError("the move cannot be restored")
+    live = LivePoints(*rows_of("live", slice(None)), float(head["log_volume"]))
+    plain = {name: head[name] for name in _PLAIN} | {"notes": tuple(head["notes"])}
+    generator = _generator_state_with_arrays(head["rng_state"])
+    return RunState(live, tuple(dead), replace(move, **head["moving"]), rng_state=generator, **plain)
 
 
 def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
@@ -333,15 +318,7 @@ def _numeric_fields_of_move(move: Move) -> dict[str, float]:
     return {f.name: v for f in fields(move) if isinstance(v := getattr(move, f.name), int | float)}
 
 
-def _move_with_numeric_fields(move: Move, numbers: object) -> Move:
-    """Return a move with the numeric fields of a checkpoint; ValueError or TypeError if it has no such fields."""
-    if not is_dataclass(move) or not isinstance(numbers, dict):
-        raise ValueError("the move cannot be restored")
-    restored: Move = replace(move, **numbers)
-    return restored
-
-
-def _json_default(value: object) -> object:
+def as_json(value: object) -> object:
     """Convert what `json` cannot: arrays to lists, anything else to text."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 

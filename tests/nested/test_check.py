@@ -119,39 +119,6 @@ def test_a_wrong_evidence_is_cured_by_longer_chains() -> None:
     assert n_cured > 3
 
 
-@pytest.mark.parametrize(
-    ("longer_by", "clusters_by", "cured"), [(0.2, 3.0, True), (5.0, 3.0, False), (-4.0, 3.0, False), (0.2, 0.0, False)]
-)
-def test_about_a_curve_two_runs_that_agree_outvote_a_second_pass_below_both(
-    longer_by: float, clusters_by: float, cured: bool
-) -> None:
-    """Stand-ins: a longer run, `longer_by` errors above the first; a pass whose mean log likelihood is off."""
-    known = problems.problem("two far peaks 4-D")  # of several clusters
-    sound = quiet(known, max_cost=1.0)
-    passes = list[object]()
-
-    def answer(problem: object, **options: object) -> NestedResult:
-        if problem is known:
-            return dataclasses.replace(sound, log_z=sound.log_z + longer_by * sound.log_z_error)
-        passes.append(problem)
-        theta = sound.theta[sound.weight > 0]
-        log_prior_ratio = problem.prior.log_prior_ratio(theta)  # type: ignore[attr-defined]
-        mean = float(sound.weight[sound.weight > 0] @ (sound.log_likelihood[sound.weight > 0] + log_prior_ratio))
-        log_z = sound.log_z - 8.0 * sound.log_z_error
-        return dataclasses.replace(sound, log_z=log_z, information=mean - log_z + clusters_by, n_calls=1000)
-
-    rng = np.random.default_rng(6)
-    result = check_and_repeat(sound, known, SliceMove(), answer, max_cost=5.0, max_calls=None, least_live=10, rng=rng)
-    assert result.check is not None
-    assert bool(result.warnings) is not cured
-    # A pass that found another posterior is followed by one from a single ellipse.
-    assert len({id(each) for each in passes}) == (2 if clusters_by else 1)
-    if cured:
-        assert result.log_z == pytest.approx(sound.log_z + 0.2 * sound.log_z_error)
-        assert result.check.route == "the same run with shorter chains"
-        assert result.check.log_z == sound.log_z
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("max_cost", [2.0, 5.0])
 def test_many_scales_with_chains_too_short_are_never_wrong_without_a_word(max_cost: float) -> None:

@@ -145,21 +145,28 @@ def _samples_of_two(n, rng):
     return rng.normal(0.0, 0.1, (n, 2)) + np.stack([np.where(rng.random(n) < 0.75, 2.0, -2.0), np.zeros(n)], axis=1)
 
 
-@pytest.mark.parametrize("clustered", [False, True])
-def test_coordinates_and_cube_lead_to_the_same_points(clustered):
+def _near_both(problem, rng):
+    theta = _samples_of_two(2000, rng)
+    right = theta[:, 0] > 0
+    return nested.repartitioned(problem, theta[right], peaks=(theta[~right],)).prior
+
+
+@pytest.mark.parametrize("with_peak", [False, True])
+def test_coordinates_and_cube_lead_to_the_same_points(with_peak):
     problem, rng = Problem(WIDE, _two), np.random.default_rng(8)
-    near = nested.repartitioned(problem, _samples_of_two(2000, rng), clustered=clustered).prior
+    plain = nested.repartitioned(problem, _samples_of_two(2000, rng)).prior
+    near = _near_both(problem, rng) if with_peak else plain
     u = rng.random((50, 2))
     theta = near.from_unit_cube(u)
     np.testing.assert_allclose(near.from_unit_cube(near.to_unit_cube(theta)), theta, atol=1e-9)
     np.testing.assert_allclose(near.leave(near.enter(theta))[0], theta, atol=1e-9)
-    if not clustered:
+    if not with_peak:
         np.testing.assert_allclose(near.to_unit_cube(theta), u, atol=1e-9)
 
 
-def test_a_cluster_of_the_posterior_has_a_part_of_the_prior():
+def test_a_peak_has_a_part_of_the_prior():
     problem, rng = Problem(WIDE, _two), np.random.default_rng(12)
-    near = nested.repartitioned(problem, _samples_of_two(2000, rng), clustered=True).prior
+    near = _near_both(problem, rng)
     drawn = near.leave(near.draw(4000, rng=rng))[0]
     by_cube = near.from_unit_cube(rng.random((4000, 2)))
     for theta in (drawn, by_cube):
@@ -172,11 +179,6 @@ def test_a_cluster_of_the_posterior_has_a_part_of_the_prior():
     inside = (np.abs(by_cube[:, 0] - 2.0) < 0.2) & (np.abs(by_cube[:, 1]) < 0.2)
     area = np.where(inside, np.exp(-near.log_prob(by_cube)), 0.0)
     assert area.mean() == pytest.approx(0.16, abs=6 * area.std() / math.sqrt(4000))
-
-
-def test_few_samples_make_one_part():
-    problem, rng = Problem(WIDE, _two), np.random.default_rng(13)
-    assert len(nested.repartitioned(problem, _samples_of_two(70, rng), clustered=True).prior.parts) == 1
 
 
 def test_what_is_no_prior_is_refused():

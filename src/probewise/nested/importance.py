@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import expit, gammaln, logsumexp
@@ -27,7 +27,7 @@ _FEW_EFFECTIVE = 100.0
 _MOST_LOST = 0.2
 _BRIDGE_STEPS = 20
 # Heavier tails than a Gaussian's keep the weights bounded where the fit is too narrow.
-DEGREES_OF_FREEDOM = 8.0
+_DEGREES_OF_FREEDOM = 8.0
 _MOST_KERNELS = 400
 _FEW = 40
 _SCALES = (1.0, 0.5, 0.2, 0.05, 0.01)
@@ -36,20 +36,12 @@ _BLOCK = 2048
 
 @dataclass(frozen=True, eq=False)
 class Weighted(Samples):
-    """Weighted posterior samples and the evidence, from importance sampling.
+    """Weighted posterior samples and the evidence, from importance sampling; see also `Samples`.
 
     Attributes
     ----------
-    names
-        Parameter names, one per column of theta.
     theta
         Draws with nonzero likelihood, (n, n_params).
-    log_likelihood, log_weight
-        Of each draw, (n,); the weights sum to one.
-    log_z, log_z_error
-        Natural log of the evidence and its standard error.
-    n_eff
-        Kish's effective sample size.
     n_calls
         Likelihood evaluations, including those of a fallback run.
     pareto_k
@@ -137,7 +129,7 @@ class Proposal:
         n_params = self.clusters.mean.shape[1]
         which = rng.choice(len(self.share), size=n, p=self.share)
         white = rng.standard_normal((n, n_params))
-        white *= np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, size=(n, 1)))
+        white *= np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, size=(n, 1)))
         out = np.empty((n, n_params))
         for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
             rows = np.flatnonzero(which == k)
@@ -145,17 +137,13 @@ class Proposal:
             out[rows] = self.clusters.mean[k] + place @ self.clusters.root[k].T
         return out
 
-    def widened(self, factor: float) -> Proposal:
-        """Return the same mixture with kernels wider by a factor."""
-        return replace(self, width=tuple(factor * width for width in self.width))
-
     def log_density(self, x: FloatArray) -> FloatArray:
         """Natural log of the density, (n, n_params) -> (n,)."""
         blocks = np.array_split(x, max(1, -(-len(x) // _BLOCK)))
         return np.concatenate([self._log_density_of_block(block) for block in blocks])
 
     def _log_density_of_block(self, x: FloatArray) -> FloatArray:
-        n_params, nu = x.shape[1], DEGREES_OF_FREEDOM
+        n_params, nu = x.shape[1], _DEGREES_OF_FREEDOM
         constant = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
         parts = []
         for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
@@ -176,17 +164,6 @@ def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) 
         tuple(width for p in proposals for width in p.width),
         np.concatenate([s / total * p.share for p, s in zip(proposals, share, strict=True)]),
     )
-
-
-def single_student_t(mean: FloatArray, covariance: FloatArray) -> Proposal:
-    """Return one Student t distribution of this mean, (n_params,), and scale matrix, (n_params, n_params)."""
-    # A small ridge where there is no extent.
-    variance = np.diag(covariance)
-    ridge = 1e-10 * variance + 1e-13 * variance.mean() + 1e-24
-    root = np.linalg.cholesky(covariance + ridge * np.eye(len(mean)))
-    log_det = np.log(np.diag(root)).sum()
-    shape = Clusters(mean[None], root[None], np.linalg.inv(root)[None], np.array([log_det]), np.ones(1, dtype=np.int64))
-    return Proposal(shape, (np.zeros((1, len(mean))),), (1.0,), np.ones(1))
 
 
 def fit_wide_and_narrow_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal, ...]:

@@ -13,9 +13,8 @@ from scipy.special import chdtrc
 from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested.check import weighted_mean_and_error
+from probewise.nested.check import DISAGREE, weighted_mean_and_error
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate
-from probewise.nested.missed import DISAGREE
 from probewise.nested.result import Agreement, Check, NestedResult, software_versions
 
 # p value below which runs disagree: one false alarm in 1000 merges.

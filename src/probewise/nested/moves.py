@@ -174,10 +174,6 @@ class SliceMove:
         chains.run(kinds, bound, evaluate, rng)
         return chains.points(), Tally(chains.n_evaluated, chains.n_taken, int((~chains.moved).sum()), chains.n_tried)
 
-    def with_twice_the_steps(self) -> SliceMove:
-        """Return the move with twice as many steps per chain."""
-        return replace(self, steps_per_param=2.0 * self.steps_per_param, fewest_steps=2 * self.fewest_steps)
-
     def adapted(self, tally: Tally) -> SliceMove:
         """Return the move with its bracket width adapted towards `target` candidates per step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)

@@ -13,6 +13,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError
+from probewise.nested.check import doubts_of_missed_parts
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     HeldOutSamples,
@@ -21,9 +22,9 @@ from probewise.nested.importance import (
     fit_wide_and_narrow_proposals,
     mixture_of_proposals,
 )
-from probewise.nested.missed import find_missed_hills
 from probewise.nested.problem import Evaluator, Samplable, Space, unbounded_space_of
 from probewise.nested.result import NestedResult
+from probewise.nested.sampler import run_once
 from probewise.nested.weights import n_effective, resampled_rows
 
 _MOST_FITTED = 2000
@@ -119,9 +120,9 @@ def refine(
     doubts = inherited_doubts(found, result)
     if look and isinstance(result, NestedResult) and result.check is None:
         # A generator of its own: the refined evidence is the same with and without the look.
-        missing = find_missed_hills(result, problem, max_calls=result.n_calls, rng=rng.spawn(1)[0])
-        found = replace(found, n_calls=found.n_calls + missing.n_calls)
-        doubts = (*doubts, *missing.doubts(found))
+        missed, n_calls = doubts_of_missed_parts(result, found, problem, run_once, rng=rng.spawn(1)[0])
+        found = replace(found, n_calls=found.n_calls + n_calls)
+        doubts = (*doubts, *missed)
     return replace(found, inherited=doubts)
 
 

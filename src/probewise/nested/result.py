@@ -178,17 +178,14 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class NestedResult(Samples):
-    """The evidence, the weighted samples and the record of a run of nested sampling.
+    """The evidence, the weighted samples and the record of a run of nested sampling; see also `Samples`.
 
     Attributes
     ----------
-    names
-        Parameter names, one per column of theta.
     theta
         Dead points in order of death, followed by the last live points, (n_dead, n_params).
-    log_likelihood, label, log_weight
-        Of each: log likelihood, the number from 0 to 1 that orders points of equal likelihood,
-        and log posterior weight (the weights sum to one), all (n_dead,).
+    label
+        Number from 0 to 1 that orders points of equal likelihood, (n_dead,).
     log_birth, birth_label
         Log likelihood and label of the dead point above which each was drawn, (n_dead,);
         minus infinity and 1 for draws from the whole prior.
@@ -198,21 +195,17 @@ class NestedResult(Samples):
         Number of points alive when each died, itself included, (n_dead,).
     log_start, log_start_error
         Natural log of the share of the prior with nonzero likelihood, and its standard error.
-    log_z, log_z_error
-        Natural log of the evidence, and its standard error: from simulated shrinkages, times the root of `memory`.
+    log_z_error
+        Standard error of ln Z: from simulated shrinkages, times the root of `memory`.
     memory
         Lineage variance: variance of log Z relative to independent points, 1 or more; see
         `probewise.nested.evidence.relative_lineage_variance`.
     information
         Kullback-Leibler divergence of posterior from prior, nats.
-    n_eff
-        Kish's effective sample size.
     n_calls, n_live
         Numbers of likelihood evaluations, those of the check included, and of live points.
-    stop_reason
-        Why the run ended.
-    complete
-        Whether its stopping rule ended it, rather than a limit, an interruption or a failure.
+    stop_reason, complete
+        Why the run ended; whether its stopping rule ended it, rather than a limit, an interruption or a failure.
     insertion_rank, insertion_n_ranked
         Rank of each new point among those alive, 0 to m, and m, both (n_inserted,).
     insertion_p_value
@@ -223,10 +216,8 @@ class NestedResult(Samples):
         Of probewise, numpy, scipy and python.
     warnings
         Reasons to doubt the result; empty for a sound run.
-    agreement
-        Agreement of the runs that were merged into this result; None for a single run.
-    check
-        A second estimate of the evidence; None if there is none.
+    agreement, check
+        Agreement of the runs that were merged into this result, and a second estimate of the evidence, or None.
     """
 
     names: tuple[str, ...]

@@ -24,6 +24,7 @@ from probewise.recordings.atomic import write_bytes_atomically
 
 _FORMAT = "nested-checkpoint/3"
 _ROUNDING = 1e-6
+_WAY_OUT = "give another file, or delete this one to start anew"
 _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
 _BIRTHS = ("log_birth", "birth_label", "ident", "parent")
 _RECORD = ("n_at_death", "rank", "n_ranked")
@@ -219,13 +220,10 @@ class CheckpointFile:
                     raise zipfile.BadZipFile(f"{damaged} is damaged")
                 head = json.loads(str(file["head"]))
                 found, settings = head["format"], head["settings"]
+                now = None
                 # Read the state only then: another version or move may have stored other fields.
-                same = found == _FORMAT and settings == self.settings
-                now = (
-                    _run_state_from_file(head, {name: file[name] for name in file.files if name != "head"}, move)
-                    if same
-                    else None
-                )
+                if found == _FORMAT and settings == self.settings:
+                    now = _run_state_from_file(head, {name: file[name] for name in file.files}, move)
         except Exception as error:  # a damaged archive can raise whatever its parts do
             raise FileError(
                 self.path, f"unreadable ({error})", "a checkpoint of this run; delete it to start anew"
@@ -244,37 +242,26 @@ class CheckpointFile:
         """Return the error that names the first setting in which the file differs from this run."""
         name = next(n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n))
         if name == "seed_state":
-            return FileError(
-                self.path,
-                "of a run with another seed: its generator began in another state",
-                "rng as it was when that run began, made anew from its seed; "
-                "give another file, or delete this one to start anew",
-            )
-        return FileError(
-            self.path,
-            f"of a run with {name} = {_shortened_text(settings.get(name))}, "
-            f"not {_shortened_text(self.settings.get(name))}",
-            "the same problem, settings and seed; give another file, or delete this one to start anew",
-        )
+            why = "another seed: its generator began in another state"
+            allowed = "rng as it was when that run began, made anew from its seed"
+        else:
+            texts = [str(each.get(name)) for each in (settings, self.settings)]
+            there, here = (text if len(text) <= 200 else f"{text[:200]}..." for text in texts)
+            why, allowed = f"{name} = {there}, not {here}", "the same problem, settings and seed"
+        return FileError(self.path, f"of a run with {why}", f"{allowed}; {_WAY_OUT}")
 
     def _require_same_problem(self, now: RunState, evaluate: Evaluator) -> None:
-        points, way_out = now.live.points, "give another file, or delete this one to start anew"
+        points = now.live.points
         theta, log_density = evaluate.space.leave(points.u)
         scale = np.abs(points.theta).max(axis=0)
         if not (_nearly_equal(theta, points.theta, scale) and _nearly_equal(log_density, points.log_density, 1.0)):
-            raise FileError(
-                self.path,
-                "of a run with another prior: it leads from its live points' coordinates to other parameters",
-                f"the same problem; {way_out}",
-            )
+            why = "another prior: it leads from its live points' coordinates to other parameters"
+            raise FileError(self.path, f"of a run with {why}", f"the same problem; {_WAY_OUT}")
         then = points.log_likelihood[:1]
         again = evaluate.log_likelihood(points.theta[:1])
         if not _nearly_equal(again, then, 1.0 + np.abs(then)):
-            raise FileError(
-                self.path,
-                f"of a run with another likelihood: its first live point had {then[0]:.10g}, now {again[0]:.10g}",
-                f"the same problem and readings; {way_out}",
-            )
+            why = f"another likelihood: its first live point had {then[0]:.10g}, now {again[0]:.10g}"
+            raise FileError(self.path, f"of a run with {why}", f"the same problem and readings; {_WAY_OUT}")
 
 
 def _run_state_from_file(head: dict[str, Any], arrays: dict[str, np.ndarray], move: Move) -> RunState:
@@ -296,19 +283,13 @@ def _run_state_from_file(head: dict[str, Any], arrays: dict[str, np.ndarray], mo
         raise ValueError("the move cannot be restored")
     live = LivePoints(*rows_of("live", slice(None)), float(head["log_volume"]))
     plain = {name: head[name] for name in _PLAIN} | {"notes": tuple(head["notes"])}
-    generator = _generator_state_with_arrays(head["rng_state"])
-    return RunState(live, tuple(dead), replace(move, **head["moving"]), rng_state=generator, **plain)
+    return RunState(live, tuple(dead), replace(move, **head["moving"]), rng_state=head["rng_state"], **plain)
 
 
 def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
     """Return whether two arrays agree to 1e-6 of `scale`: a row's last digits depend on the size of its batch."""
     with np.errstate(invalid="ignore"):  # inf - inf
         return a.shape == b.shape and bool(((a == b) | (np.abs(a - b) <= _ROUNDING * scale)).all())
-
-
-def _shortened_text(value: object) -> str:
-    text = str(value)
-    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _numeric_fields_of_move(move: Move) -> dict[str, float]:
@@ -321,16 +302,3 @@ def _numeric_fields_of_move(move: Move) -> dict[str, float]:
 def as_json(value: object) -> object:
     """Convert what `json` cannot: arrays to lists, anything else to text."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
-def _generator_state_with_arrays(value: object) -> dict[str, Any]:
-    """Convert the lists in a generator's state back to arrays."""
-    if not isinstance(value, dict):
-        raise ValueError("no state of a random generator")
-
-    def item_with_arrays(item: object) -> object:
-        if isinstance(item, dict):
-            return {k: item_with_arrays(v) for k, v in item.items()}
-        return np.asarray(item, dtype=np.uint64) if isinstance(item, list) else item
-
-    return {k: item_with_arrays(v) for k, v in value.items()}

@@ -30,9 +30,9 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.experiment import ArmReachAndTravel, Experiment, Step, explore
-from probewise.experiment.acquisition import predict_readings_and_utilities
-from probewise.experiment.method import nested_sampling_from_scratch
-from probewise.experiment.particles import Particles, update
+from probewise.experiment.inquire import predict_readings_and_utilities
+from probewise.experiment.reestimation import nested_sampling_from_scratch
+from probewise.experiment.smc import Particles, update
 from probewise.inquiry import Grid
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import Trial, arm_of, experiment_of

@@ -20,7 +20,7 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.errors import DoubtfulResultWarning
-from probewise.experiment import Experiment, HiddenShape, RandomStreams, explore, possible_shapes_by_name, shape_named
+from probewise.experiment import Experiment, HiddenShape, RandomStreams, as_shape, explore
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.nested import refine
@@ -36,7 +36,7 @@ EVERY = 3
 
 def experiment_of(field: Field) -> Experiment:
     """Pose the question: circle or rectangle, under a sensor of one Gaussian."""
-    shape = shape_named(("circle", "rectangle"), field)
+    shape = as_shape(("circle", "rectangle"), field)
     mixture = FixedMixture(np.ones(1), np.array([[0.0, 1.5]]), np.array([[[16.0, 2.0], [2.0, 6.25]]]))
     model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(shape), n_nodes=FAST_NODES)
     grid = Grid(field.width_mm, field.height_mm)
@@ -61,7 +61,7 @@ def follow(number: int) -> dict:
     field = Field()
     experiment = experiment_of(field)
     streams = RandomStreams.spawned_from(np.random.default_rng(number))
-    hidden = HiddenShape.given_or_drawn(None, possible_shapes_by_name(experiment.shape), field, rng=streams.truth)
+    hidden = HiddenShape.given_or_drawn(None, experiment.shape, field, rng=streams.truth)
     spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.2)])
     world = World(spot, black=10.0, white=60.0, noise_sd=1.0)
     noise = np.random.default_rng(streams.noise)

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from probewise.arm import SimulatedArm
-from probewise.experiment import Experiment, left_out_after_step, run
+from probewise.experiment import Experiment, Exploration, explore, left_out_after_step
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc
 from probewise.report import exploration, plots
@@ -42,7 +42,7 @@ def explored(trust):
     arm = SimulatedArm(light, scale=None)  # readings are not rounded
     experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, trust=trust)
     with arm:
-        return experiment, run(arm, experiment, rng=rng, max_readings=30)
+        return experiment, Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=30)))
 
 
 # %%

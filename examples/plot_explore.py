@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from probewise.arm import SimulatedArm
-from probewise.experiment import Experiment, run
+from probewise.experiment import Experiment, Exploration, explore
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc
 from probewise.report import exploration, plots
@@ -37,7 +37,7 @@ robot = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, a
 # %%
 # Measure, infer, inquire.
 with robot:
-    found = run(robot, experiment, rng=rng, max_readings=30)
+    found = Exploration(experiment, tuple(explore(robot, experiment, rng=rng, max_readings=30)))
 print(found.summary())
 places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exploring import run as explore_once
 from matplotlib.figure import Figure
 
 import probewise
@@ -26,13 +27,12 @@ from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
 from probewise.experiment import (
     Experiment,
     Exploration,
+    as_shape,
     experiment_for,
     explore,
     result_json,
     samples_csv,
-    shape_named,
 )
-from probewise.experiment import run as explore_once
 from probewise.inference import GaussianKnown, Naive, Rounded, SensorProblem, StudentT
 from probewise.investigation import Budget, investigate
 from probewise.nested import NestedResult, RemainingEvidence, SliceMove, diversify, run
@@ -253,7 +253,7 @@ MISTAKES = {
     "swapped to run": (lambda: list(explore(EXPERIMENT, ARM, rng=RNG)), "instrument is .*; allowed: an Instrument"),
     "no experiment": (lambda: list(explore(ARM, CIRCLE, rng=RNG)), "experiment is .*; allowed: an Experiment"),
     "swapped to pose": (lambda: experiment_for(CIRCLE, SENSOR, Field()), "sensor is .*in the order experiment_for"),
-    "a shape that is none": (lambda: shape_named(["blob"], Field()), "shape is 'blob'; allowed: one of circle"),
+    "a shape that is none": (lambda: as_shape(["blob"], Field()), "shape is 'blob'; allowed: one of circle"),
     "a number as likelihood": (lambda: Experiment(CIRCLE, MODEL, 0.7, 0.7), "likelihood is 0.7; allowed: a likelihood"),
     "swapped experiment": (lambda: Experiment(MODEL, CIRCLE, GaussianKnown(1), 0.7), "shape is .*; allowed: a shape"),
     # nested sampling

@@ -6,7 +6,7 @@
 import numpy as np
 
 from probewise.arm import SimulatedArm
-from probewise.experiment import Experiment, left_out_after_step, run
+from probewise.experiment import Experiment, Exploration, explore, left_out_after_step
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc
 from probewise.report import exploration, plots
@@ -38,7 +38,8 @@ def explored(trust):
         return world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng)
 
     with SimulatedArm(light, scale=None) as arm:  # readings are not rounded
-        return run(arm, Experiment(circle, model, GaussianKnown(0.7), 0.7, trust=trust), rng=rng, max_readings=30)
+        experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, trust=trust)
+        return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=30)))
 
 
 trusting, doubting = explored(1.0), explored(0.9)

@@ -5,7 +5,7 @@
 import numpy as np
 
 from probewise.arm import SimulatedArm
-from probewise.experiment import Experiment, run
+from probewise.experiment import Experiment, Exploration, explore
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc
 from probewise.scene import Circle, HypothesisScene
@@ -29,7 +29,7 @@ experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, n_live=80)
 # %%
 # Measure, infer, inquire, until every length is known to 4 mm.
 with robot:
-    found = run(robot, experiment, rng=rng, max_readings=30)
+    found = Exploration(experiment, tuple(explore(robot, experiment, rng=rng, max_readings=30)))
 found
 
 # %%

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -297,8 +297,7 @@ def explore(
 
     See Also
     --------
-    probewise.experiment.run : The same for any experiment and any arm.
-    probewise.experiment.explore : One step at a time.
+    probewise.experiment.explore : The same for any experiment and any arm, one step at a time.
 
     Examples
     --------
@@ -311,7 +310,7 @@ def explore(
     >>> len(run.readings)
     2
     """
-    from probewise import experiment as posing
+    from probewise import experiment
     from probewise._kinds import (
         checked_number,
         checked_one_or_several_numbers,
@@ -332,10 +331,10 @@ def explore(
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     require_fitted_sensor(sensor, "in the order explore(sensor, ...)")
     require_flag("learn_sensor", learn_sensor)
-    lies = posing.as_shape(shape, field)
-    streams, hidden = posing.RandomStreams.spawned_from(rng), None
+    lies = experiment.as_shape(shape, field)
+    streams, hidden = experiment.RandomStreams.spawned_from(rng), None
     naive = _naive_levels(sensor, levels, method=method, model=model, has_arm=arm is not None, rng=streams.levels)
-    asked = posing.experiment_from_names(
+    asked = experiment.experiment_for(
         sensor,
         lies,
         field,
@@ -353,19 +352,27 @@ def explore(
         cards=tuple(cards),
     )
     if isinstance(arm, LegoArm) and arm.geometry.accuracy is not None:
-        asked = replace(asked, fitted_arm=posing.FittedArm.from_geometry_and_sensor(arm.geometry, sensor))
+        asked = replace(asked, fitted_arm=experiment.FittedArm.from_geometry_and_sensor(arm.geometry, sensor))
     path = None if journal is None else checked_path("journal", journal)
-    before = posing.read_journal(path) if path is not None and path.exists() else None
-    geometry = posing.geometry_entry(arm.geometry if isinstance(arm, LegoArm) else None)
-    about = {**posing.sensor_entry(sensor), **geometry, "arm": "simulated" if arm is None else type(arm).__name__}
+    before = experiment.read_journal(path) if path is not None and path.exists() else None
+    geometry = experiment.geometry_entry(arm.geometry if isinstance(arm, LegoArm) else None)
+    about: dict[str, Any] = {
+        **experiment.sensor_entry(sensor),
+        **geometry,
+        "arm": "simulated" if arm is None else type(arm).__name__,
+    }
     taken = () if before is None else before.readings
     if arm is None:
-        hidden = posing.HiddenShape.given_or_drawn(
-            truth, posing.possible_shapes_by_name(asked.shape), field, rng=streams.truth
-        )
-        world, scale = posing.world_like(sensor), posing.scale_of(sensor.instrumentation)
-        arm = posing.arm_over(
-            world, posing.with_cards(hidden.surface, asked.cards), field, seed=streams.noise, taken=taken, scale=scale
+        hidden = experiment.HiddenShape.given_or_drawn(truth, asked.shape, field, rng=streams.truth)
+        about["hidden"] = hidden.journal_entry
+        world, scale = experiment.world_like(sensor), experiment.scale_of(sensor.instrumentation)
+        arm = experiment.arm_over(
+            world,
+            experiment.with_cards(hidden.surface, asked.cards),
+            field,
+            seed=streams.noise,
+            taken=taken,
+            scale=scale,
         )
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
@@ -373,22 +380,22 @@ def explore(
     with instrument, progress_or_bar(progress) as told:
         told(*("going through the journal", 0, len(taken)) if taken else ("taking the first readings",))
 
-        def report_step(step: Step) -> None:
-            if step.replayed:
-                return told("going through the journal", step.number, len(taken))
-            believed = f"widest sd {step.largest_sd_mm:.1f} mm, {step.bits:.1f} bits"
-            told(f"reading {step.number} of at most {max_readings}", note=believed)
-
-        return posing.run(
+        steps: list[Step] = []
+        for step in experiment.explore(
             instrument,
             asked,
             rng=streams.run,
             max_readings=max_readings,
             journal=path if before is None else before,
-            progress=report_step,
-            hidden=hidden,
             about=about,
-        )
+        ):
+            steps.append(step)
+            if step.replayed:
+                told("going through the journal", step.number, len(taken))
+                continue
+            believed = f"widest sd {step.largest_sd_mm:.1f} mm, {step.bits:.1f} bits"
+            told(f"reading {step.number} of at most {max_readings}", note=believed)
+        return experiment.Exploration(asked, tuple(steps), hidden)
 
 
 def _naive_levels(
@@ -404,7 +411,7 @@ def _naive_levels(
 
     Raises ParameterError if `levels` is missing with an arm of one's own, or given without that model.
     """
-    from probewise import experiment as posing
+    from probewise import experiment
     from probewise.errors import ParameterError
 
     wanted = method == "paper" and model == "naive"
@@ -412,10 +419,12 @@ def _naive_levels(
         allowed = "a recording with readings over black and over white" if wanted else "None"
         raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
     if levels is not None:
-        return posing.naive_levels_from_recording(levels, sensor)
+        return experiment.naive_levels_from_recording(levels, sensor)
     if not wanted:
         return None
-    return posing.naive_levels_from_world(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
+    return experiment.naive_levels_from_world(
+        experiment.world_like(sensor), experiment.scale_of(sensor.instrumentation), rng=rng
+    )
 
 
 def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progress: bool | Progress = True) -> PlanAudit:

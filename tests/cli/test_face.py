@@ -117,7 +117,7 @@ def test_a_verb_and_the_function_behind_it_have_the_same_defaults():
     for parameter in ("orders", "n_live"):
         own = inspect.signature(verbs.calibrate).parameters[parameter].default
         assert inspect.signature(calibration.calibrate).parameters[parameter].default == own
-    for function in (experiment.explore, experiment.run):
+    for function in (experiment.explore,):
         assert inspect.signature(function).parameters["max_readings"].default == verbs.MAX_READINGS
     posing = inspect.signature(experiment.experiment_for).parameters
     for parameter in ("model", "learn_sensor", "batch", "orientations_rad", "heights_mm", "repeats"):
@@ -197,12 +197,10 @@ def test_an_arm_of_ones_own_is_entered_measured_with_and_left(sensor):
     ],
 )
 def test_what_is_hidden_is_the_truth_that_was_given(shape, truth, name, theta):
-    from probewise.experiment import HiddenShape, as_shape, possible_shapes_by_name
+    from probewise.experiment import HiddenShape, as_shape
 
     field = Field()
-    hidden = HiddenShape.given_or_drawn(
-        truth, possible_shapes_by_name(as_shape(shape, field)), field, rng=np.random.default_rng(0)
-    )
+    hidden = HiddenShape.given_or_drawn(truth, as_shape(shape, field), field, rng=np.random.default_rng(0))
     assert (hidden.name, hidden.theta.tolist()) == (name, theta)
 
 

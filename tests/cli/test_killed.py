@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from probewise import investigation
 from probewise.cli import main
-from probewise.investigation import loop
 from probewise.recordings import fingerprint, paper_plan, write_plan
 
 
@@ -44,7 +44,7 @@ def thin_plan(tmp_path):
     return path
 
 
-def investigation(plan, out, *more):
+def investigating(plan, out, *more):
     options = ("--truth", "backlash:1", "--seed", 4, "--rounds", 2, "--readings", 30, "--quiet")
     return [str(word) for word in ("investigate", "--plan", plan, "--out", out, *options, *more)]
 
@@ -101,7 +101,7 @@ def test_a_second_run_on_the_same_journal_is_refused_and_the_first_goes_on(
 def test_an_investigation_goes_on_from_whatever_stands_on_the_disk(thin_plan, tmp_path, monkeypatch):
     """Before and after any file is put in place, and after its only round; no diagnosis is computed twice."""
     made, standing, whole = {}, [], tmp_path / "whole"
-    compute, replace = loop.diagnose, os.replace
+    compute, replace = investigation.diagnose, os.replace
 
     def diagnosed_once(recordings, *, rng, **options):
         key = (*map(fingerprint, recordings), str(rng.bit_generator.state))
@@ -115,15 +115,15 @@ def test_an_investigation_goes_on_from_whatever_stands_on_the_disk(thin_plan, tm
             shutil.copytree(whole, tmp_path / "standing" / str(len(standing)))
             standing.append(target)
 
-    monkeypatch.setattr(loop, "diagnose", diagnosed_once)
-    monkeypatch.setattr("probewise.investigation.folder._KEPT_AGAIN_S", 0.0)
+    monkeypatch.setattr(investigation, "diagnose", diagnosed_once)
+    monkeypatch.setattr("probewise.investigation._KEPT_AGAIN_S", 0.0)
     with monkeypatch.context() as during:
         during.setattr(os, "replace", replace_and_remember)
-        assert main(investigation(thin_plan, whole)) == 0
+        assert main(investigating(thin_plan, whole)) == 0
     assert len(made) == 2
     shorter = tmp_path / "shorter"
-    assert main(investigation(thin_plan, shorter, "--rounds", 1)) == 0
-    assert main(investigation(thin_plan, shorter, "--resume")) == 0
+    assert main(investigating(thin_plan, shorter, "--rounds", 1)) == 0
+    assert main(investigating(thin_plan, shorter, "--resume")) == 0
     assert contents(shorter) == contents(whole)
     chance = np.random.default_rng(int(os.environ.get("PROBEWISE_KILL_SEED", "1")))
     of_round = {n: [k for k, target in enumerate(standing) if Path(target).name == f"{n}.csv"] for n in (1, 2)}
@@ -132,7 +132,7 @@ def test_an_investigation_goes_on_from_whatever_stands_on_the_disk(thin_plan, tm
     for k in moments:
         out = tmp_path / "standing" / str(k)
         more = ["--resume"] if (out / "rounds" / "settings.json").exists() else []
-        assert main(investigation(thin_plan, out, *more)) == 0
+        assert main(investigating(thin_plan, out, *more)) == 0
         assert contents(out) == contents(whole), standing[k]
     assert len(made) == 2
 
@@ -147,7 +147,7 @@ def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(verb, sensor_fi
     """As processes, with all pictures; killed twice in all, and no run more often than that."""
 
     def words(out, *more):
-        return command(sensor_file, out, *more) if verb == "explore" else investigation(thin_plan, out, *more)
+        return command(sensor_file, out, *more) if verb == "explore" else investigating(thin_plan, out, *more)
 
     began_s = time.monotonic()
     run = [sys.executable, "-m", "probewise"]

@@ -28,6 +28,7 @@ from arm_faults import (
     violations,
     wrong,
 )
+from exploring import run as run_experiment
 
 import probewise
 from probewise.arm import LegoArm, Pose, Reading
@@ -35,7 +36,6 @@ from probewise.arm.geometry import Accuracy
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.emulator import Faults, SensorPose, VirtualClock, VirtualLine
 from probewise.experiment import Experiment, arm_over
-from probewise.experiment import run as run_experiment
 from probewise.recordings import Disc
 from probewise.scene import Field
 

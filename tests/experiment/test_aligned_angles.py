@@ -5,11 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from exploring import run
 
-from probewise.experiment import run
-from probewise.experiment.aligned_angles import with_aligned_angles
 from probewise.experiment.method import SequentialMonteCarlo
-from probewise.experiment.stopping_rule import probability_of_length_off, shape_moments_and_probabilities
+from probewise.experiment.stopping import (
+    probability_of_length_off,
+    shape_moments_and_probabilities,
+    with_aligned_angles,
+)
 from probewise.nested import Weighted
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from exploring import run
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
@@ -20,7 +21,7 @@ from probewise.arm.geometry import (
     places_at_parameters,
 )
 from probewise.errors import FileError, ParameterError
-from probewise.experiment import FittedArm, explore, found_shape, result_json, run, samples_csv
+from probewise.experiment import FittedArm, explore, found_shape, result_json, samples_csv
 from probewise.experiment.arm_error import arm_error_in_posterior
 from probewise.inquiry import Grid
 
@@ -48,9 +49,10 @@ def found(request):
 def with_arm_error(exploration, geometry):
     """A run that has ended, with the error of a fitted arm added to its posterior."""
     last = exploration.last
-    of = (exploration.experiment, FittedArm(geometry, LEVELS), exploration.readings, last.posterior)
+    experiment = dataclasses.replace(exploration.experiment, fitted_arm=FittedArm(geometry, LEVELS))
+    of = (experiment, exploration.readings, last.posterior.theta[:, experiment.shape_columns])
     moments = {name: getattr(last, name) for name in ("mean", "sd", "likely_shape")}
-    error = arm_error_in_posterior(*of, last.kinds.with_raised_fault_odds, **moments, rng=np.random.default_rng(1))
+    error = arm_error_in_posterior(*of, last.kinds.with_raised_fault_odds(), **moments, rng=np.random.default_rng(1))
     return dataclasses.replace(exploration, steps=(*exploration.steps[:-1], dataclasses.replace(last, arm_error=error)))
 
 

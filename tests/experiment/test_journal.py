@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from exploring import run
 
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import Pose, Reading
@@ -18,7 +19,6 @@ from probewise.experiment import (
     read_journal,
     recording_of,
     require_same_settings,
-    run,
     value_digest,
 )
 from probewise.recordings.patterns import Disc
@@ -330,7 +330,6 @@ def test_the_clock_of_ones_own_instrument_goes_on_where_an_earlier_run_ended(sma
     ],
 )
 def test_what_lies_there_may_be_said_in_order_or_by_name(truth, name, theta):
-    members = {"circle": Circle()}
-    hidden = HiddenShape.given_or_drawn(truth, members, Circle().field, rng=np.random.default_rng(0))
+    hidden = HiddenShape.given_or_drawn(truth, Circle(), Field(), rng=np.random.default_rng(0))
     assert (hidden.name, hidden.theta.tolist()) == (name, theta)
     assert hidden.journal_entry["shape"] == name

@@ -11,24 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exploring import run
 from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
-from probewise.experiment import ArmReachAndTravel as FieldOf
-from probewise.experiment import (
-    Exploration,
-    OneScan,
-    acquisition,
-    arm_over,
-    begin,
-    explore,
-    loop,
-    read_journal,
-    run,
-    step,
-)
-from probewise.experiment.stopping_rule import p_value_and_worst_reading
+from probewise.experiment import Exploration, OneScan, arm_over, begin, explore, inquire, loop, read_journal, step
+from probewise.experiment.stopping import p_value_and_worst_reading
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, UtilityMap, prior_entropy
 from probewise.inquiry.any_settings.posterior import prior_samples
@@ -121,16 +110,14 @@ def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
 def test_a_step_by_hand_is_a_step_of_the_loop(small):
     experiment, arm = small.experiment(), small.arm()
     first = next(iter(explore(arm, experiment, rng=rng())))
-    field = FieldOf.from_instrument(arm, experiment.grid)
     # explore() takes the first child of the generator's seed, and of that a child for each reading.
     child = np.random.SeedSequence(2013).spawn(1)[0]
     start, then = (
         np.random.default_rng(np.random.SeedSequence(child.entropy, spawn_key=(*child.spawn_key, k))) for k in (0, 1)
     )
-    prior_bits = prior_entropy(experiment.prior, rng=start)
-    state = begin(experiment, field, rng=start)
+    state = begin(experiment, small.arm(), rng=start)
     assert state.next_pose == first.reading.pose
-    state, info = step(state, small.arm().measure(state.next_pose), experiment, field, prior_bits=prior_bits, rng=then)
+    state, info = step(state, small.arm().measure(state.next_pose), experiment, rng=then)
     np.testing.assert_array_equal(info.samples, first.samples)
     assert (info.bits, info.log_z, info.next_pose) == (first.bits, first.log_z, first.next_pose)
     assert state.readings == (first.reading,)
@@ -293,7 +280,7 @@ def test_a_run_killed_while_it_infers_keeps_the_reading_just_taken(small, found,
     journal = tmp_path / "journal.jsonl"
     steps = explore(small.arm(), small.experiment(), rng=rng(), journal=journal)
     next(steps)
-    monkeypatch.setattr("probewise.experiment.method.updated", lambda *_, **__: os._exit(9))
+    monkeypatch.setattr("probewise.experiment.method.SequentialMonteCarlo.updated", lambda *_, **__: os._exit(9))
     pid = os.fork()
     if pid == 0:
         next(steps)  # measures, writes the reading, dies in the inference
@@ -608,14 +595,13 @@ def peaked(small):
 
 def one_step(experiment, arm, planned):
     """Take the first step by hand, with poses planned before it."""
-    field = FieldOf.from_instrument(arm, experiment.grid)
-    state = replace(begin(experiment, field, rng=rng()), planned=planned)
-    return step(state, arm.measure(state.next_pose), experiment, field, prior_bits=0.0, rng=rng())
+    state = replace(begin(experiment, arm, rng=rng()), planned=planned)
+    return step(state, arm.measure(state.next_pose), experiment, rng=rng())
 
 
 def test_a_batch_near_the_end_is_the_one_reading_that_may_end_the_run(small, peaked, monkeypatch):
     there, place = peaked
-    monkeypatch.setattr(acquisition, "utility_map", lambda *_: there)
+    monkeypatch.setattr(inquire, "utility_map", lambda *_: there)
     state, info = one_step(small.experiment(batch=3, grid=COARSE), small.arm(), ())
     assert (info.next_pose.x_mm, info.next_pose.y_mm) == place
     assert state.planned == ()
@@ -627,7 +613,8 @@ def test_a_reading_for_which_the_run_goes_on_is_taken_before_those_planned(small
     experiment, planned = small.experiment(batch=3, grid=COARSE), (Pose(10.0, 20.0), Pose(30.0, 40.0))
     assert len(experiment.kinds) == 1
     object.__setattr__(experiment, "trust", 0.9)  # this sensor has no rivals, so the constructor would refuse
-    monkeypatch.setattr(loop, "utility_map_and_must_continue", lambda *_, **__: (there, asks))
+    monkeypatch.setattr(inquire, "utilities_near_end", lambda *_, **__: there)
+    monkeypatch.setattr(loop, "must_continue", lambda _: asks)
     state, info = one_step(experiment, small.arm(), planned)
     assert (info.next_pose, *state.planned) == ((Pose(*place),) if asks else planned)
 

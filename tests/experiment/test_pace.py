@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.arm import Pose, Reading
-from probewise.experiment.pace import EACH_S, EffectInPacedTime, Pace
-from probewise.experiment.rivals import GainLoss, rivals_of
+from probewise.experiment.rivals import EACH_S, EffectInPacedTime, GainLoss, Pace, rivals_of
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import experiment_of
 
@@ -37,9 +36,9 @@ def test_parameters_are_told_by_the_clock():
     (step,) = rivals("ambient_step")
     pace = Pace.from_readings(readings(2.0))
     assert pace.each_s == pytest.approx(2.0)
-    np.testing.assert_allclose(step.theta_in_seconds(np.array([5.0, 4 * EACH_S]), pace), [5.0, 8.0])
+    np.testing.assert_allclose(pace.in_seconds(step, np.array([5.0, 4 * EACH_S])), [5.0, 8.0])
     (drift,) = rivals("offset_drift")
-    np.testing.assert_allclose(drift.theta_in_seconds(np.array([1.0]), pace), [4.0])
+    np.testing.assert_allclose(pace.in_seconds(drift, np.array([1.0])), [4.0])
 
 
 def test_one_reading_has_the_usual_pace():

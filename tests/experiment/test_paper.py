@@ -1,11 +1,13 @@
 """The paper's own method: against sums over a lattice, its likelihoods, its draws, its journal."""
 
+import itertools
 import json
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from exploring import run
 
 from probewise.arm import ReadingScale
 from probewise.arm.instrument import Pose, Reading
@@ -14,17 +16,16 @@ from probewise.errors import FileError, NotConvergedError, ParameterError
 from probewise.experiment import (
     NestedSampling,
     OneScan,
-    experiment_from_names,
+    experiment_for,
     explore,
+    find_shape,
     naive_levels_from_recording,
     naive_levels_from_world,
-    paper_experiment,
     read_journal,
-    run,
     student_t_likelihood,
 )
 from probewise.inference import Naive
-from probewise.inquiry import InformationGain, ReadingEntropy
+from probewise.inquiry import Grid, InformationGain, ReadingEntropy
 from probewise.nested import EvidenceChange, RemainingEvidence
 from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Recording
 from probewise.recordings import Uniform as UniformPattern
@@ -94,7 +95,7 @@ def test_the_posterior_is_that_of_a_sum_over_a_lattice(small, likelihood, blur_m
 
 
 def infer(experiment, readings, previous=None, seed=1):
-    from probewise.experiment.posterior import prior_posterior
+    from probewise.experiment.kinds import prior_posterior
 
     start = prior_posterior(experiment.kinds, 200, rng=rng()) if previous is None else previous
     return experiment.inference_method.updated(start, experiment.problem(readings).recording, rng=rng(seed))
@@ -161,7 +162,7 @@ def test_a_journal_of_one_method_is_not_gone_on_with_by_another(small, tmp_path)
 def test_of_two_shapes_each_has_a_run_of_its_own_and_the_right_one_wins():
     field = Field(400.0, 300.0)
     shape = AnyOf({"circle": Circle(field, (40.0, 80.0)), "rectangle": Rectangle(field)})
-    experiment = paper_experiment(sensor(), shape, field, nested_stop="remaining")
+    experiment = experiment_for(sensor(), shape, field, method="paper", nested_stop="remaining")
     experiment = replace(experiment, method=QUICK)
     truth = shape.shapes["circle"].region(np.array([[200.0, 150.0, 60.0]]))
     angles = np.arange(12) * math.tau / 12
@@ -206,7 +207,7 @@ def sensor():
 
 
 def test_the_paper_experiment_is_posed_as_the_paper_says():
-    posed = paper_experiment(sensor(), Circle(), Field())
+    posed = experiment_for(sensor(), Circle(), Field(), method="paper")
     assert posed.method == NestedSampling(n_live=300, stop=EvidenceChange(1e-8), n_steps=1000)
     assert posed.utility == ReadingEntropy(1.0)
     assert posed.likelihood == OneScan(1 / math.sqrt(12), 50.0)
@@ -214,7 +215,9 @@ def test_the_paper_experiment_is_posed_as_the_paper_says():
     assert (posed.grid.n_x, posed.grid.n_y) == (131, 65)
     inside = posed.prior.log_prob(np.array([[100.0, 100.0, 30.0], [900.0, 400.0, 140.0]]))
     assert inside[0] == inside[1]
-    naive = paper_experiment(sensor(), Circle(), Field(), model="naive", naive=LEVELS, nested_stop="remaining")
+    naive = experiment_for(
+        sensor(), Circle(), Field(), method="paper", model="naive", naive=LEVELS, nested_stop="remaining"
+    )
     assert naive.likelihood is LEVELS
     assert naive.method.stop == RemainingEvidence(0.05)
     assert naive.doubt_p == 0
@@ -230,7 +233,7 @@ def test_the_papers_robot_has_the_mean_of_the_sampled_fields():
     samples[:, 1:5] *= np.exp(0.6 * rng(5).standard_normal((len(samples), 4)))
     axis = np.arange(-60.0, 60.5, 0.5)
     field = mean_ssf_field(footprint_of(samples[:, :6], 1), u_mm=axis, v_mm=axis)
-    posed = paper_experiment(replace(uncertain, samples=samples, field=field), Circle(), Field())
+    posed = experiment_for(replace(uncertain, samples=samples, field=field), Circle(), Field(), method="paper")
     x_mm = np.linspace(-12.0, 12.0, 49)
     for pattern in (HalfPlane(0.3, 0.0), Disc((0.0, 0.0), 9.0)):
         plan = Plan.from_arrays(x_mm=x_mm, y_mm=0.4 * x_mm, patterns={"only": pattern}, unit="LEGO")
@@ -263,7 +266,7 @@ def test_the_papers_robot_has_the_mean_of_the_sampled_fields():
 )
 def test_what_does_not_go_with_the_method_is_refused_by_name(options, named):
     with pytest.raises(ParameterError) as caught:
-        experiment_from_names(sensor(), Circle(), Field(), **{"method": "paper", **options})
+        experiment_for(sensor(), Circle(), Field(), **{"method": "paper", **options})
     assert caught.value.name == named
 
 
@@ -309,3 +312,29 @@ def test_what_a_run_wrote_can_be_read(small, tmp_path):
     run(small.arm(), small.experiment(likelihood=STUDENT, method=QUICK), rng=rng(), max_readings=1, journal=journal)
     first = json.loads(journal.read_text().splitlines()[0])
     assert first["method"].startswith("NestedSampling(n_live=60, stop=RemainingEvidence(dlogz=0.1)")
+
+
+def test_the_loop_of_the_paper_and_the_method_of_explore_infer_the_same(small):
+    """Two routes from the same readings: evidence and means within five standard errors of as many samples as count."""
+    grid = Grid(400.0, 300.0, 14, 10)
+    experiment = small.experiment(likelihood=STUDENT, grid=grid, method=NestedSampling())
+    steps = find_shape(small.arm(), experiment.shape, experiment.model, STUDENT, grid, bin_width=1.0, rng=rng())
+    readings, posterior, shapes = next(itertools.islice(steps, 2, None))
+    assert len(readings) == 3
+    assert len(np.unique(shapes, axis=0)) == 50
+    found = infer(experiment, readings).joined(rng=rng())
+    error = 5 * math.hypot(posterior.log_z_error, found.log_z_error)
+    assert posterior.log_z == pytest.approx(found.log_z, abs=error)
+    spread = 5 * found.sd() * math.sqrt(found.run.memory / found.n_eff + posterior.memory / posterior.n_eff)
+    assert (np.abs(posterior.mean() - found.mean()) < spread).all()
+
+
+@pytest.mark.slow
+def test_the_loop_of_the_paper_ends_when_it_has_found_the_circle(small):
+    experiment = small.experiment(likelihood=STUDENT)
+    options = {"bin_width": 1.0, "rng": rng()}
+    *_, last = find_shape(small.arm(), experiment.shape, experiment.model, STUDENT, experiment.grid, **options)
+    readings, posterior, _ = last
+    assert len(readings) < 40
+    assert posterior.sd().max() < 4.0
+    assert np.abs(posterior.mean() - small.arm().truth).max() < 16.0

@@ -10,9 +10,10 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
-from probewise.experiment.evidence import bridged_evidence, posterior_sampled_about_points
-from probewise.experiment.kernels import LocalKernels
-from probewise.experiment.particles import (
+from probewise.experiment.reestimation import bridged_evidence, sampled_about_points
+from probewise.experiment.smc import (
+    THOROUGH,
+    LocalKernels,
     Particles,
     _LastReadingEvaluator,
     _move_by_metropolis,
@@ -21,7 +22,7 @@ from probewise.experiment.particles import (
     resample_and_move,
     update,
 )
-from probewise.experiment.stopping_rule import information_nats
+from probewise.experiment.stopping import information_nats
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 
@@ -186,7 +187,7 @@ def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_bega
     points = posterior.samples(2000, rng=rng(1))
     left = points[:, 0] < mean[0]
     uneven = np.concatenate([points[left], points[~left][: left.sum() // 9]])
-    found = posterior_sampled_about_points(uneven, problem, rng=rng(2), n_draws=8000)
+    found = sampled_about_points(uneven, problem, 8000, rng(2))
     assert found.mean()[0] == pytest.approx(mean[0], abs=0.15 * sd[0])
     assert found.log_z == pytest.approx(log_z, abs=5 * found.log_z_error + 0.05)
 
@@ -263,7 +264,8 @@ def test_copies_of_one_sample_are_not_moved(small):
     """They are left where they are, and the posterior is marked as strained."""
     problem = small.experiment().problem([Reading(40.0, Pose(50.0, 30.0, 0.0), 1.0)])
     theta = np.repeat(problem.prior.from_unit_cube(np.full((1, len(problem.prior.names)), 0.5)), 60, axis=0)
-    cloud = _LastReadingEvaluator(problem).evaluate_samples(theta)
-    moved, moves = _move_by_metropolis(cloud, 1.0, _LastReadingEvaluator(problem), np.random.default_rng(1))
-    assert moves.accepted == 0.0
+    last = _LastReadingEvaluator(problem)
+    start = last.evaluate_samples(theta)
+    moved, accepted, _ = _move_by_metropolis(start, 1.0, last, rng(1), [np.arange(len(theta))], THOROUGH)
+    assert accepted == 0.0
     np.testing.assert_array_equal(moved.theta, theta)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +9,8 @@ from scipy.special import logsumexp
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import NotConvergedError
-from probewise.experiment.lost_modes import with_lost_modes_found
-from probewise.experiment.method import nested_sampling_from_scratch
-from probewise.experiment.posterior import prior_posterior
-from probewise.experiment.posterior_update import updated
+from probewise.experiment.kinds import prior_posterior
+from probewise.experiment.method import SequentialMonteCarlo
 from probewise.scene import AnyOf
 
 # The lead changes four times.
@@ -63,12 +60,8 @@ def followed(experiment, n, *, seed=0):
     random = rng(seed)
     now = prior_posterior(experiment.kinds, experiment.n_particles, rng=random)
     for k in range(1, n + 1):
-        now = updated(
-            now,
-            experiment.problem(readings(k)).recording,
-            experiment.n_particles,
-            rng=random,
-            from_scratch=partial(nested_sampling_from_scratch, n_live=experiment.n_live, rng=random),
+        now = SequentialMonteCarlo(experiment.n_particles, experiment.n_live).updated(
+            now, experiment.problem(readings(k)).recording, rng=random
         )
         yield now
 
@@ -130,12 +123,8 @@ def test_a_kind_that_cannot_be_is_impossible_and_the_others_go_on(small):
     random = rng()
     now = prior_posterior(experiment.kinds, 1500, rng=random)
     for k in (1, 2):
-        now = updated(
-            now,
-            experiment.problem(taken[:k]).recording,
-            1500,
-            rng=random,
-            from_scratch=partial(nested_sampling_from_scratch, n_live=experiment.n_live, rng=random),
+        now = SequentialMonteCarlo(1500, experiment.n_live).updated(
+            now, experiment.problem(taken[:k]).recording, rng=random
         )
     np.testing.assert_array_equal(now.probability, [0.0, 1.0])
 
@@ -145,17 +134,13 @@ def test_readings_that_no_kind_allows_are_refused(small):
     random = rng()
     now = prior_posterior(experiment.kinds, 300, rng=random)
     with pytest.raises(NotConvergedError):
-        updated(
-            now,
-            experiment.problem([Reading(200.0, Pose(150.0, 140.0), 0.0)]).recording,
-            300,
-            rng=random,
-            from_scratch=partial(nested_sampling_from_scratch, n_live=experiment.n_live, rng=random),
+        SequentialMonteCarlo(300, experiment.n_live).updated(
+            now, experiment.problem([Reading(200.0, Pose(150.0, 140.0), 0.0)]).recording, rng=random
         )
 
 
 def last_of(small, n=4):
-    """The posterior of one kind, large circles, given some readings; and its problem."""
+    """The posterior of one kind, large circles, given some readings; and these."""
     experiment = small.experiment(
         shape=small.circle((20.0, 150.0)),
         model=small.sensor(),
@@ -164,31 +149,30 @@ def last_of(small, n=4):
         n_particles=1000,
     )
     *_, now = followed(experiment, n)
-    return now, [kind.problem(experiment.problem(readings(n)).recording) for kind in now.kinds]
+    return now, experiment.problem(readings(n)).recording
 
 
-def checked(now, problems):
-    from_scratch = partial(nested_sampling_from_scratch, n_live=200, rng=rng(1))
-    return with_lost_modes_found(now, problems, rng=rng(2), from_scratch=from_scratch)
+def checked(now, recording):
+    return SequentialMonteCarlo(3000, n_live=200).reconsidered(now, recording, rng=rng(2))
 
 
 @pytest.mark.parametrize("share", [0.02, 0.7])
 def test_a_part_of_the_posterior_that_the_samples_lost_is_found_before_a_run_ends(small, share):
     """The samples are confined to a share of the posterior, the largest radii: ln Z is too small by its log."""
-    now, problems = last_of(small)
+    now, recording = last_of(small)
     (whole,) = now.particles
     theta, weight = whole.weighted.theta, whole.weighted.weight
     kept = theta[:, 2] >= np.quantile(theta[:, 2], 1 - share)
     log_weight = np.where(kept, np.log(np.maximum(weight, 1e-300)) - math.log(weight[kept].sum()), -np.inf)
     few = replace(whole.weighted, log_weight=log_weight, log_z=whole.log_z + math.log(share))
-    found = checked(replace(now, particles=(replace(whole, weighted=few),)), problems).particles[0]
+    found = checked(replace(now, particles=(replace(whole, weighted=few),)), recording).particles[0]
     assert found.log_z == pytest.approx(whole.log_z, abs=0.5)
     away = np.abs(found.weighted.mean() - whole.weighted.mean()) / whole.weighted.sd()
     assert (away < 0.4).all()
 
 
 def test_samples_that_lost_nothing_stay_as_they_are(small):
-    now, problems = last_of(small)
-    again = checked(now, problems)
+    now, recording = last_of(small)
+    again = checked(now, recording)
     assert again.particles[0].weighted is now.particles[0].weighted
-    assert checked(again, problems).particles[0] is again.particles[0]  # it was checked just now
+    assert checked(again, recording).particles[0] is again.particles[0]  # it was checked just now

@@ -4,7 +4,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -24,36 +23,30 @@ from probewise.experiment import (
     begin,
     experiment_for,
     left_out_after_step,
+    reestimation,
     repaired_sensor,
     result_json,
-    sampled_anew,
     step,
 )
-from probewise.experiment.acquisition import ArmReachAndTravel, predict_readings_and_utilities
 from probewise.experiment.arm_error import arm_error_in_posterior
-from probewise.experiment.checking import (
+from probewise.experiment.inquire import (
+    ENDS,
     ENOUGH_BITS,
+    INFORMATION,
     NAMES,
+    ArmReachAndTravel,
     OutlineReadingDistances,
     expected_bits_about_left_out_effect,
+    predict_readings_and_utilities,
+    utilities_near_end,
 )
-from probewise.experiment.declared_noise import DeclaredNoise
-from probewise.experiment.method import nested_sampling_from_scratch
-from probewise.experiment.noise_rivals import (
-    CoarserRoundingLikelihood,
-    CorrelatedLikelihood,
-    FlickerLikelihood,
-    LostReadingLikelihood,
-    OutlierLikelihood,
-    SignalDependentLikelihood,
-)
-from probewise.experiment.posterior import Posterior, prior_posterior
-from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
-from probewise.experiment.refitted import fit_kind, sampled_about_fits
+from probewise.experiment.kinds import Posterior, prior_posterior
+from probewise.experiment.method import SequentialMonteCarlo
+from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
+from probewise.experiment.reestimation import fit_kind, nested_sampling_from_scratch, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
-from probewise.experiment.utility_near_end import _ENDS, _LABEL, utility_map_and_must_continue
 from probewise.inference import Rounded
-from probewise.inquiry import Readout, prior_entropy
+from probewise.inquiry import Readout
 from probewise.proof.concealed_study import (
     ConcealedTrial,
     _arm_in_concealed_world,
@@ -77,13 +70,11 @@ def stepped(doubting):
     """Two steps of a run that doubts, both of the prior's first places."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
-        state = begin(doubting, field, rng=rng)
-        prior_bits = prior_entropy(doubting.prior, rng=rng)
+        state = begin(doubting, arm, rng=rng)
         found = []
         for _ in range(2):
             reading = arm.measure(state.next_pose)
-            state, info = step(state, reading, doubting, field, prior_bits=prior_bits, rng=rng, max_readings=2)
+            state, info = step(state, reading, doubting, rng=rng, max_readings=2)
             found.append(info)
     return found
 
@@ -145,11 +136,14 @@ def test_a_rival_is_of_a_size_and_at_a_time_that_a_run_can_show():
     assert at_s.to_unit(np.array([99 * 8.0]))[0] < 1.0  # nor is a run of a hundred readings safe from it
 
 
-def laws(*kinds):
-    return [rival.likelihood for rival in rivals() if isinstance(rival.likelihood, kinds)]
+LEVELS = (10.0, 60.0)
 
 
-@pytest.mark.parametrize("law", laws(OutlierLikelihood, CorrelatedLikelihood, FlickerLikelihood))
+def laws(*names):
+    return [rival.likelihood for rival in rivals() if rival.name in names]
+
+
+@pytest.mark.parametrize("law", laws("outliers", "correlated_noise", "flicker"))
 def test_laws_of_the_residual_alone_are_densities(law):
     """As the level goes over all levels, so does the residual; its density is one."""
     level = np.linspace(-600.0, 670.0, 60_001)
@@ -157,7 +151,7 @@ def test_laws_of_the_residual_alone_are_densities(law):
     assert np.trapezoid(density, level) == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("law", laws(LostReadingLikelihood, SignalDependentLikelihood, CoarserRoundingLikelihood))
+@pytest.mark.parametrize("law", laws("dropouts", "signal_dependent_noise", "quantisation"))
 def test_laws_of_the_noise_are_densities(law):
     """The density of one reading over all readings is one."""
 
@@ -172,18 +166,10 @@ def test_laws_of_the_noise_are_densities(law):
 NOISE_ON_A_SCALE = DeclaredNoise.from_likelihood(Rounded(sd=2.0, step=1.0, low=4.0, high=36.0))
 
 
-@pytest.mark.parametrize(
-    "law",
-    [
-        OutlierLikelihood(NOISE_ON_A_SCALE, np.array([0.1]), np.array([4.0])),
-        LostReadingLikelihood(NOISE_ON_A_SCALE, 4.0, 4.0, 36.0),
-        CorrelatedLikelihood(NOISE_ON_A_SCALE),
-        SignalDependentLikelihood(NOISE_ON_A_SCALE, 4.0, 36.0),
-        FlickerLikelihood(NOISE_ON_A_SCALE, (1.0, 3.0)),
-    ],
-)
-def test_readings_at_an_end_of_the_scale_cover_everything_beyond(law):
+@pytest.mark.parametrize("name", ["outliers", "dropouts", "correlated_noise", "signal_dependent_noise", "flicker"])
+def test_readings_at_an_end_of_the_scale_cover_everything_beyond(name):
     """The probabilities of all readings of a scale, both ends among them, add up to one."""
+    law = noise_likelihoods(NOISE_ON_A_SCALE, (4.0, 36.0))[name]
     cells = np.arange(4.0, 37.0)
     total = sum(math.exp(law.log_prob(np.array([cell]), np.array([[35.3]]))[0]) for cell in cells)
     assert total == pytest.approx(1.0, abs=3e-3)
@@ -194,7 +180,7 @@ def test_readings_at_an_end_of_the_scale_show_no_lattice():
     plain = Rounded(sd=1.0, step=1.0, low=0.0, high=100.0)
     noise = DeclaredNoise.from_likelihood(plain)
     readings, level = np.full(6, 100.0), np.full((1, 6), 101.0)
-    assert CoarserRoundingLikelihood(noise).log_prob(readings, level)[0] == pytest.approx(
+    assert noise_likelihoods(noise, (0.0, 100.0))["quantisation"].log_prob(readings, level)[0] == pytest.approx(
         plain.log_prob(readings, level)[0], abs=1e-3
     )
 
@@ -202,11 +188,9 @@ def test_readings_at_an_end_of_the_scale_show_no_lattice():
 @pytest.mark.slow
 def test_rounded_laws_of_the_noise_are_probabilities_of_cells():
     cells = np.arange(-200.0, 271.0)
-    shares, sizes = np.array([0.1]), np.array([3.0])
-    for law in (
-        OutlierLikelihood(DeclaredNoise(1.5, 1.0), shares, sizes),
-        LostReadingLikelihood(DeclaredNoise(1.5, 1.0), 10.0, 10.0, 60.0),
-    ):
+    laws_of_noise = noise_likelihoods(DeclaredNoise(1.5, 1.0), (10.0, 60.0))
+    for name in ("outliers", "dropouts"):
+        law = laws_of_noise[name]
         total = sum(math.exp(law.log_prob(np.array([cell]), np.array([[35.3]]))[0]) for cell in cells)
         assert total == pytest.approx(1.0, abs=1e-3)
 
@@ -297,9 +281,8 @@ def test_the_fit_is_tested_where_the_declared_noise_leads(doubting, stepped, mon
     monkeypatch.setattr(Posterior, "most_probable_kind_index", index)
     rng = np.random.default_rng(4)
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
-        state = begin(doubting, field, rng=rng)
-        _, info = step(state, stepped[0].reading, doubting, field, prior_bits=0.0, rng=rng, max_readings=1)
+        state = begin(doubting, arm, rng=rng)
+        _, info = step(state, stepped[0].reading, doubting, rng=rng, max_readings=1)
     assert (info.p_value is not None) == tested
     found = Exploration(doubting, (info,))
     said = "not tested: the most probable noise is not the declared one"
@@ -322,7 +305,9 @@ def test_repeats_tell_names_by_their_mean():
 
 
 @pytest.mark.parametrize(
-    ("sd_mm", "what"), [((30.0, 30.0, 9.0), _LABEL), ((6.0, 1.0, 1.0), _ENDS)], ids=["far from the end", "near the end"]
+    ("sd_mm", "what"),
+    [((30.0, 30.0, 9.0), INFORMATION), ((6.0, 1.0, 1.0), ENDS)],
+    ids=["far from the end", "near the end"],
 )
 def test_near_the_end_repeats_are_worth_more_than_one_reading(doubting, sd_mm, what):
     """At every place that is a candidate with one reading and with nine: the noise of their mean is a third."""
@@ -336,8 +321,8 @@ def test_near_the_end_repeats_are_worth_more_than_one_reading(doubting, sd_mm, w
     readings = (Reading(35.0, Pose(500.0, 170.0), 8.0), Reading(35.0, Pose(500.0, 350.0), 16.0))
     with arm_of(Trial(REFERENCE, 0)) as arm:
         field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
-    of = predict_readings_and_utilities(experiment, weighted, theta[:20], field, at=readings[-1])
-    there, _ = utility_map_and_must_continue(experiment, posterior, *of, readings, rng=rng)
+    of = predict_readings_and_utilities(experiment, weighted, theta[:20], field, at=readings[-1], goal=experiment.goal)
+    there = utilities_near_end(experiment, posterior, *of, readings, rng=rng)
     assert there.label == what
     once, nine_times = there.values.reshape(2, -1)
     both = (once > 0) & (nine_times > 0)
@@ -373,18 +358,17 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
     fitted, rng = FittedArm(geometry, (10.0, 60.0)), np.random.default_rng(3)
     experiment = replace(doubting, fitted_arm=fitted)
     with arm_of(Trial(REFERENCE, 0)) as simulated:
-        field = ArmReachAndTravel.from_instrument(simulated, experiment.grid)
-    state = begin(experiment, field, rng=rng)
+        state = begin(experiment, simulated, rng=rng)
     for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
         reading = Reading(value, Pose(x, y), 8.0 * k)
-        state, last = step(state, reading, experiment, field, prior_bits=20.0, rng=rng, max_readings=3)
+        state, last = step(state, reading, experiment, rng=rng, max_readings=3)
 
     def slopes(kinds):
-        of = (experiment, fitted, state.readings, last.posterior, kinds)
+        of = (experiment, state.readings, last.posterior.theta[:, experiment.shape_columns], kinds)
         named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
         return arm_error_in_posterior(*of, **named, rng=np.random.default_rng(1)).slopes
 
-    np.testing.assert_allclose(last.arm.slopes, slopes(last.kinds.with_raised_fault_odds))
+    np.testing.assert_allclose(last.arm.slopes, slopes(last.kinds.with_raised_fault_odds()))
     assert not np.allclose(last.arm.slopes, slopes(last.kinds))
 
 
@@ -399,7 +383,9 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
         field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
-    utility_input, _ = predict_readings_and_utilities(doubting, joined, joined.theta[:20], field, at=inside)
+    utility_input, _ = predict_readings_and_utilities(
+        doubting, joined, joined.theta[:20], field, at=inside, goal=doubting.goal
+    )
     missing = [
         replace(r, value=math.nan, pose=Pose(2 * x - r.pose.x_mm, 2 * y - r.pose.y_mm)) for r in on_edge
     ]  # on the far side, without a value
@@ -535,7 +521,7 @@ def test_rows_of_the_study_are_summed_up():
 
 def test_a_memory_of_the_noise_is_heard():
     """Errors that repeat each other are likelier under it, errors that do not under the plain noise."""
-    law, level = CorrelatedLikelihood(DeclaredNoise(1.0, 0.0)), np.full((1, 12), 35.0)
+    law, level = noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["correlated_noise"], np.full((1, 12), 35.0)
     alike, apart = 35.0 + np.full(12, 1.5), 35.0 + 1.5 * np.tile([1.0, -1.0, -1.0, 1.0], 3)
     plain = experiment_of(REFERENCE).likelihood
     gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (alike, apart)]
@@ -544,7 +530,7 @@ def test_a_memory_of_the_noise_is_heard():
 
 
 def test_readings_on_a_lattice_are_no_chance():
-    law, level = CoarserRoundingLikelihood(DeclaredNoise(1.0, 0.0)), np.full((1, 8), 35.0)
+    law, level = noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["quantisation"], np.full((1, 8), 35.0)
     level[0, 4:] = 12.0
     plain = experiment_of(REFERENCE).likelihood
     coarse = np.array([35.0, 35.0, 40.0, 30.0, 10.0, 15.0, 10.0, 10.0])
@@ -557,7 +543,7 @@ def test_readings_on_a_lattice_are_no_chance():
 def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
     """Before a shape is seen all is black: readings of 10.0 and 5.0 are no lost ones, and places without a shape."""
     readings, level = np.array(read), np.full((1, len(read)), 9.0)
-    rounded, lost = CoarserRoundingLikelihood(DeclaredNoise(1.0, 0.0)), laws(LostReadingLikelihood)[0]
+    rounded, lost = noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["quantisation"], laws("dropouts")[0]
     assert rounded.log_prob(readings, level)[0] > lost.log_prob(readings, level)[0] + 2.0
     shared = np.array([10.0, 9.31, 10.72, 8.4, 10.0])  # two were lost, the others were read
     level = np.full((1, 5), 9.6)
@@ -568,15 +554,15 @@ def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
 def test_values_that_recur_are_rounded_where_a_step_is_only_the_width_of_a_cell(read):
     """As `experiment_for` describes a sensor that declares no step."""
     readings, level = np.array(read), np.full((1, 5), 9.0)
-    cells, lost = Rounded(1.0, 1.0 / 8.0, whole_steps=False), laws(LostReadingLikelihood)[0]
-    noise = DeclaredNoise.from_likelihood(cells)
-    rounded = CoarserRoundingLikelihood(noise).log_prob(readings, level)[0]
+    cells = Rounded(1.0, 1.0 / 8.0, whole_steps=False)
+    of_cells = noise_likelihoods(DeclaredNoise.from_likelihood(cells), LEVELS)
+    rounded, lost = (of_cells[name].log_prob(readings, level)[0] for name in ("quantisation", "dropouts"))
     assert rounded > cells.log_prob(readings, level)[0] + 2.0
-    assert rounded > replace(lost, noise=noise).log_prob(readings, level)[0] + 2.0
+    assert rounded > lost + 2.0
 
 
 def test_readings_that_are_rounded_as_declared_recur_by_nature():
-    law, level = CoarserRoundingLikelihood(DeclaredNoise(0.6, 1.0)), np.full((1, 6), 10.2)
+    law, level = noise_likelihoods(DeclaredNoise(0.6, 1.0), LEVELS)["quantisation"], np.full((1, 6), 10.2)
     plain = Rounded(sd=0.6, step=1.0, low=1.0, high=100.0)
     for read in ([10.0] * 6, [10.0, 11.0, 10.0, 10.0, 11.0, 10.0]):
         assert law.log_prob(np.array(read), level)[0] == pytest.approx(
@@ -586,7 +572,7 @@ def test_readings_that_are_rounded_as_declared_recur_by_nature():
 
 def test_noise_that_grows_with_the_light_is_heard():
     law, level = (
-        SignalDependentLikelihood(DeclaredNoise(1.0, 0.0), 10.0, 60.0),
+        noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["signal_dependent_noise"],
         np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12),
     )
     read = level[0] + np.where(level[0] > 50, 4.0, 0.5) * np.tile([1.0, -1.0], 6)
@@ -595,17 +581,17 @@ def test_noise_that_grows_with_the_light_is_heard():
 
 
 def test_a_run_is_the_warier_the_less_it_could_end_wrong(stepped):
-    """To doubt ten times as readily multiplies the odds of every rival by ten and leaves evidences as they are."""
+    """Raised odds multiply those of every rival by twelve and leave evidences as they are."""
     kinds = stepped[-1].kinds
-    wary = kinds.with_fault_odds_times(10.0)
+    wary = kinds.with_raised_fault_odds()
     np.testing.assert_allclose([p.log_z for p in wary.particles], [p.log_z for p in kinds.particles])
     odds = [found.left_out["backlash"] / found.left_out[""] for found in (wary, kinds)]
-    assert odds[0] == pytest.approx(10.0 * odds[1])
+    assert odds[0] == pytest.approx(12.0 * odds[1])
 
 
 def test_readings_lost_to_exactly_black_are_no_chance():
     """Noise never repeats a value; three readings that are black to the last digit were lost."""
-    law = laws(LostReadingLikelihood)[0]
+    law = laws("dropouts")[0]
     level = np.array([[60.0, 10.0, 10.0, 10.0, 60.0]])
     plain = experiment_of(REFERENCE).likelihood
     exact, noisy = np.array([60.3, 10.0, 10.0, 10.0, 59.1]), np.array([60.3, 10.4, 9.2, 10.9, 59.1])
@@ -660,8 +646,7 @@ def test_a_mode_that_samples_and_fits_have_lost_is_found_by_a_search_from_scratc
     )
     plain = replace(start.particles[0], weighted=replace(start.particles[0].weighted, log_z=float(likelihood.mean())))
     now = replace(start, particles=(plain, lost))
-    solve = partial(nested_sampling_from_scratch, n_live=200, rng=rng)
-    found = with_rivals_sampled_again(now, recording, 600, rng=rng, from_scratch=solve).particles[1]
+    found = SequentialMonteCarlo(600, n_live=200).reconsidered(now, recording, rng=rng).particles[1]
     assert found.log_z > lost.log_z + 20.0
     # Nine of ten samples of a posterior of six parameters are less than 5.4 nats below its top (chi-square, 6 degrees).
     at_truth = problem.log_likelihood(true)[0]
@@ -703,10 +688,10 @@ def test_rivals_that_were_searched_before_are_not_searched_again(doubting, monke
     kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "backlash", "nonlinearity")]
     recording, rng = played(doubting, kinds[-1], 12.0), np.random.default_rng(1)
     now = prior_posterior(kinds, 3000, rng=rng)
-    solved = partial(nested_sampling_from_scratch, n_live=100, rng=rng)
+    method = SequentialMonteCarlo(3000, n_live=100)
     for n in range(1, len(recording) + 1):
-        now = updated(now, recording.take(np.arange(n)), 3000, rng=rng, from_scratch=solved)
-    once = with_rivals_sampled_again(now, recording, 3000, rng=rng, from_scratch=solved)
+        now = method.updated(now, recording.take(np.arange(n)), rng=rng)
+    once = method.reconsidered(now, recording, rng=rng)
     ruled_out = {kind: p for kind, p in zip(kinds, once.particles, strict=True) if math.isfinite(p.log_z_limit)}
     assert ruled_out
     assert all(p.log_z_limit >= p.log_z and p.limit_is_searched for p in ruled_out.values())
@@ -716,11 +701,12 @@ def test_rivals_that_were_searched_before_are_not_searched_again(doubting, monke
         assert kind not in ruled_out
         return fit_kind(kind, *args, **options)
 
-    def searched(problem, *, quick=False):
+    def searched(*_, **__):
         raise AssertionError("a search no reading after the last one")
 
-    monkeypatch.setattr(sampled_anew, "fit_kind", fitted)
-    with_rivals_sampled_again(once, recording, 3000, rng=rng, from_scratch=searched)
+    monkeypatch.setattr(reestimation, "fit_kind", fitted)
+    monkeypatch.setattr(reestimation, "nested_sampling_from_scratch", searched)
+    method.reconsidered(once, recording, rng=rng)
 
 
 def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch(doubting, monkeypatch):
@@ -730,18 +716,19 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
     now = prior_posterior(kinds, 3000, rng=rng)
     solved = []
 
-    def from_nothing(problem, *, quick=False):
+    def from_nothing(problem, **options):
         solved.append(problem)
-        return nested_sampling_from_scratch(problem, n_live=100, rng=rng)
+        return nested_sampling_from_scratch(problem, **options)
 
     def by_few(found, kind, problem, own, *, n_draws, with_own, rng):
         weighted = sampled_about_fits(found, kind, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
         return replace(weighted, n_eff=7.0)
 
-    monkeypatch.setattr(sampled_anew, "sampled_about_fits", by_few)
+    monkeypatch.setattr(reestimation, "sampled_about_fits", by_few)
+    monkeypatch.setattr(reestimation, "nested_sampling_from_scratch", from_nothing)
     plain, lost = (replace(p, weighted=replace(p.weighted, log_z=-1000.0)) for p in now.particles)
     now = replace(now, particles=(plain, lost))
-    found = with_rivals_sampled_again(now, recording, 3000, rng=rng, from_scratch=from_nothing)
+    found = SequentialMonteCarlo(3000, n_live=100).reconsidered(now, recording, rng=rng)
     assert len(solved) >= 1
     assert solved[0].prior.names == kinds[1].prior.names
     assert not found.particles[1].strained
@@ -807,9 +794,7 @@ def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
     now = prior_posterior(kinds, 3000, rng=rng)
     for k in range(1, len(read) + 1):
         recording = experiment.problem(read[:k]).recording
-        now = updated(
-            now, recording, 3000, rng=rng, from_scratch=partial(nested_sampling_from_scratch, n_live=100, rng=rng)
-        )
+        now = SequentialMonteCarlo(3000, n_live=100).updated(now, recording, rng=rng)
     assert now.left_out["ambient_step"] > 0.97
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.experiment import ArmReachAndTravel, explore, shadow_run
+from probewise.experiment import explore, shadow_run
 from probewise.inquiry import Grid
 
 COARSE = Grid(400.0, 300.0, 17, 13)
@@ -14,8 +14,7 @@ def steps_of(small, **options):
 
 
 def watched(small, other):
-    field = ArmReachAndTravel.from_instrument(small.arm(), COARSE)
-    return list(shadow_run(steps_of(small), other, field, rng=np.random.default_rng(2)))
+    return list(shadow_run(steps_of(small), other, small.arm(), rng=np.random.default_rng(2)))
 
 
 @pytest.mark.slow

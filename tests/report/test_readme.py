@@ -40,9 +40,9 @@ def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
     exec(compile(setup, "README.md", "exec"), again)
     rng = eval(rest.splitlines()[0], again)
     monkeypatch.setattr(loop, "_rng_of_reading", lambda seed, number: rng)
-    found = experiment.run(again["robot"], printed["asked"], rng=rng, max_readings=4)
+    steps = list(experiment.explore(again["robot"], printed["asked"], rng=rng, max_readings=4))
     taken = [(r.pose, r.value) for r in printed["state"].readings]
-    assert [(r.pose, r.value) for r in found.readings] == taken[:4]
+    assert [(s.reading.pose, s.reading.value) for s in steps] == taken[:4]
     last = printed["info"]
     assert printed["asked"].may_stop(last.sd, last.shapes)
     assert abs((last.mean - [600.0, 260.0, 90.0]) / last.sd).max() < 4

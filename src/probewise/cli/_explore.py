@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probewise import experiment as posing
 from probewise._progress import progress_shown
 from probewise.calibration import FittedSensor, read_sensor
 from probewise.cli._arm import ArmName, parse_arm, read_or_shipped_geometry
@@ -31,7 +30,30 @@ from probewise.cli._common import message_to_resume, parse_numbers, print_result
 from probewise.cli._output import Drawings, StagedFiles, checked_output_directory, tables_and_descriptions
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, ParameterError, did_you_mean
-from probewise.experiment import Exploration, HiddenShape
+from probewise.experiment import (
+    CLEAN,
+    Exploration,
+    FittedArm,
+    HiddenShape,
+    RandomStreams,
+    arm_over,
+    as_shape,
+    experiment_for,
+    geometry_entry,
+    left_out_after_step,
+    naive_levels_from_recording,
+    naive_levels_from_world,
+    read_journal,
+    repaired_sensor,
+    result_json,
+    samples_csv,
+    scale_of,
+    sensor_entry,
+    shadow_run,
+    with_cards,
+    world_like,
+)
+from probewise.experiment import explore as explore_step_by_step
 from probewise.recordings import read_recording, write_bytes_atomically
 from probewise.report import exploration as report
 from probewise.report.pictures import animated_gif
@@ -40,7 +62,7 @@ from probewise.scene import SHAPES, Card, Field
 if TYPE_CHECKING:
     from probewise._arrays import FloatArray
     from probewise.arm import Geometry, Instrument, Reading
-    from probewise.experiment import Experiment, Journal, Model, RandomStreams, Step
+    from probewise.experiment import Experiment, Journal, Model, Step
     from probewise.inference import Naive
     from probewise.progress import Progress
 
@@ -80,8 +102,8 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
     sensor = read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
-    streams = posing.RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
-    shape = posing.shape_named(arguments.shape, field)
+    streams = RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
+    shape = as_shape(arguments.shape, field)
     _refuse_settings_that_the_arm_lacks(arguments, geometry)
     cards = parse_cards(arguments.reference, field)
     if cards and (arguments.both_models or arguments.model == "naive" or arguments.method == "paper"):
@@ -89,7 +111,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
         raise ParameterError("--reference", arguments.reference[0], allowed)
     levels = _naive_levels(arguments, chosen, sensor, rng=streams.levels)
     pose = partial(
-        posing.experiment_from_names,
+        experiment_for,
         sensor,
         shape,
         field,
@@ -109,7 +131,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
         trust=arguments.trust,
     )
     if chosen.may_differ_from_geometry and geometry is not None and geometry.accuracy is not None:
-        fitted_arm = posing.FittedArm.from_geometry_and_sensor(geometry, sensor)
+        fitted_arm = FittedArm.from_geometry_and_sensor(geometry, sensor)
         experiment = dataclasses.replace(experiment, fitted_arm=fitted_arm)
     other: Experiment | None = None
     other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
@@ -211,13 +233,13 @@ def _naive_levels(
     if arguments.levels is not None:
         if not wanted:
             raise ParameterError("--levels", str(arguments.levels), "only with --method paper and --model naive")
-        return posing.naive_levels_from_recording(read_recording(arguments.levels), sensor)
+        return naive_levels_from_recording(read_recording(arguments.levels), sensor)
     if not wanted:
         return None
     if chosen.is_real:
         allowed = "a recording of readings over a black and a white sheet, for the naive model of the paper"
         raise ParameterError("--levels", "none", allowed)
-    return posing.naive_levels_from_world(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
+    return naive_levels_from_world(world_like(sensor), scale_of(sensor.instrumentation), rng=rng)
 
 
 @dataclass(frozen=True)
@@ -245,15 +267,15 @@ def _open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tu
             raise ParameterError("--truth", arguments.truth, "none with a real arm, whose target is unknown")
         return ArmAndTruth(open_real_arm(chosen, geometry, start_s=start_s))
     hidden = parse_truth(arguments.truth, arguments.shape, inputs.field, rng=inputs.streams.truth)
-    world, surface = posing.world_like(inputs.sensor), posing.with_cards(hidden.surface, inputs.cards)
+    world, surface = world_like(inputs.sensor), with_cards(hidden.surface, inputs.cards)
     arm: Instrument
     if chosen.is_lego and geometry is not None:
         seed = inputs.streams.noise + len(taken)  # a resumed run draws no noise a second time
         built = chosen.true_geometry_file(arguments.geometry)
         arm, _ = open_emulated_arm_and_bench(geometry, built, world, surface, seed=seed, start_s=start_s)
     else:
-        scale, noise = posing.scale_of(inputs.sensor.instrumentation), inputs.streams.noise
-        arm = posing.arm_over(world, surface, inputs.field, seed=noise, taken=taken, workspace=geometry, scale=scale)
+        scale, noise = scale_of(inputs.sensor.instrumentation), inputs.streams.noise
+        arm = arm_over(world, surface, inputs.field, seed=noise, taken=taken, workspace=geometry, scale=scale)
     known = hidden.parameters_by_hypothesis_name(inputs.experiment.names)
     return ArmAndTruth(arm, hidden.outline_mm, known, {"hidden": hidden.journal_entry})
 
@@ -323,9 +345,9 @@ class Pictures:
         """
 
         def write_files(stage: StagedFiles) -> None:
-            stage.write("result.json", posing.result_json(result))
-            stage.write("samples.csv", posing.samples_csv(result))
-            learnt = posing.repaired_sensor(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
+            stage.write("result.json", result_json(result))
+            stage.write("samples.csv", samples_csv(result))
+            learnt = repaired_sensor(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
             stage.write("sensor.json", learnt.to_json())
 
         beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
@@ -375,7 +397,7 @@ def explore(arguments: argparse.Namespace) -> int:
     def kept_message() -> str:
         if not journal.exists():
             return "nothing was read"
-        n_read = len(posing.read_journal(journal).entries)
+        n_read = len(read_journal(journal).entries)
         return message_to_resume(journal, n_read, "reading", arguments, "--resume")
 
     def report_activity(doing: str) -> None:
@@ -391,15 +413,15 @@ def explore(arguments: argparse.Namespace) -> int:
             lambda reading: report_activity(f"thinking about {reading.value:g}"),
         ) as reporting,
         closing(
-            posing.explore(
+            explore_step_by_step(
                 reporting,
                 inputs.experiment,
                 rng=inputs.streams.run,
                 max_readings=arguments.max_readings,
                 journal=before or journal,
                 about={
-                    **posing.sensor_entry(inputs.sensor, _path_relative_to_folder(out, arguments.sensor)),
-                    **posing.geometry_entry(inputs.geometry),
+                    **sensor_entry(inputs.sensor, _path_relative_to_folder(out, arguments.sensor)),
+                    **geometry_entry(inputs.geometry),
                     **site.about,
                     "arm": arguments.arm.partition(":")[0],
                 },
@@ -412,8 +434,7 @@ def explore(arguments: argparse.Namespace) -> int:
             report_activity("choosing its place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in run)
         if inputs.other is not None:
-            under = posing.ArmReachAndTravel.from_instrument(site.arm, inputs.other.grid)
-            pairs = posing.shadow_run(run, inputs.other, under, rng=inputs.streams.shadow)
+            pairs = shadow_run(run, inputs.other, site.arm, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.draw_and_write(step, shadow)
             if step.replayed:
@@ -431,10 +452,10 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journ
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry and inputs.geometry.accuracy is None:
         yield "arm          nobody has fitted its geometry: its own error is not in these sds"
     trust = inputs.experiment.trust
-    missing = posing.left_out_after_step(result.last, trust)
+    missing = left_out_after_step(result.last, trust)
     if trust < 1:
         yield missing.sentence
-    if missing.leading != posing.CLEAN:
+    if missing.leading != CLEAN:
         yield f"what the readings say of the sensor: probewise diagnose {journal} --out DIAGNOSIS"
     if site.known is not None:
         yield f"error        {report.errors_text(result, site.known)}"
@@ -455,4 +476,4 @@ def _journal_to_resume(journal: Path, *, resume: bool) -> Journal | None:
         return None
     if not resume:
         raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
-    return posing.read_journal(journal)
+    return read_journal(journal)

@@ -101,7 +101,7 @@ def _hypothesised_shape(path: Path, settings: Mapping[str, Any]) -> Shape:
 
     Raises FileError unless it is a shape that `explore` offers, or a set of these.
     """
-    from probewise.experiment import shape_named
+    from probewise.experiment import as_shape
     from probewise.scene import SHAPES, Field
 
     allowed = f"shapes as explore has them: {', '.join(SHAPES)}"
@@ -112,7 +112,7 @@ def _hypothesised_shape(path: Path, settings: Mapping[str, Any]) -> Shape:
         raise FileError(path, f"unusable settings: {_missing_key_or_error_text(error)}", allowed, row=1) from error
     for n in range(1, len(SHAPES) + 1):
         for names in itertools.permutations(SHAPES, n):
-            shape: Shape = shape_named(names, field)
+            shape = as_shape(names, field)
             if repr(shape) == written:
                 return shape
     raise FileError(path, f"shape {written}", allowed, row=1, column="shape")

@@ -255,7 +255,7 @@ def search(
 
     import numpy as np
 
-    from probewise.experiment import arm_over, experiment_for, run, run_from_place, surface_of
+    from probewise.experiment import Exploration, HiddenShape, arm_over, experiment_for, explore, run_from_place
     from probewise.report.demo import SATURATION
     from probewise.scene import Field
     from probewise.world import Saturation
@@ -264,11 +264,13 @@ def search(
     field, world = Field(), world_behind("paper")
     if saturating:
         world = replace(world, concealed=(Saturation(SATURATION),))
+    options = {"trust": 1.0, **options}
     experiment = experiment_for(sensor, hypothesised_circle(), field, n_live=N_LIVE_ROBOT, **options)
     rng = np.random.default_rng([seed, stream])
-    with arm_over(world, surface_of("circle", np.array(truth), field), field, seed=seed) as arm:
+    surface = HiddenShape("circle", hypothesised_circle(), np.array(truth)).surface
+    with arm_over(world, surface, field, seed=seed) as arm:
         if not on_circle:
-            return run(arm, experiment, rng=rng, max_readings=max_readings)
+            return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=max_readings)))
         first = random_pose_within_circle(truth, seed)
         return run_from_place(first, arm, experiment, rng=rng, max_readings=max_readings)
 

@@ -12,7 +12,7 @@ known, minus the identity matrix (Stein), so that the samples only estimate the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,52 +20,61 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.arm.geometry import FITTED, Accuracy, Geometry, place_jacobian
 from probewise.arm.instrument import Reading
 from probewise.errors import ParameterError
-from probewise.experiment.configuration import Experiment
-from probewise.experiment.fitted_arm import FittedArm
-from probewise.experiment.kinds import HypothesisKind
-from probewise.experiment.posterior import Posterior
-from probewise.experiment.state import ArmError
+from probewise.experiment.kinds import HypothesisKind, Posterior
+from probewise.experiment.setup import Experiment
 from probewise.inference.problem import checked_log_prob
-from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
 from probewise.scene.any_of import AnyOf, shape_and_columns
 from probewise.scene.symmetry import with_angles_near
 
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
 _STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are
-_LEAST = 1e-3  # probability of a kind of hypotheses that is asked
+_LEAST = 1e-3  # probability from which on a kind of hypotheses counts
+
+
+@dataclass(frozen=True, eq=False)
+class ArmError:
+    """Effect of an error in the arm's geometry, common to all readings, on the posterior of the shape.
+
+    Attributes
+    ----------
+    slopes
+        Shift of the posterior mean by each independent error of one sd, (n_params, n_errors).
+    shifts
+        Shift of each posterior sample by an error of the arm drawn for it, (n_samples, n_params).
+    """
+
+    slopes: FloatArray
+    shifts: FloatArray
+
+    @property
+    def sd(self) -> FloatArray:
+        """Sd of the shape's parameters that comes from the arm, (n_params,)."""
+        return np.asarray(np.sqrt((self.slopes**2).sum(axis=1)))
 
 
 def arm_error_in_posterior(
     experiment: Experiment,
-    arm: FittedArm,
     readings: Sequence[Reading],
-    posterior: Weighted,
+    theta: FloatArray,
     kinds: Posterior,
     *,
     mean: FloatArray,
     sd: FloatArray,
     likely_shape: str,
     rng: np.random.Generator,
-) -> ArmError:
+) -> ArmError | None:
     """Compute by how much the error of the arm's geometry moves and widens the posterior of the shape.
 
-    Parameters
-    ----------
-    experiment, arm, readings
-        The experiment, the arm, the readings so far.
-    posterior, kinds
-        The posterior given the readings: the samples of all kinds joined, and kind by kind with the same probabilities.
-    mean, sd, likely_shape
-        Mean and sd of the shape's parameters, (n_params,) each, and the name of the most probable shape, see `Step`.
-    rng
-        Random generator of the errors, one drawn for each posterior sample.
+    `theta` (n_samples, n_params) are samples of the shape given the readings, `kinds` the same posterior kind by kind;
+    `mean`, `sd` (n_params,) and `likely_shape` are as in `Step`; `rng` draws one error for each sample.
 
-    Raises
-    ------
-    ParameterError
-        If the arm does not reach a place of a reading.
+    Return the effect, or None if the arm's error is not known. ParameterError if the arm does not reach a place of a
+    reading.
     """
+    arm = experiment.fitted_arm
+    if arm is None:
+        return None
     geometry, accuracy = arm.geometry, arm.geometry.accuracy
     assert accuracy is not None
     recording = experiment.problem(readings).recording
@@ -82,7 +91,6 @@ def arm_error_in_posterior(
     slopes = _posterior_mean_shifts(
         experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape
     )
-    theta = posterior.theta[:, experiment.shape_columns]
     return ArmError(slopes, draw_shape_shifts_from_arm_error(experiment, slopes, theta, likely_shape, rng=rng))
 
 
@@ -150,17 +158,12 @@ def _posterior_mean_shifts(
         by_shape.append(_log_likelihood_slopes_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
-    theta, slope, known = (_minus_weighted_mean(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
+    theta, slope, known = (each - weight @ each for each in map(np.concatenate, (thetas, by_error, by_shape)))
     root = np.sqrt(weight)[:, None]
     coefficients = np.linalg.lstsq(root * known, root * slope, rcond=None)[0]
     out = np.zeros((len(mean), off.shape[2]))
     out[columns] = (theta * weight[:, None]).T @ (slope - known @ coefficients) - coefficients
     return out
-
-
-def _minus_weighted_mean(columns: FloatArray, weight: FloatArray) -> FloatArray:
-    """Subtract its weighted mean from each column, (n_samples, n_columns); weights (n_samples,) sum to one."""
-    return columns - weight @ columns
 
 
 def _log_likelihood_slopes_by_shape(

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
@@ -28,7 +30,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
 from probewise.arm.instrument import Pose, Reading
-from probewise.errors import FileError, shown
+from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.atomic import write_and_sync, write_text_atomically
 from probewise.recordings.locking import hold_lock
 from probewise.recordings.patterns import Pattern
@@ -98,44 +100,29 @@ def recording_of(
     instrumentation: Instrumentation | None = None,
     source: str = "",
 ) -> Recording:
-    """Convert readings to a recording: one scan, over the pattern "field".
+    """Convert readings, in order of time, to a recording of one scan over the pattern "field".
 
-    Parameters
-    ----------
-    readings
-        Readings in order of time.
-    patterns
-        The pattern on the field, {"field": ...}, if known; otherwise hypotheses take its place.
-    instrumentation
-        Instrument, with unit and range.
-    source
-        Source of the readings, for messages.
-
-    Returns
-    -------
-    A recording of n_points = len(readings) rows; a covariate that some readings lack is NaN there. The height of a pose
-    is the covariate `height_mm`, unless the reading has its own.
+    The height of a pose is the covariate `height_mm`, unless the reading has its own; a covariate that some readings
+    lack is NaN there. `patterns` is the pattern on the field, {"field": ...}, if known; otherwise hypotheses take its
+    place. `source` names the readings in messages.
     """
-    n = len(readings)
     covariates = [covariates_with_height(reading) for reading in readings]
     names = sorted({name for known in covariates for name in known})
-    zeros = np.zeros(n, dtype=np.int64)
+    zeros = np.zeros(len(readings), dtype=np.int64)
     plan = Plan(
-        x_mm=_value_per_reading(readings, lambda r: r.pose.x_mm),
-        y_mm=_value_per_reading(readings, lambda r: r.pose.y_mm),
-        orientation_rad=_value_per_reading(readings, lambda r: r.pose.orientation_rad),
-        time_s=_value_per_reading(readings, lambda r: r.time_s),
+        x_mm=_column([reading.pose.x_mm for reading in readings]),
+        y_mm=_column([reading.pose.y_mm for reading in readings]),
+        orientation_rad=_column([reading.pose.orientation_rad for reading in readings]),
+        time_s=_column([reading.time_s for reading in readings]),
         scan=zeros,
         scan_names=(PATTERN,),
         pattern=zeros,
         pattern_names=(PATTERN,),
         patterns={} if patterns is None else patterns,
-        covariates={
-            name: np.array([known.get(name, math.nan) for known in covariates], dtype=np.float64) for name in names
-        },
+        covariates={name: _column([known.get(name, math.nan) for known in covariates]) for name in names},
         instrumentation=Instrumentation() if instrumentation is None else instrumentation,
     )
-    return Recording(plan, _value_per_reading(readings, lambda r: r.value), source)
+    return Recording(plan, _column([reading.value for reading in readings]), source)
 
 
 def covariates_with_height(reading: Reading) -> Mapping[str, float]:
@@ -144,9 +131,8 @@ def covariates_with_height(reading: Reading) -> Mapping[str, float]:
     return reading.covariates if height_mm is None else {"height_mm": height_mm, **reading.covariates}
 
 
-def _value_per_reading(readings: Sequence[Reading], value: Any) -> FloatArray:
-    """Collect what the function `value` returns for each reading, (n_points,)."""
-    return np.array([value(reading) for reading in readings], dtype=np.float64)
+def _column(values: list[float]) -> FloatArray:
+    return np.array(values, dtype=np.float64)
 
 
 def read_journal(path: str | Path) -> Journal:
@@ -391,3 +377,45 @@ class JournalWriter:
 
 def _error_of_existing_file(path: Path) -> FileError:
     return FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")
+
+
+def value_digest(value: object) -> str:
+    """Digest a value built of dataclasses, arrays, mappings, sequences, numbers and texts (sha256, hex).
+
+    Two values have the same digest when their types, their fields and every bit of their numbers are the same, in
+    whatever process; a list counts as a tuple. ParameterError if the value holds anything else, such as a function,
+    which has no reproducible digest.
+    """
+    digest = hashlib.sha256()
+    _add_to_digest(digest, value)
+    return digest.hexdigest()
+
+
+def _add_to_digest(digest: Any, value: object) -> None:
+    """Add types, names of fields and bits of a value to a digest."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"<{type(value).__qualname__}>".encode())
+        for item in dataclasses.fields(value):
+            digest.update(item.name.encode())
+            _add_to_digest(digest, getattr(value, item.name))
+    elif isinstance(value, np.ndarray):
+        digest.update(f"[{value.dtype.str}{value.shape}]".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, Enum):
+        digest.update(f"<{value}>".encode())
+    elif value is None or isinstance(value, (bool, int, float, str, np.generic)):
+        plain = value.item() if isinstance(value, np.generic) else value
+        digest.update(f"{type(plain).__name__}:{plain!r};".encode())
+    elif isinstance(value, Mapping):
+        digest.update(f"{{{len(value)}".encode())
+        for key in sorted(value, key=str):
+            _add_to_digest(digest, key)
+            _add_to_digest(digest, value[key])
+    elif isinstance(value, Sequence):
+        digest.update(f"({len(value)}".encode())
+        for item in value:
+            _add_to_digest(digest, item)
+    else:
+        raise ParameterError(
+            "fingerprint of", value, "frozen dataclasses of arrays, numbers and texts, so that a journal can name them"
+        )

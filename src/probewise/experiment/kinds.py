@@ -1,4 +1,8 @@
-"""The kinds of hypotheses that a run compares: a shape, with an effect that the sensor model leaves out or none."""
+"""The kinds of hypotheses that a run compares, and the posterior: a mixture of kinds, each with samples and evidence.
+
+A kind is a shape, with an effect that the sensor model leaves out or none. Its probability is proportional to its prior
+times its evidence. Improbable kinds are kept with fewer samples, so that later readings can revive them.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +12,32 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Estimated
 from probewise.errors import ParameterError
-from probewise.experiment.pace import DescribedEffect
-from probewise.experiment.rivals import SensorModelRival
+from probewise.experiment.rivals import DescribedEffect, SensorModelRival
+from probewise.experiment.smc import Particles, prior_particles
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import TabulatedChain
+from probewise.nested import Weighted
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene.albedo import Shape
 from probewise.scene.any_of import AnyOf
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
+
+IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
+_FEWER = 3  # times
+SUSPECTED = ((0.2, 2), (0.02, 4), (0.0, 6))  # probability from which on a rival has which fraction of the samples
+_LEAST_SAMPLES = 100
+
+FAULT_ODDS_FACTOR = 12.0
+"""Factor on the odds that the sensor model is incomplete, wherever something is concluded: choice of readings, stopping
+rule, reported shape and its error, credible set. By the plain odds a fault that a dozen readings can hardly show would
+be right one time in ten, and whatever is concluded of a run that has it would miss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,81 +90,29 @@ def kinds_of(
 ) -> tuple[HypothesisKind, ...]:
     """Return the kinds of hypotheses of an experiment: for every shape, the sensor model alone and with each rival.
 
-    Parameters
-    ----------
-    shape
-        The possible shape; each shape of a set has kinds of its own.
-    sensor_prior
-        Prior of the sensor's parameters, which come before the shape's in every kind; None: the sensor is known.
-    prior, likelihood
-        Prior and likelihood of all parameters of the experiment.
-    models
-        The sensor model, from tables where possible, for kinds without effects; the chain to which effects are added.
-    trust
-        Prior probability that the sensor model is complete, below 1 if there are rivals, which share the rest equally.
-        Below 1, the kinds without a rival also infer the effects that a repair of the sensor estimated.
-    rivals
-        Effects that the sensor model may leave out, and other likelihoods; those of one name share one probability.
-
-    Raises
-    ------
-    ParameterError
-        If an effect is to be added to a sensor model that is no `Chain`.
+    `prior` and `likelihood` are those of all parameters, of which those of `sensor_prior` (None: the sensor is known)
+    come first. `models` are the sensor model, from tables where possible, and the chain to which effects are added;
+    ParameterError if that is no `Chain`. `trust` is the prior probability that the sensor model is complete; the names
+    of the rivals share the rest equally. Below 1, the kinds without a rival also infer the effects that a repair of the
+    sensor estimated.
     """
     quick, chain = models
     ways = Counter(rival.name for rival in rivals)
     kinds = []
     for part in _member_shapes(shape, sensor_prior, prior):
-        own, log_prior = part.prior, math.log(part.share)
-        plain = log_prior + math.log(trust)
-        whole, model = _prior_and_model_with_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
-        kinds.append(
-            HypothesisKind(
-                part.label,
-                "",
-                log_prior=plain,
-                prior=whole,
-                model=part.restrict_model(model),
-                likelihood=likelihood,
-                to_whole_theta=part.to_whole_theta,
-                whole_names=prior.names,
-            )
-        )
+        whole = _prior_and_model_with_estimated_effects(part.prior, chain, quick) if trust < 1 else (part.prior, quick)
+        kinds.append(part.kind("", trust, *whole, likelihood))
         for rival in rivals:
-            log_p = log_prior + math.log((1.0 - trust) / (len(ways) * ways[rival.name]))
+            share = (1.0 - trust) / (len(ways) * ways[rival.name])
             if rival.effect is None:
-                model, law = part.restrict_model(quick), rival.likelihood or likelihood
-                kinds.append(
-                    HypothesisKind(
-                        part.label,
-                        rival.name,
-                        log_prior=log_p,
-                        prior=own,
-                        model=model,
-                        likelihood=law,
-                        to_whole_theta=part.to_whole_theta,
-                        whole_names=prior.names,
-                    )
-                )
+                kinds.append(part.kind(rival.name, share, part.prior, quick, rival.likelihood or likelihood))
                 continue
             if not isinstance(chain, Chain):
                 raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
-            both = Joint((own, _PrefixedPrior(rival.name, rival.effect.prior)))
+            both = Joint((part.prior, _PrefixedPrior(rival.name, rival.effect.prior)))
             acting = chain.with_effects(rival.effect)
-            model = part.restrict_model(TabulatedChain.of(acting, quick) or acting)
-            kinds.append(
-                HypothesisKind(
-                    part.label,
-                    rival.name,
-                    log_prior=log_p,
-                    prior=both,
-                    model=model,
-                    likelihood=likelihood,
-                    to_whole_theta=part.to_whole_theta,
-                    whole_names=prior.names,
-                    effect=rival.effect,
-                )
-            )
+            model = TabulatedChain.of(acting, quick) or acting
+            kinds.append(part.kind(rival.name, share, both, model, likelihood, rival.effect))
     return tuple(kinds)
 
 
@@ -182,6 +146,28 @@ class _MemberShape:
     number: int | None
     n_sensor: int
 
+    def kind(
+        self,
+        left_out: str,
+        probability: float,
+        prior: Prior,
+        model: SensorModel,
+        likelihood: Likelihood,
+        effect: DescribedEffect | None = None,
+    ) -> HypothesisKind:
+        """Return a kind of this shape with a prior probability given the shape, and a model of all parameters."""
+        return HypothesisKind(
+            self.label,
+            left_out,
+            log_prior=math.log(self.share) + math.log(probability),
+            prior=prior,
+            model=self.restrict_model(model),
+            likelihood=likelihood,
+            to_whole_theta=self.to_whole_theta,
+            whole_names=self.whole.names,
+            effect=effect,
+        )
+
     def to_whole_theta(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return the experiment's parameters for own ones, (n, n_own); draw those missing, drop the effect's."""
         if self.number is None:
@@ -207,19 +193,13 @@ class _MemberShape:
 def _member_shapes(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_MemberShape]:
     """Return the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
     if not isinstance(shape, AnyOf):
-        return [
-            _MemberShape(
-                "", 1.0, prior=prior, whole=prior, columns=np.arange(len(prior.names)), number=None, n_sensor=0
-            )
-        ]
+        return [_MemberShape("", 1.0, prior, prior, np.arange(len(prior.names)), number=None, n_sensor=0)]
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
     parts = []
     for k, (name, member) in enumerate(shape.shapes.items()):
         columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns_by_shape[k]])
         own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
-        parts.append(
-            _MemberShape(name, shape.weights[k], prior=own, whole=prior, columns=columns, number=k, n_sensor=n_sensor)
-        )
+        parts.append(_MemberShape(name, shape.weights[k], own, prior, columns, number=k, n_sensor=n_sensor))
     return parts
 
 
@@ -257,3 +237,94 @@ class _PrefixedPrior:
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         return self.own.log_prob(theta)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The kinds of hypotheses and, in the same order, their weighted samples with the evidence."""
+
+    kinds: tuple[HypothesisKind, ...]
+    particles: tuple[Particles, ...]
+
+    @property
+    def log_odds(self) -> FloatArray:
+        """Log of prior times evidence of each kind, (n_kinds,)."""
+        return np.array([k.log_prior + p.log_z for k, p in zip(self.kinds, self.particles, strict=True)])
+
+    @property
+    def probability(self) -> FloatArray:
+        """Probability of each kind, (n_kinds,), summing to one."""
+        log_odds = self.log_odds
+        share = np.exp(log_odds - log_odds.max())
+        return np.asarray(share / share.sum())
+
+    @property
+    def log_z(self) -> float:
+        """Natural log of the evidence of the mixture."""
+        return float(logsumexp(self.log_odds))
+
+    @property
+    def left_out(self) -> dict[str, float]:
+        """Probability of each effect that the sensor may leave out, marginalised over shapes; "" is none."""
+        shares: dict[str, float] = {}
+        for kind, p in zip(self.kinds, self.probability.tolist(), strict=True):
+            shares[kind.left_out] = shares.get(kind.left_out, 0.0) + p
+        return shares
+
+    @property
+    def doubts_sensor(self) -> bool:
+        """Whether some kind has an effect that the sensor model leaves out."""
+        return any(kind.left_out for kind in self.kinds)
+
+    @property
+    def most_probable_kind_index(self) -> int:
+        """Index of the most probable kind."""
+        return int(self.log_odds.argmax())
+
+    def with_raised_fault_odds(self) -> Posterior:
+        """Return the posterior with the odds of a left-out effect multiplied by `FAULT_ODDS_FACTOR`."""
+        if not self.doubts_sensor:
+            return self
+        raised = math.log(FAULT_ODDS_FACTOR)
+        log_prior = np.array([k.log_prior + (raised if k.left_out else 0.0) for k in self.kinds])
+        log_prior -= logsumexp(log_prior)
+        kinds = tuple(replace(k, log_prior=p) for k, p in zip(self.kinds, log_prior.tolist(), strict=True))
+        return replace(self, kinds=kinds)
+
+    def joined(self, *, rng: np.random.Generator) -> Weighted:
+        """Return the samples of all kinds as one weighted posterior; parameters that a kind lacks are drawn."""
+        if len(self.kinds) == 1:
+            return self.particles[0].weighted
+        probability = self.probability
+        some = [k for k, p in enumerate(probability) if p > 0]
+        own = [self.particles[k].weighted for k in some]
+        theta = np.concatenate([self.kinds[k].to_whole_theta(w.theta, rng) for k, w in zip(some, own, strict=True)])
+        log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, own, strict=True)])
+        weight = np.exp(log_weight)
+        errors = np.array([self.particles[k].log_z_error for k in some])
+        return Weighted(
+            self.kinds[0].whole_names,
+            theta,
+            log_likelihood=np.concatenate([w.log_likelihood for w in own]),
+            log_weight=log_weight,
+            log_z=self.log_z,
+            log_z_error=float(np.sqrt(probability[some] ** 2 @ errors**2)),
+            n_eff=float(weight.sum() ** 2 / (weight @ weight)),
+            n_calls=sum(p.weighted.n_calls for p in self.particles),
+            pareto_k=max(w.pareto_k for w in own),
+            run=self.particles[self.most_probable_kind_index].weighted.run,
+        )
+
+
+def prior_posterior(kinds: Sequence[HypothesisKind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
+    """Return the posterior without readings: samples of every kind's prior, fewer for improbable kinds and rivals."""
+    sizes = [n_samples_of_kind(kind, math.exp(kind.log_prior), n_particles) for kind in kinds]
+    drawn = (prior_particles(kind.prior, n, rng=rng) for kind, n in zip(kinds, sizes, strict=True))
+    return Posterior(tuple(kinds), tuple(drawn))
+
+
+def n_samples_of_kind(kind: HypothesisKind, probability: float, n_particles: int) -> int:
+    """Return the number of samples of a kind: fewer if improbable; for rivals at most half, but 100 or more."""
+    if kind.left_out:
+        return max(n_particles // next(part for least, part in SUSPECTED if probability >= least), _LEAST_SAMPLES)
+    return n_particles if probability >= IMPROBABLE else n_particles // _FEWER

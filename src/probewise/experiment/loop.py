@@ -1,84 +1,93 @@
-"""The loop of a run: measure, infer, inquire, until the target precision is reached (paper, machine learning system).
+"""The loop of a run: measure, infer, judge, inquire, until the target precision is reached (paper, section 2).
 
 `step` processes one reading; `explore` is the loop around it, a generator, so that the command line, notebooks and
-reports see the same steps; `run` collects them.
+reports see the same steps. `run_from_place` and `shadow_run` are the same loop from a given first place, and on the
+readings of another run.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import math
 import warnings
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from probewise._arrays import own_arithmetic
-from probewise._kinds import checked_path, checked_whole, require_callable, require_kind, require_rng
-from probewise.arm.instrument import Instrument, Reading
+from probewise._arrays import FloatArray, own_arithmetic
+from probewise._kinds import checked_path, checked_whole, require_kind, require_rng
+from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.own import Measures, as_instrument, require_measures
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
-from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_readings_and_utilities
-from probewise.experiment.aligned_angles import with_aligned_angles
-from probewise.experiment.arm_abilities import require_turns_and_lifts
-from probewise.experiment.arm_error import arm_error_in_posterior, draw_shape_shifts_from_arm_error
-from probewise.experiment.configuration import Experiment, largest_sd_mm
-from probewise.experiment.hidden import HiddenShape
+from probewise.experiment.inquire import (
+    ArmReachAndTravel,
+    inquire,
+    must_continue,
+    next_poses,
+    predict_readings_and_utilities,
+)
 from probewise.experiment.journal import (
     Journal,
     JournalWriter,
     PosteriorSummary,
+    covariates_with_height,
     read_journal,
     require_same_settings,
 )
-from probewise.experiment.missing_readings import MOST_MISSING, n_missing_at_end
-from probewise.experiment.pace import Pace
-from probewise.experiment.posterior import Posterior, prior_posterior
-from probewise.experiment.reading_height import doubt_about_height, height_of_reading_mm
-from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
-from probewise.experiment.stopping_rule import (
-    OFF_SDS,
-    doubt_message,
+from probewise.experiment.kinds import Posterior, prior_posterior
+from probewise.experiment.result import Exploration, Step
+from probewise.experiment.rivals import Pace
+from probewise.experiment.setup import Experiment
+from probewise.experiment.stopping import (
+    MOST_MISSING,
     information_nats,
-    p_value_and_worst_reading,
-    probability_of_length_off,
+    judge,
+    may_stop_and_chance_off,
+    n_missing_at_end,
     sensor_moments,
-    shape_moments_and_probabilities,
     stop_reason,
+    with_aligned_angles,
+    with_arm_error,
 )
-from probewise.experiment.utility_near_end import utility_map_and_must_continue
-from probewise.inquiry import Goal, bits_gained, prior_entropy
+from probewise.inquiry import bits_gained, prior_entropy
 from probewise.nested import Weighted
+from probewise.recordings.plan import Recording
 from probewise.sensor.commanded import require_possible_commands
+
+_MOST_OFF = 0.01  # share of the calibrated height, which changes the signal by 2 %
+
+
+@dataclass(frozen=True, eq=False)
+class ExplorationState:
+    """The current state of a run.
+
+    `readings` so far, the `posterior` given them, the next pose, and the poses `planned` after it in a batch; the reach
+    of the arm, and the differential entropy of the prior in bits.
+    """
+
+    readings: tuple[Reading, ...]
+    posterior: Posterior
+    next_pose: Pose
+    planned: tuple[Pose, ...]
+    field: ArmReachAndTravel
+    prior_bits: float
 
 
 @own_arithmetic
-def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Generator) -> ExplorationState:
+def begin(experiment: Experiment, instrument: Instrument, *, rng: np.random.Generator) -> ExplorationState:
     """Return the state before the first reading: draws from the prior, and the pose with the largest utility.
 
-    Parameters
-    ----------
-    experiment
-        The experiment.
-    field
-        Reach of the arm, and travel times.
-    rng
-        Source of randomness.
-
-    Raises
-    ------
-    ReachError
-        If no place is reachable.
-    ParameterError
-        If the prior has no mass, or no place is more informative than others.
+    ReachError if the instrument, already entered, reaches no place; ParameterError if the prior has no mass, or no
+    place is more informative than others.
     """
+    field = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
+    prior_bits = prior_entropy(experiment.prior, rng=rng)
     posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
     joined = posterior.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
-    utility_input, utilities = predict_readings_and_utilities(experiment, joined, drawn, field, at=None)
+    given, utilities = predict_readings_and_utilities(experiment, joined, drawn, field, at=None, goal=experiment.goal)
     if utilities.is_flat:
         raise ParameterError(
             "utility",
@@ -86,8 +95,8 @@ def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Ge
             "one that differs between places: as it is, no reading within reach is expected to tell anything; "
             "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
         )
-    pose, *planned = next_poses(experiment, utility_input, utilities, rng=rng)
-    return ExplorationState((), posterior, pose, tuple(planned))
+    pose, *planned = next_poses(experiment, given, utilities, rng=rng)
+    return ExplorationState((), posterior, pose, tuple(planned), field, prior_bits)
 
 
 @own_arithmetic
@@ -95,165 +104,93 @@ def step(
     state: ExplorationState,
     reading: Reading,
     experiment: Experiment,
-    field: ArmReachAndTravel,
     *,
-    prior_bits: float,
     rng: np.random.Generator,
     max_readings: int | None = None,
     max_missing: int | None = MOST_MISSING,
 ) -> tuple[ExplorationState, Step]:
     """Update the posterior with one reading, and choose the next.
 
-    Parameters
-    ----------
-    state
-        The readings so far and the posterior given them.
-    reading
-        The new reading.
-    experiment, field
-        See `begin`.
-    prior_bits
-        Differential entropy of the prior, see `inquiry.prior_entropy`.
-    rng
-        Random generator of this step.
-    max_readings
-        Number of readings at which the run ends; None: no limit.
-    max_missing
-        Number of missing readings (NaN) in a row at which the run ends; None: no limit.
+    `max_readings` is the number of readings at which the run ends, `max_missing` that of missing ones (NaN) in a row;
+    None: no limit. `rng` is the random generator of this step.
 
-    Returns
-    -------
-    The state after the reading, with the next pose; and the result of this step.
-
-    Raises
-    ------
-    ParameterError
-        If the reading is outside the sensor's range.
-    NotConvergedError
-        If no hypothesis could have given these readings.
+    Return the state after the reading, with the next pose, and the result of this step. ParameterError if the reading
+    is outside the sensor's range; NotConvergedError if no hypothesis could have given these readings.
     """
     experiment.readout.require_in_range(reading.value)
     readings = (*state.readings, reading)
-    problem = experiment.problem(readings)
-    with warnings.catch_warnings():
-        # Each step keeps its own notes; a warning per reading would hide them.
-        warnings.simplefilter("ignore", DoubtfulResultWarning)
-        carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
-    wary, joined, posterior = _wary_kinds_and_posterior(experiment, carried, rng)
-    if _may_stop_and_chance_off(experiment, posterior, None, "", rng)[0]:
-        carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
-        wary, joined, posterior = _wary_kinds_and_posterior(experiment, carried, rng)
-    mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
-    leader = carried.kinds[carried.most_probable_kind_index]
-    p_value, notes = None, () if posterior.run is None else posterior.run.warnings
-    if leader.likelihood is experiment.likelihood:  # chi-square is of this noise
-        p_value, worst = p_value_and_worst_reading(
-            experiment, carried.particles[carried.most_probable_kind_index].weighted, leader.problem(problem.recording)
-        )
-        if experiment.fit_is_doubtful(p_value):
-            notes = (*notes, doubt_message(p_value, worst, readings))
-    drawn = experiment.inference_method.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
-    likely = max(shapes, key=shapes.__getitem__, default="")
-
-    def error_of_arm() -> ArmError | None:
-        if experiment.fitted_arm is None:
-            return None
-        of = (experiment, experiment.fitted_arm, readings, posterior, wary)
-        return arm_error_in_posterior(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
-
-    arm = error_of_arm() if largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
-    known, off = _may_stop_and_chance_off(experiment, posterior, arm, likely, rng)
-    utility_input, utilities = predict_readings_and_utilities(
-        experiment, posterior, drawn, field, at=reading, goal=_goal_less_arm_error(experiment, arm)
-    )
-    asks = False
-    if experiment.trust < 1:
-        utilities, asks = utility_map_and_must_continue(
-            experiment, wary, utility_input, utilities, readings, rng=rng, known=known
-        )
-        asks = asks and (max_readings is None or len(readings) < max_readings)
-    n_missing = n_missing_at_end(readings)
+    n_readings, n_missing = len(readings), n_missing_at_end(readings)
+    recording = experiment.problem(readings).recording
+    kinds, joined, posterior, drawn = infer(experiment, state.posterior, recording, rng=rng)
+    judged = judge(experiment, kinds, posterior, readings, rng=rng)
+    given, utilities = inquire(experiment, kinds, posterior, drawn, judged, state.field, readings, rng=rng)
     all_missing = max_missing is not None and n_missing >= max_missing
-    all_taken = max_readings is not None and len(readings) >= max_readings
-    if arm is None and (utilities.is_flat or all_missing or all_taken):
-        arm = error_of_arm()
-        known, off = _may_stop_and_chance_off(experiment, posterior, arm, likely, rng)
-    arm_sd = None if arm is None else arm.sd
+    all_taken = max_readings is not None and n_readings >= max_readings
+    checks = must_continue(utilities) and not all_taken
+    if judged.arm_error is None and (utilities.is_flat or all_missing or all_taken):
+        judged = with_arm_error(judged, experiment, kinds, posterior, readings, rng=rng)
     reason = stop_reason(
         experiment,
-        sd,
-        known=known and not asks,
-        p_value=p_value,
-        utilities=utilities,
-        n_readings=len(readings),
+        judged,
+        utilities,
+        must_continue=checks,
+        n_readings=n_readings,
         max_readings=max_readings,
-        arm_sd=arm_sd,
         n_missing=n_missing if all_missing else 0,
     )
     # A reading for which the run goes on, though the shape is known, is not one of those planned before. Nor is one
     # after a missing reading, since those planned may be at the same place.
-    planned_before = () if asks or n_missing else state.planned
-    pose, *planned = planned_before or next_poses(experiment, utility_input, utilities, readings, rng=rng)
+    planned_before = () if checks or n_missing else state.planned
+    pose, *planned = planned_before or next_poses(experiment, given, utilities, readings, rng=rng)
+    log_prior = experiment.prior.log_prob(joined.theta)
     info = Step(
-        number=len(readings),
+        number=n_readings,
         reading=reading,
         names=experiment.shape.prior.names,
-        mean=mean,
-        sd=sd,
-        shapes=shapes,
-        samples=utility_input.drawn[:, experiment.shape_columns],
+        mean=judged.mean,
+        sd=judged.sd,
+        shapes=judged.shapes,
+        samples=given.drawn[:, experiment.shape_columns],
         map=utilities,
         next_pose=None if reason else pose,
-        bits=bits_gained(information_nats(joined), problem.prior.log_prob(joined.theta), joined.weight, prior_bits),
-        p_value=p_value,
+        bits=bits_gained(information_nats(joined), log_prior, joined.weight, state.prior_bits),
+        p_value=judged.p_value,
         posterior=posterior,
         sensor=sensor_moments(experiment, posterior),
-        left_out=carried.left_out,
-        kinds=carried,
-        chance_off=off,
+        left_out=kinds.left_out,
+        kinds=kinds,
+        chance_off=judged.chance_off,
         stop_reason=reason,
-        notes=notes,
+        notes=judged.notes,
         pace=Pace.from_readings(readings),
-        arm_error=arm,
-        checks_sensor=known and asks,
+        arm_error=judged.arm_error,
+        checks_sensor=judged.may_stop and checks,
     )
-    return ExplorationState(readings, carried, pose, tuple(planned)), info
+    return replace(state, readings=readings, posterior=kinds, next_pose=pose, planned=tuple(planned)), info
 
 
-def _wary_kinds_and_posterior(
-    experiment: Experiment, carried: Posterior, rng: np.random.Generator
-) -> tuple[Posterior, Weighted, Weighted]:
-    """Return the kinds with raised fault odds, their samples as one posterior, and the latter with aligned angles."""
-    wary = carried.with_raised_fault_odds
-    joined = wary.joined(rng=rng)
-    return wary, joined, with_aligned_angles(experiment, joined)
+def infer(
+    experiment: Experiment, previous: Posterior, recording: Recording, *, rng: np.random.Generator
+) -> tuple[Posterior, Weighted, Weighted, FloatArray]:
+    """Update the posterior with the last reading of a recording; before the run may end, reconsider it.
 
-
-def _goal_less_arm_error(experiment: Experiment, arm: ArmError | None) -> Goal | None:
-    """Return the goal for the readings alone, the target variance less the arm's; None stands for the usual goal."""
-    goal = experiment.goal
-    if arm is None or goal is None:
-        return None
-    lengths = np.array(goal.columns) - experiment.shape_columns[0]
-    left = goal.sd**2 - float(arm.sd[lengths].max()) ** 2
-    return dataclasses.replace(goal, sd=math.sqrt(left)) if left > 0 else None
-
-
-def _may_stop_and_chance_off(
-    experiment: Experiment, posterior: Weighted, arm: ArmError | None, likely: str, rng: np.random.Generator
-) -> tuple[bool, float]:
-    """Return whether a posterior with the arm's error meets the stopping rule, and its `probability_of_length_off`."""
-    _, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
-    if arm is not None:
-        sd = np.hypot(sd, arm.sd)
-        theta = posterior.theta.copy()
-        own = theta[:, experiment.shape_columns]
-        theta[:, experiment.shape_columns] = own + draw_shape_shifts_from_arm_error(
-            experiment, arm.slopes, own, likely, rng=rng
-        )
-        posterior = dataclasses.replace(posterior, theta=theta)
-    off = probability_of_length_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
-    return experiment.may_stop(sd, shapes, off), off
+    Returns
+    -------
+    The posterior kind by kind; its samples joined, with raised odds of faults; the same with aligned angles; and a few
+    hypotheses drawn from it, (n_samples, n_params).
+    """
+    method = experiment.inference_method
+    with warnings.catch_warnings():
+        # Each step keeps its own notes; a warning per reading would hide them.
+        warnings.simplefilter("ignore", DoubtfulResultWarning)
+        kinds = method.updated(previous, recording, rng=rng)
+    joined = kinds.with_raised_fault_odds().joined(rng=rng)
+    posterior = with_aligned_angles(experiment, joined)
+    if may_stop_and_chance_off(experiment, posterior)[0]:
+        kinds = method.reconsidered(kinds, recording, rng=rng)
+        joined = kinds.with_raised_fault_odds().joined(rng=rng)
+        posterior = with_aligned_angles(experiment, joined)
+    return kinds, joined, posterior, method.drawn(kinds, posterior, recording, experiment.n_samples, rng=rng)
 
 
 def explore(
@@ -267,7 +204,8 @@ def explore(
 ) -> Generator[Step, None, None]:
     """Let the robot find the shape: yield one `Step` per reading until the target precision (paper, section 2).
 
-    A generator that is not exhausted keeps its journal locked until the generator is closed.
+    `Exploration(experiment, tuple(explore(...)))` is the whole run. A generator that is not exhausted keeps its journal
+    locked until the generator is closed.
 
     Parameters
     ----------
@@ -320,6 +258,7 @@ def explore(
     if before is None and path is not None and path.exists():
         before = read_journal(path)
     settings = {} if path is None else experiment.settings(seed) | dict(about or {})  # settings may lack a name
+    start_s = 0.0
     if before is not None:
         require_same_settings(before, settings)
         seed = _seed_of_journal(before, seed)
@@ -327,40 +266,9 @@ def explore(
             raise ParameterError(
                 "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
             )
-    start_s = before.readings[-1].time_s if before is not None and before.entries else 0.0
+        start_s = before.readings[-1].time_s if before.entries else 0.0
     instrument = as_instrument(instrument, start_s=start_s)
-    return _yield_steps(
-        instrument, experiment, seed=seed, max_readings=max_readings, path=path, before=before, settings=settings
-    )
-
-
-@own_arithmetic
-def run(
-    instrument: Instrument | Measures,
-    experiment: Experiment,
-    *,
-    rng: np.random.Generator,
-    max_readings: int = 100,
-    journal: str | Path | Journal | None = None,
-    progress: Callable[[Step], None] | None = None,
-    hidden: HiddenShape | None = None,
-    about: Mapping[str, Any] | None = None,
-) -> Exploration:
-    """Run `explore` to its end and collect the steps; `progress` is called with each step.
-
-    `hidden` is the true shape of a simulated field, for reports and the journal; the inference does not use that shape.
-    """
-    if progress is not None:
-        require_callable("progress", progress, "a function that is called with every Step, or None")
-    if hidden is not None:
-        require_kind("hidden", hidden, HiddenShape, "a HiddenShape: what a simulated field holds; or None")
-        about = {**(about or {}), "hidden": hidden.journal_entry}
-    steps = []
-    for info in explore(instrument, experiment, rng=rng, max_readings=max_readings, journal=journal, about=about):
-        if progress is not None:
-            progress(info)
-        steps.append(info)
-    return Exploration(experiment, tuple(steps), hidden)
+    return _yield_steps(instrument, experiment, seed, max_readings, path=path, before=before, settings=settings)
 
 
 def _yield_steps(
@@ -368,18 +276,17 @@ def _yield_steps(
     experiment: Experiment,
     seed: np.random.SeedSequence,
     max_readings: int,
+    *,
     path: Path | None,
     before: Journal | None,
     settings: Mapping[str, Any],
 ) -> Generator[Step, None, None]:
     """Yield the steps: those of the journal `before`, then those of new readings, which are written to `path`."""
-    require_turns_and_lifts(instrument, experiment)
+    _require_turns_and_lifts(instrument, experiment)
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
-    field = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
-    first = _rng_of_reading(seed, 0)
-    prior_bits = prior_entropy(experiment.prior, rng=first)
-    state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
-    doubt = doubt_about_height(experiment, getattr(instrument, "read_height_mm", None))
+    # Before the journal is created: a run that cannot begin leaves none.
+    state = begin(experiment, instrument, rng=_rng_of_reading(seed, 0))
+    doubt = _doubt_about_height(experiment, getattr(instrument, "read_height_mm", None))
     if doubt is not None:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     with _journal_writer(path, before, settings) as writer:
@@ -391,14 +298,13 @@ def _yield_steps(
             _require_possible_reading(experiment, reading)  # before it is written, or a resumed run fails again
             if writer is not None and entry is None:
                 writer.write_reading(number, reading)
-            if doubt is None and (doubt := doubt_about_height(experiment, height_of_reading_mm(reading))) is not None:
+            height_mm = covariates_with_height(reading).get("height_mm")  # NaN: missing
+            if doubt is None and (doubt := _doubt_about_height(experiment, height_mm)) is not None:
                 warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
             state, info = step(
                 state,
                 reading,
                 experiment,
-                field,
-                prior_bits=prior_bits,
                 rng=_rng_of_reading(seed, number),
                 max_readings=max_readings,
                 # A run that ended for want of values goes on when it is resumed, with the instrument mended.
@@ -406,17 +312,48 @@ def _yield_steps(
             )
             if writer is not None and (entry is None or entry.summary is None):
                 writer.write_summary(_posterior_summary(info, state))
-            if entry is not None:
-                info = dataclasses.replace(info, replayed=True)
+            if entry is not None and entry.summary is not None:
                 # The journal's pose is used, even if another machine's arithmetic would choose another.
-                if entry.summary is not None:
-                    state = dataclasses.replace(state, next_pose=entry.summary.next_pose)
-            if number == 1 and notes:
-                info = dataclasses.replace(info, notes=(*info.notes, *notes))
-            if doubt is not None:
-                info = dataclasses.replace(info, notes=(*info.notes, doubt))
+                state = replace(state, next_pose=entry.summary.next_pose)
+            of_run = (*(notes if number == 1 else ()), *(() if doubt is None else (doubt,)))
             stopped = info.stop_reason is not None
-            yield info
+            yield replace(info, replayed=entry is not None, notes=(*info.notes, *of_run))
+
+
+def _require_turns_and_lifts(instrument: Instrument, experiment: Experiment) -> None:
+    """Check that an instrument, already entered, can take the orientations and heights that may be chosen.
+
+    An instrument that takes a pose's orientation and height without following it would record readings wrongly; so it
+    has to declare `turns` and `lifts`. A single height needs no `lifts` if the instrument reads at that height.
+    """
+    undeclared = "none with an instrument that does not declare that it can {} = True"
+    turns_rad, heights_mm = experiment.orientations_rad, experiment.heights_mm
+    if turns_rad != (0.0,) and not getattr(instrument, "turns", False):
+        allowed = undeclared.format("turn its sensor to pose.orientation_rad: turns")
+        raise ParameterError("orientations_rad (--orientations)", turns_rad, allowed)
+    own_mm = getattr(instrument, "read_height_mm", None)
+    if set(heights_mm) - {own_mm} and not getattr(instrument, "lifts", False):
+        allowed = undeclared.format("read at pose.height_mm: lifts")
+        raise ParameterError("heights_mm (--heights)", heights_mm, allowed)
+
+
+def _doubt_about_height(experiment: Experiment, height_mm: float | None) -> str | None:
+    """Describe why a run with readings at this height is doubtful; None if it is not, or either height is not known.
+
+    Readings at heights that may be chosen (`Experiment.heights_mm`) count as what they are. Without them, every reading
+    counts as one at the calibrated height: at another, the footprint is wider or narrower and the signal weaker or
+    stronger than modelled, and the shape wrong.
+    """
+    calibrated_mm = experiment.calibrated_height_mm
+    if experiment.heights_mm or calibrated_mm is None or height_mm is None:
+        return None
+    if not abs(height_mm - calibrated_mm) > _MOST_OFF * calibrated_mm:  # NaN: the height is not known
+        return None
+    return (
+        f"the arm reads {height_mm:g} mm above the surface, and the sensor was calibrated at {calibrated_mm:g} mm: "
+        f"every reading counts as one at {calibrated_mm:g} mm, so the shape may be wrong by more than its sds; "
+        f"calibrate the sensor at {height_mm:g} mm, or name the height (heights_mm, --heights {height_mm:g})"
+    )
 
 
 def _require_possible_reading(experiment: Experiment, reading: Reading) -> None:
@@ -459,6 +396,40 @@ def _rng_of_reading(seed: np.random.SeedSequence, number: int) -> np.random.Gene
 
 
 def _posterior_summary(info: Step, state: ExplorationState) -> PosteriorSummary:
-    known = [(n, float(m), float(s)) for n, m, s in zip(info.names, info.mean, info.sd, strict=True) if np.isfinite(m)]
-    known += [(name, mean, sd) for name, (mean, sd) in info.sensor.items()]
-    return PosteriorSummary({n: m for n, m, _ in known}, {n: s for n, _, s in known}, info.bits, state.next_pose)
+    known = {n: (float(m), float(s)) for n, m, s in zip(info.names, info.mean, info.sd, strict=True) if np.isfinite(m)}
+    known |= info.sensor
+    mean, sd = ({name: both[k] for name, both in known.items()} for k in (0, 1))
+    return PosteriorSummary(mean, sd, info.bits, state.next_pose)
+
+
+def run_from_place(
+    first: Pose, instrument: Instrument, experiment: Experiment, *, rng: np.random.Generator, max_readings: int = 100
+) -> Exploration:
+    """Run the loop from a given first place, so that two robots with the same first reading can be compared.
+
+    The instrument, already entered, has to reach that place; `rng` is the generator of the whole run. Errors are those
+    of `explore`.
+    """
+    if max_readings < 1:
+        raise ParameterError("max_readings", max_readings, "1 or more")
+    state = replace(begin(experiment, instrument, rng=rng), next_pose=first, planned=())
+    steps: list[Step] = []
+    while not steps or steps[-1].stop_reason is None:
+        reading = instrument.measure(state.next_pose)
+        state, info = step(state, reading, experiment, rng=rng, max_readings=max_readings)
+        steps.append(info)
+    return Exploration(experiment, tuple(steps))
+
+
+def shadow_run(
+    steps: Iterable[Step], other: Experiment, instrument: Instrument, *, rng: np.random.Generator
+) -> Iterator[tuple[Step, Step]]:
+    """Yield each step of a run, as it arrives, with another experiment's step from the same reading.
+
+    `other` is the same experiment with another sensor model; its own choices of readings are not carried out. `rng` is
+    the generator of its inference; the run has its own.
+    """
+    state = begin(other, instrument, rng=rng)
+    for own in steps:
+        state, info = step(replace(state, planned=()), own.reading, other, rng=rng)
+        yield own, info

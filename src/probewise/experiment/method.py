@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.experiment.lost_modes import with_lost_modes_found
-from probewise.experiment.posterior import Posterior
-from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
-from probewise.experiment.sampled_anew import SolverFromScratch
-from probewise.inference.problem import SensorProblem
-from probewise.nested import LIVE_PER_PARAM, KernelMove, NestedResult, RemainingEvidence, Weighted, run
+from probewise.errors import NotConvergedError
+from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, Posterior, n_samples_of_kind
+from probewise.experiment.reestimation import (
+    nested_sampling_from_scratch,
+    reestimated_after_reading,
+    reestimated_before_end,
+)
+from probewise.experiment.smc import BRIEF, STEADY, THOROUGH, resample_and_move, update
+from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
-
-_DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 
 
 class Method(Protocol):
@@ -74,42 +75,37 @@ class SequentialMonteCarlo:
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """Reweight, resample and move the samples of every kind by the last reading."""
-        return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng))
+        problems = [kind.problem(recording) for kind in previous.kinds]
+        if len(problems) == 1:
+            from_scratch = partial(nested_sampling_from_scratch, problems[0], n_live=self.n_live, rng=rng)
+            found = update(previous.particles[0], problems[0], rng=rng, fall_back=from_scratch)
+            return replace(previous, particles=(found,))
+        usual, unsuspected = STEADY if previous.doubts_sensor else THOROUGH, SUSPECTED[1][0]
+        updated = tuple(
+            update(particles, problem, rng=rng, effort=BRIEF if kind.left_out and p < unsuspected else usual)
+            for kind, particles, problem, p in zip(
+                previous.kinds, previous.particles, problems, previous.probability, strict=True
+            )
+        )
+        now = replace(previous, particles=updated)
+        now = reestimated_after_reading(now, problems, self.n_particles, self.n_live, rng=rng)
+        if not np.isfinite(now.log_odds).any():
+            raise NotConvergedError("no hypothesis of any kind could have given these readings")
+        particles = list(now.particles)
+        for k, (kind, p) in enumerate(zip(now.kinds, now.probability, strict=True)):
+            n = n_samples_of_kind(kind, p, self.n_particles)
+            if n > len(particles[k].ancestor) or p < IMPROBABLE:
+                effort = BRIEF if kind.left_out else THOROUGH
+                particles[k] = resample_and_move(particles[k], n, problems[k], rng=rng, effort=effort)
+        return replace(now, particles=tuple(particles))
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Return the posterior with kinds sampled again whose samples may have lost the truth.
-
-        The check for lost modes draws from a generator of its own: if no mode was lost, the run goes on as without it.
-        """
-        own = rng.spawn(1)[0]
-        if any(kind.left_out for kind in posterior.kinds):
-            posterior = with_rivals_sampled_again(
-                posterior, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng)
-            )
+        """Return the posterior with kinds sampled again whose samples may have lost the truth."""
         problems = [kind.problem(recording) for kind in posterior.kinds]
-        return with_lost_modes_found(posterior, problems, rng=own, from_scratch=self._solver_from_scratch(own))
-
-    def _solver_from_scratch(self, rng: np.random.Generator) -> SolverFromScratch:
-        """Return the function that solves a problem by nested sampling."""
-        return partial(nested_sampling_from_scratch, n_live=self.n_live, rng=rng)
+        return reestimated_before_end(posterior, problems, self.n_particles, self.n_live, rng=rng)
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
         """Resample `n` hypotheses from the joined posterior, (n, n_params)."""
         return joined.samples(n, rng=rng)
-
-
-def nested_sampling_from_scratch(
-    problem: SensorProblem, *, n_live: int, rng: np.random.Generator, quick: bool = False
-) -> NestedResult:
-    """Solve a problem, all readings at once, by nested sampling; with half of `n_live` live points if `quick`."""
-    return run(
-        problem,
-        rng=rng,
-        n_live=max(n_live // 2 if quick else n_live, LIVE_PER_PARAM * len(problem.prior.names)),
-        move=KernelMove(),
-        stop=RemainingEvidence(_DLOGZ),
-        max_cost=1.0,  # speed matters, since the robot waits
-        return_interrupted=False,
-    )

@@ -1,20 +1,27 @@
 """Alternatives to the declared noise model, as rivals that predict the same noise-free readings.
 
-Each likelihood is marginalised over equally weighted nodes of its prior.
+A law of the noise is a function of readings, (n_points,), and predictions, (n_samples, n_points), that returns log
+likelihoods, (n_samples,), marginalised over equally weighted nodes of its prior.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Self
 
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.effects import HeavyTailedPrior
 from probewise.effects.noise import CorrelatedNoise, Outliers, SignalDependentNoise, lattice_step
-from probewise.experiment.declared_noise import DeclaredNoise
+from probewise.effects.noise_distribution import log_gaussian_density, log_rounding_cell_density
+from probewise.inference import GaussianKnown, Rounded
+from probewise.inference.problem import Likelihood
+from probewise.inference.rounded import ScaleEnds
 from probewise.priors import LogUniform
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
@@ -29,6 +36,209 @@ _LEAST = -1e300  # log of a probability of zero, for differences
 _FREE = 2  # readings that determine the lattice
 
 
+@dataclass(frozen=True)
+class DeclaredNoise:
+    """Gaussian noise of sd `sd`, clipped to a scale and rounded to `step` within it (0: not rounded).
+
+    If not `whole_steps`, readings are not rounded, and `step` is only the width of a reading's cell.
+
+    Methods return the log density of each reading, (n_samples, n_points); for rounded readings, the log probability of
+    the rounding cell, and for a reading at an end of the scale, the log probability of all values beyond.
+    """
+
+    sd: float
+    step: float = 0.0
+    ends: ScaleEnds | None = None
+    whole_steps: bool = True
+
+    @classmethod
+    def from_likelihood(cls, likelihood: Likelihood) -> Self | None:
+        """Return the noise of a likelihood with one known sd; None for any other."""
+        if isinstance(likelihood, Rounded):
+            return cls(likelihood.sd, likelihood.step, likelihood.ends, likelihood.whole_steps)
+        if isinstance(likelihood, GaussianKnown) and np.ndim(likelihood.sd) == 0:
+            return cls(float(np.asarray(likelihood.sd)))
+        return None
+
+    def inside_scale_mask(self, readings: FloatArray) -> BoolArray:
+        """Return which readings, (n_points,), lie between the ends of the scale."""
+        return np.ones(len(readings), dtype=np.bool_) if self.ends is None else ~self.ends.end_mask(readings)
+
+    def log_density(
+        self,
+        readings: FloatArray,
+        predicted: FloatArray,
+        *,
+        sd: float | FloatArray | None = None,
+        step: float | None = None,
+    ) -> FloatArray:
+        """Return the log density of readings, (n_points,), given predictions, (n_samples, n_points).
+
+        Another `sd` or `step` than the declared one may be given; `sd` broadcasts to the predictions.
+        """
+        sd, step = self.sd if sd is None else sd, self.step if step is None else step
+        if step:
+            within = log_rounding_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
+        else:
+            within = log_gaussian_density(readings, predicted, sd)
+        return self._with_probability_at_ends(readings, predicted, sd, within)
+
+    def quick_log_density(self, readings: FloatArray, predicted: FloatArray, *, sd: float) -> FloatArray:
+        """Return the same as `log_density`, approximately and faster if the noise is wider than the rounding cell.
+
+        In that case, take the density at the cell's middle, with the variance of a uniform cell added to the noise's.
+        """
+        if sd < self.step:
+            return self.log_density(readings, predicted, sd=sd)
+        within = log_gaussian_density(readings, predicted, math.hypot(sd, self.step / math.sqrt(12.0)))
+        within = within + (math.log(self.step) if self.step else 0.0)
+        return self._with_probability_at_ends(readings, predicted, sd, within)
+
+    def log_uniform_density(self, readings: FloatArray, low: float, high: float) -> FloatArray:
+        """Return the log density, (n_points,), of readings that are uniform from `low` to `high`; -inf outside."""
+        width, ends = np.full(len(readings), self.step or 1.0), self.ends
+        if ends is not None:
+            width = np.where(ends.lowest_reading_mask(readings), ends.lowest_cell + 0.5 * self.step - low, width)
+            width = np.where(ends.highest_reading_mask(readings), high - ends.highest_cell + 0.5 * self.step, width)
+        possible = (readings >= low) & (readings <= high) & (width > 0)
+        return np.log(np.where(possible, width, 1.0) / (high - low)) + np.where(possible, 0.0, -np.inf)
+
+    def _with_probability_at_ends(
+        self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, within: FloatArray
+    ) -> FloatArray:
+        """Replace the log densities of readings at an end of the scale by the log probability of all values beyond."""
+        inside = self.inside_scale_mask(readings)
+        if self.ends is None or inside.all():
+            return within
+        return np.where(inside, within, self.ends.log_prob_at_ends(readings, predicted, sd))
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLikelihood:
+    """A law of the noise as a likelihood."""
+
+    law: Callable[[FloatArray, FloatArray], FloatArray]
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
+        return self.law(readings, predicted)
+
+
+def noise_likelihoods(noise: DeclaredNoise, levels: tuple[float, float]) -> dict[str, NoiseLikelihood]:
+    """Return the noise models, {name of the effect in the vocabulary: likelihood}; `levels` are black and white."""
+    amplitude = HeavyTailedPrior(0.01 * abs(levels[1] - levels[0]), positive=True)
+    laws: dict[str, Callable[[FloatArray, FloatArray], FloatArray]] = {
+        "outliers": partial(_outliers, noise, Outliers().bank()[:, 0]),
+        "dropouts": partial(_lost_readings, noise, levels),
+        "correlated_noise": partial(_correlated, noise),
+        "signal_dependent_noise": partial(_signal_dependent, noise, levels),
+        "flicker": partial(_flicker, noise, amplitude.from_unit(_NODES[:, 0]).tolist()),
+        "quantisation": partial(_coarser_rounding, noise),
+    }
+    return {name: NoiseLikelihood(law) for name, law in laws.items()}
+
+
+def _outliers(
+    noise: DeclaredNoise, shares_and_sizes: FloatArray, readings: FloatArray, predicted: FloatArray
+) -> FloatArray:
+    """Outliers; a node is their share and their size, sds over the noise's sd, (n_nodes, 2)."""
+    narrow = noise.log_density(readings, predicted)
+    nodes = []
+    for share, size in shares_and_sizes:
+        wide = noise.quick_log_density(readings, predicted, sd=noise.sd * size)
+        nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
+    return _log_mean_over_nodes(nodes)
+
+
+def _lost_readings(
+    noise: DeclaredNoise, levels: tuple[float, float], readings: FloatArray, predicted: FloatArray
+) -> FloatArray:
+    """Lost readings, independent of the target; a node is their share.
+
+    A lost reading is, with equal probability, exactly black, black with noise, or uniform over the sensor's range and
+    some sds beyond.
+    """
+    black = np.array([[levels[0]]])
+    kept = noise.log_density(readings, predicted)
+    to_black = noise.log_density(readings, black)
+    exactly = noise.log_density(readings, black, sd=noise.sd * _EXACT)
+    low, high = min(min(levels) - _REACH * noise.sd, 0.0), max(levels) + _REACH * noise.sd
+    anywhere = noise.log_uniform_density(readings, low, high)
+    lost = logsumexp(np.broadcast_arrays(exactly, to_black, anywhere), axis=0) - math.log(3.0)
+    return _log_mean_over_nodes(
+        [np.logaddexp(kept + math.log1p(-share), lost + math.log(share)).sum(axis=1) for share in _SHARES.tolist()]
+    )
+
+
+def _correlated(noise: DeclaredNoise, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    """AR(1) noise from reading to reading; a node is the correlation."""
+    before = np.zeros_like(predicted)
+    before[:, 1:] = (readings - predicted)[:, :-1]
+    first = noise.log_density(readings[:1], predicted[:, :1])[:, 0]
+    nodes = []
+    for rho in CorrelatedNoise().prior.from_unit_cube(_NODES)[:, 0].tolist():
+        sd = noise.sd * math.sqrt(1.0 - rho**2)
+        later = noise.log_density(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd=sd)
+        nodes.append(first + later.sum(axis=1))
+    return _log_mean_over_nodes(nodes)
+
+
+def _signal_dependent(
+    noise: DeclaredNoise, levels: tuple[float, float], readings: FloatArray, predicted: FloatArray
+) -> FloatArray:
+    """Noise that grows with the signal, 0 over black and 1 over white; a node is the growth of its variance."""
+    seen = np.clip((predicted - levels[0]) / (levels[1] - levels[0]), 0.0, 1.0)
+    return _log_mean_over_nodes(
+        [
+            noise.log_density(readings, predicted, sd=noise.sd * np.sqrt(1.0 + ratio * seen)).sum(axis=1)
+            for ratio in SignalDependentNoise().prior.from_unit_cube(_NODES)[:, 0].tolist()
+        ]
+    )
+
+
+def _flicker(
+    noise: DeclaredNoise, amplitudes: Sequence[float], readings: FloatArray, predicted: FloatArray
+) -> FloatArray:
+    """Flicker of the lamp, faster than the readings, of which each has a random phase; a node is the amplitude.
+
+    A mixture over a few phases stands for the sine.
+    """
+    sines = np.cos((np.arange(_PHASES) + 0.5) / _PHASES * np.pi).tolist()
+    nodes = []
+    for amplitude in amplitudes:
+        sd = math.hypot(noise.sd, _PER_PHASE * amplitude)
+        phases = [noise.quick_log_density(readings, predicted + amplitude * sine, sd=sd) for sine in sines]
+        nodes.append(_log_mean_over_nodes(phases).sum(axis=1))
+    return _log_mean_over_nodes(nodes)
+
+
+def _coarser_rounding(noise: DeclaredNoise, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Coarser rounding than declared; if the readings show none, the declared noise.
+
+    The coarser step is the largest whose lattice holds all readings within the scale, from three different values on.
+    If the declared noise is not rounded and values recur, two different values determine the step by their difference;
+    with a single value, the step is a node.
+    """
+    inside = noise.inside_scale_mask(readings)
+    if not inside.all():
+        at_end = noise.log_density(readings[~inside], predicted[:, ~inside]).sum(axis=1)
+        return np.asarray(at_end + _coarser_rounding(noise, readings[inside], predicted[:, inside]))
+    values, n_free = np.unique(readings), _FREE  # readings that determine the step are no test of it
+    recur = not (noise.whole_steps and noise.step > 0) and len(values) < len(readings)
+    if recur and len(values) == 1:
+        steps, n_free = [times * noise.sd for times in _STEPS], 1
+    else:
+        steps = [float(values[1] - values[0]) if recur and len(values) == 2 else lattice_step(readings)]
+    nodes = []
+    for coarse in steps:
+        if coarse > max(_COARSE * noise.sd, 1.5 * noise.step):
+            surprise = (len(readings) - n_free) * math.log(coarse / (noise.step or _EXACT * noise.sd))
+            density = noise.log_density(readings, predicted, step=coarse) - math.log(coarse)
+            of_cells = len(readings) * math.log(noise.step) if noise.step else 0.0
+            nodes.append(density.sum(axis=1) + surprise + of_cells)
+    return _log_mean_over_nodes(nodes) if nodes else noise.log_density(readings, predicted).sum(axis=1)
+
+
 def _log_mean_over_nodes(nodes: list[FloatArray]) -> FloatArray:
     """Return the log of the mean of exp over a list of arrays, elementwise; faster than scipy's `logsumexp`."""
     stacked = np.stack(nodes)
@@ -37,199 +247,3 @@ def _log_mean_over_nodes(nodes: list[FloatArray]) -> FloatArray:
     np.exp(stacked, out=stacked)
     with np.errstate(divide="ignore"):  # impossible at every node
         return np.asarray(most + np.log(stacked.mean(axis=0)))
-
-
-@dataclass(frozen=True, eq=False)
-class OutlierLikelihood:
-    """Likelihood with outliers, marginalised over their share and width.
-
-    `shares` of outliers and their `sizes` (sds over the noise's sd), (n_nodes,) each, are equally weighted pairs.
-    """
-
-    noise: DeclaredNoise
-    shares: FloatArray
-    sizes: FloatArray
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        narrow = self.noise.log_density(readings, predicted)
-        nodes = []
-        for share, size in zip(self.shares, self.sizes, strict=True):
-            wide = self.noise.quick_log_density(readings, predicted, sd=self.noise.sd * size)
-            nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
-        return _log_mean_over_nodes(nodes)
-
-
-@dataclass(frozen=True, eq=False)
-class LostReadingLikelihood:
-    """Likelihood with lost readings, independent of the target, marginalised over their share.
-
-    A lost reading is, with equal probability, exactly `black`, `black` with noise, or uniform over the sensor's range,
-    from `low` to `high` and some sds beyond.
-    """
-
-    noise: DeclaredNoise
-    black: float
-    low: float
-    high: float
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        sd, black = self.noise.sd, np.array([[self.black]])
-        kept = self.noise.log_density(readings, predicted)
-        to_black = self.noise.log_density(readings, black)
-        exactly = self.noise.log_density(readings, black, sd=sd * _EXACT)
-        low, high = min(self.low - _REACH * sd, 0.0), self.high + _REACH * sd
-        anywhere = self.noise.log_uniform_density(readings, low, high)
-        lost = logsumexp(np.broadcast_arrays(exactly, to_black, anywhere), axis=0) - math.log(3.0)
-        return _log_mean_over_nodes(
-            [np.logaddexp(kept + math.log1p(-share), lost + math.log(share)).sum(axis=1) for share in _SHARES.tolist()]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class CorrelatedLikelihood:
-    """Likelihood with AR(1) noise from reading to reading, marginalised over the correlation."""
-
-    noise: DeclaredNoise
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        before = np.zeros_like(predicted)
-        before[:, 1:] = (readings - predicted)[:, :-1]
-        first = self.noise.log_density(readings[:1], predicted[:, :1])[:, 0]
-        nodes = []
-        for rho in CorrelatedNoise().prior.from_unit_cube(_NODES)[:, 0].tolist():
-            sd = self.noise.sd * math.sqrt(1.0 - rho**2)
-            later = self.noise.log_density(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd=sd)
-            nodes.append(first + later.sum(axis=1))
-        return _log_mean_over_nodes(nodes)
-
-
-@dataclass(frozen=True, eq=False)
-class SignalDependentLikelihood:
-    """Likelihood with noise that grows with the signal, marginalised over the growth of its variance.
-
-    The signal runs from 0 at `dark` to 1 at `bright`.
-    """
-
-    noise: DeclaredNoise
-    dark: float
-    bright: float
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
-        return _log_mean_over_nodes(
-            [
-                self.noise.log_density(readings, predicted, sd=self.noise.sd * np.sqrt(1.0 + ratio * seen)).sum(axis=1)
-                for ratio in SignalDependentNoise().prior.from_unit_cube(_NODES)[:, 0].tolist()
-            ]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class FlickerLikelihood:
-    """Likelihood under a lamp that flickers faster than the readings: each reading has a random phase.
-
-    `amplitudes` are equally weighted nodes, in the reading's unit. A mixture over a few phases stands for the sine.
-    """
-
-    noise: DeclaredNoise
-    amplitudes: tuple[float, ...]
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        sines = np.cos((np.arange(_PHASES) + 0.5) / _PHASES * np.pi)
-        nodes = []
-        for amplitude in self.amplitudes:
-            sd = math.hypot(self.noise.sd, _PER_PHASE * amplitude)
-            phases = [
-                self.noise.quick_log_density(readings, predicted + amplitude * sine, sd=sd) for sine in sines.tolist()
-            ]
-            nodes.append(_log_mean_over_nodes(phases).sum(axis=1))
-        return _log_mean_over_nodes(nodes)
-
-
-@dataclass(frozen=True, eq=False)
-class CoarserRoundingLikelihood:
-    """Likelihood with coarser rounding than declared; if the readings show none, that of the declared noise.
-
-    The coarser step is the largest whose lattice holds all readings, from three different values on. If the declared
-    noise is not rounded and values recur, two different values determine the step by their difference; with a single
-    value, the step is marginalised over.
-    """
-
-    noise: DeclaredNoise
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        inside = self.noise.inside_scale_mask(readings)
-        if inside.all():
-            return self._log_prob_inside_scale(readings, predicted)
-        at_end = self.noise.log_density(readings[~inside], predicted[:, ~inside]).sum(axis=1)
-        return np.asarray(at_end + self._log_prob_inside_scale(readings[inside], predicted[:, inside]))
-
-    def _log_prob_inside_scale(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return log likelihoods of readings that lie inside the scale, (n_samples,)."""
-        least = max(_COARSE * self.noise.sd, 1.5 * self.noise.step)
-        steps, n_free = self._rounding_steps_and_n_determining(readings)
-        nodes = [
-            self._log_prob_if_rounded_to(coarse, n_free, readings, predicted) for coarse in steps if coarse > least
-        ]
-        if not nodes:
-            return np.asarray(self.noise.log_density(readings, predicted).sum(axis=1))
-        return _log_mean_over_nodes(nodes)
-
-    def _rounding_steps_and_n_determining(self, readings: FloatArray) -> tuple[list[float], int]:
-        """Return possible rounding steps, equally weighted, and how many readings determine the step (are no test)."""
-        values = np.unique(readings)
-        recur = not self.noise.is_rounded and len(values) < len(readings)
-        if recur and len(values) == 1:
-            return [times * self.noise.sd for times in _STEPS], 1
-        if recur and len(values) == 2:
-            return [float(values[1] - values[0])], _FREE
-        return [lattice_step(readings)], _FREE
-
-    def _log_prob_if_rounded_to(
-        self, coarse: float, n_free: int, readings: FloatArray, predicted: FloatArray
-    ) -> FloatArray:
-        """Return the log likelihood under rounding to `coarse`, which `n_free` readings determine, (n_samples,)."""
-        step = self.noise.step
-        surprise = (len(readings) - n_free) * math.log(coarse / (step or _EXACT * self.noise.sd))
-        density = self.noise.log_density(readings, predicted, step=coarse) - math.log(coarse)
-        return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(step) if step else 0.0))
-
-
-NoiseLikelihood = (
-    OutlierLikelihood
-    | LostReadingLikelihood
-    | CorrelatedLikelihood
-    | SignalDependentLikelihood
-    | FlickerLikelihood
-    | CoarserRoundingLikelihood
-)
-
-
-def noise_likelihoods(noise: DeclaredNoise, ends: tuple[float, float]) -> dict[str, NoiseLikelihood]:
-    """Return the noise models, {name of the effect in the vocabulary: likelihood}.
-
-    Parameters
-    ----------
-    noise
-        The declared noise.
-    ends
-        Readings over black and over white.
-    """
-    dark, bright = ends
-    low, high = sorted(ends)
-    shares, sizes = Outliers().bank()[:, 0].T
-    amplitudes = HeavyTailedPrior(0.01 * (high - low), positive=True).from_unit((np.arange(6) + 0.5) / 6)
-    return {
-        "outliers": OutlierLikelihood(noise, shares, sizes),
-        "dropouts": LostReadingLikelihood(noise, dark, low, high),
-        "correlated_noise": CorrelatedLikelihood(noise),
-        "signal_dependent_noise": SignalDependentLikelihood(noise, dark, bright),
-        "flicker": FlickerLikelihood(noise, tuple(amplitudes.tolist())),
-        "quantisation": CoarserRoundingLikelihood(noise),
-    }

@@ -2,35 +2,36 @@
 
 The effects and their typical sizes are those of the diagnosis. But before the first reading of a run, nothing is known
 of places and times. So effects of the pose and of the footprint take their scales from a scan of 100 mm, as in a
-calibration; effects that change with the place, from the whole field; with time, from 150 s. Effects too small for a
-dozen readings are excluded (`EffectWithRunPrior`).
+calibration; effects that change with the place, from the whole field. Effects in time use paced time, which is 0 at the
+first reading and scaled so that each reading takes eight seconds on average: their priors are set before the speed of
+the instrument is known. Effects too small for a dozen readings are excluded (`EffectWithRunPrior`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.arm.instrument import Reading
+from probewise.effects import VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior, NamedEffect
+from probewise.effects.known import WrappedEffect
+from probewise.effects.optics import PatchPrior
 from probewise.effects.pose import Backlash
 from probewise.effects.reading import AmbientStep, GainDrift, Hysteresis, Lag, OffsetDrift
 from probewise.errors import ParameterError
-from probewise.experiment.declared_noise import DeclaredNoise
-from probewise.experiment.effect_with_run_prior import EffectWithRunPrior
-from probewise.experiment.noise_rivals import noise_likelihoods
-from probewise.experiment.pace import EACH_S, DescribedEffect, EffectInPacedTime, FromRest
+from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import cards_of
-from probewise.recordings.plan import Instrumentation, Plan
+from probewise.priors import LogUniform, Prior, Product, Uniform
+from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.sensor import Chain, FixedLevels
-from probewise.sensor.stages import SensorModel
-
-_DURATION_S = 150.0
-_SCAN_MM = 100.0
+from probewise.sensor.stages import Effect, Poses, SensorModel
 
 ON_FIELD = {
     "ambient_gradient": True,
@@ -56,10 +57,19 @@ ON_FIELD = {
 WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
 """Effects that are aliased with another shape, unless there is a card at a known place."""
 
-_IN_TIME = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name, Lag.name})
-
 OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
 """Effects of the direction from which the arm comes."""
+
+EACH_S = 8.0
+"""Seconds of paced time that each reading takes on average."""
+
+_IN_TIME = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name, Lag.name})
+_PACED = "paced_s"  # column of a plan
+_DURATION_S = 150.0
+_SCAN_MM = 100.0
+_SMALLEST = 4.0  # sd of an effect's size, in typical sizes of a recording: a smaller one hardly moves the shape
+_POWERS_OF_S = {"at_s": 1, "tau_s": 1, "per_hour": -1}
+_CHANGE_POINT = LogUniform(0.5 * EACH_S, 100.0 * EACH_S)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,21 +86,9 @@ def rivals_of(
 ) -> tuple[SensorModelRival, ...]:
     """Return the rivals of a sensor model: effects that it leaves out, and other noise.
 
-    Parameters
-    ----------
-    model
-        A chain with known levels.
-    likelihood
-        `GaussianKnown` with one sd, or `Rounded`; for any other, no noise models are among the rivals.
-    field_mm
-        Width and height of the field.
-    height_mm
-        Height of the sensor above the surface as it was calibrated; None: not known.
-
-    Raises
-    ------
-    ParameterError
-        If the model is no `Chain` with known levels, and so does not support effects.
+    The model has to be a chain with known levels (else ParameterError); unless the likelihood is `GaussianKnown` with
+    one sd, or `Rounded`, no noise models are among the rivals. `field_mm` is width and height of the field, `height_mm`
+    that of the sensor above the surface as it was calibrated (None: not known).
     """
     if not isinstance(model, Chain) or not isinstance(model.levels, FixedLevels):
         raise ParameterError(
@@ -98,54 +96,34 @@ def rivals_of(
             "below 1",
             '1 with a sensor model that is naive, is learnt along, or is one of your own: "--trust 1"',
         )
-    ends = sorted((model.levels.i_min, model.levels.i_max))
+    dark, bright = model.levels.i_min, model.levels.i_max
     carried = {effect.name for effect in model.effects}
     found = []
-    shown = {**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD
-    for name, wide in shown.items():
-        reach_mm = math.hypot(*field_mm) if wide else _SCAN_MM
-        effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _plan_there_and_back(reach_mm, height_mm)))
+    for name, wide in ({**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD).items():
+        plan = _plan_there_and_back(math.hypot(*field_mm) if wide else _SCAN_MM, height_mm)
+        effect = VOCABULARY[name].for_extent(Extent(min(dark, bright), max(dark, bright), plan))
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, field_mm)]
     noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
-        laws = noise_likelihoods(noise, (model.levels.i_min, model.levels.i_max))
-        found += [SensorModelRival(name, likelihood=law) for name, law in laws.items()]
+        found += [
+            SensorModelRival(name, likelihood=law) for name, law in noise_likelihoods(noise, (dark, bright)).items()
+        ]
     return tuple(found)
 
 
 def _forms_of_effect_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """Return the forms in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
+    in_run = EffectWithRunPrior(effect, field_mm)
     if effect.name in OF_MOTION:
-        return [EffectWithRunPrior(effect, field_mm), FromRest(EffectWithRunPrior(effect, field_mm))]
+        return [in_run, FromRest(in_run)]
     if effect.name not in _IN_TIME:
-        return [EffectWithRunPrior(effect, field_mm)]
-    ways = [effect, GainLoss.from_gain_drift(effect)] if isinstance(effect, GainDrift) else [effect]
-    return [EffectInPacedTime(EffectWithRunPrior(way, field_mm)) for way in ways]
-
-
-@dataclass(frozen=True)
-class GainLoss(GainDrift):
-    """A lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
-
-    @classmethod
-    def from_gain_drift(cls, drift: GainDrift) -> Self:
-        """Build with the scales of the priors of `drift`, an effect whose signal ends as calibrated."""
-        return cls(drift.typical, drift.shortest_s, drift.longest_s)
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal, (n_samples, n_points), but not the dark level."""
-        gone = -np.expm1(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
-        return np.asarray(value * np.maximum(1 + theta[:, :1] * gone, 0.0))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the change of the signal in percent, and its speed."""
-        way = "rises" if mean[0] > 0 else "falls"
-        in_the_end = 100 * abs(mean[0])
-        return (
-            f"the signal {way} by {in_the_end:.2g} % in the end, {-in_the_end * math.expm1(-60 / mean[1]):.2g} % in "
-            "the first minute of this: the lamp or its battery changes"
-        )
+        return [in_run]
+    forms: list[DescribedEffect] = [EffectInPacedTime(in_run)]
+    if isinstance(effect, GainDrift):
+        lost = GainLoss(effect.typical, effect.shortest_s, effect.longest_s)
+        forms.append(EffectInPacedTime(EffectWithRunPrior(lost, field_mm)))
+    return forms
 
 
 def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
@@ -163,3 +141,135 @@ def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
         pattern_names=("field",),
         instrumentation=Instrumentation(height_mm=height_mm),
     )
+
+
+@dataclass(frozen=True)
+class GainLoss(GainDrift):
+    """A lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Scale the signal, (n_samples, n_points), but not the dark level."""
+        gone = -np.expm1(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
+        return np.asarray(value * np.maximum(1 + theta[:, :1] * gone, 0.0))
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Describe the change of the signal in percent, and its speed."""
+        way = "rises" if mean[0] > 0 else "falls"
+        in_the_end = 100 * abs(mean[0])
+        return (
+            f"the signal {way} by {in_the_end:.2g} % in the end, {-in_the_end * math.expm1(-60 / mean[1]):.2g} % in "
+            "the first minute of this: the lamp or its battery changes"
+        )
+
+
+class DescribedEffect(Effect[Any], Protocol):
+    """An effect that can describe itself in a sentence."""
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Describe the effect, given posterior means and sds of its parameters."""
+        ...
+
+
+class _WrappedDescribedEffect(WrappedEffect[Any]):
+    effect: DescribedEffect
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Describe the effect, given posterior means and sds of its parameters."""
+        return self.effect.sentence(mean, sd)
+
+
+@dataclass(frozen=True, eq=False)
+class EffectWithRunPrior(_WrappedDescribedEffect):
+    """An effect with the prior for a single run: sizes large enough to matter, and times within the run.
+
+    A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small to change the dozen
+    readings of a run or its shape. A change point is log-uniform over up to a hundred readings. A patch may lie
+    anywhere on the field, of width and height `field_mm`, not only along scanned lines.
+    """
+
+    effect: NamedEffect[Any]
+    field_mm: tuple[float, float]
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The effect's prior for a run."""
+        own = self.effect.prior
+        if isinstance(own, PatchPrior):
+            size = HeavyTailedPrior(own.typical, smallest=_SMALLEST)
+            x, y = (Uniform(0.0, length) for length in self.field_mm)
+            return Product({own.size: size, "x": x, "y": y, "r": own.radius_prior})
+        if not isinstance(own, Product):
+            return own
+        marginals = dict(own.marginals)
+        for name, marginal in marginals.items():
+            if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
+                marginals[name] = replace(marginal, smallest=_SMALLEST)
+            elif name == "at_s":
+                marginals[name] = _CHANGE_POINT
+        return Product(marginals)
+
+
+@dataclass(frozen=True, eq=False)
+class EffectInPacedTime(_WrappedDescribedEffect):
+    """An effect whose times and rates are in paced time; in recorded time if the plan has no paced time."""
+
+    effect: DescribedEffect
+
+    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Apply the effect in paced time, or in recorded time if the plan has no paced time."""
+        own = paced_time_s(plan)
+        return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
+
+
+@dataclass(frozen=True, eq=False)
+class FromRest(_WrappedDescribedEffect):
+    """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
+
+    effect: DescribedEffect
+
+    def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
+        """Apply the effect to all readings but the run's first."""
+        moved = self.effect.apply(value, theta, plan)
+        own = paced_time_s(plan)
+        if own is None or not (first := own <= 0.0).any():
+            return moved
+        if not isinstance(value, Poses):
+            return np.where(first, value, moved)
+        x_mm, y_mm = np.where(first, value.x_mm, moved.x_mm), np.where(first, value.y_mm, moved.y_mm)
+        return replace(moved, x_mm=x_mm, y_mm=y_mm)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Start time of a run in seconds, and mean seconds per reading."""
+
+    start_s: float = 0.0
+    each_s: float = EACH_S
+
+    @classmethod
+    def from_readings(cls, readings: Sequence[Reading]) -> Self:
+        """Take the start and the mean seconds per reading of some readings; the default pace for fewer than two."""
+        if len(readings) < 2 or readings[-1].time_s <= readings[0].time_s:
+            return cls(readings[0].time_s if readings else 0.0)
+        return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
+
+    def plan_with_paced_time(self, plan: Plan) -> Plan:
+        """Return the plan with a column of paced time."""
+        own = (plan.time_s - self.start_s) * (EACH_S / self.each_s)
+        return replace(plan, covariates={**plan.covariates, _PACED: own})
+
+    def recording_with_paced_time(self, recording: Recording) -> Recording:
+        """Return the recording with a column of paced time in its plan."""
+        return replace(recording, plan=self.plan_with_paced_time(recording.plan))
+
+    def in_seconds(self, effect: Effect[Any], theta: FloatArray) -> FloatArray:
+        """Return an effect's parameters, (..., n_params), in seconds, those of an `EffectInPacedTime` converted."""
+        if not isinstance(effect, EffectInPacedTime):
+            return theta
+        powers = np.array([_POWERS_OF_S.get(name, 0) for name in effect.prior.names])
+        return np.asarray(theta * (self.each_s / EACH_S) ** powers)
+
+
+def paced_time_s(plan: Plan) -> FloatArray | None:
+    """Return the paced time of each reading, (n_points,); None if the plan has no such column."""
+    return plan.covariates.get(_PACED)

@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
 from probewise.proof.null_refit import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
 from probewise.proof.results import RoundsResult, SensorResult, SystemResult, misfit_of_case
-from probewise.proof.sensors.cases import Case, HiddenEffect, draw_case, held_out_recordings, stratum_of
+from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup
 from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer
 from probewise.recordings.plan import Plan, Recording
@@ -161,6 +161,8 @@ def _true_log_density(expected: FloatArray, sd: float, recording: Recording) -> 
     return float(log_gaussian_density(recording.readings, expected, sd)[recording.usable].sum())
 
 
+C = TypeVar("C")
+_BREAKS = (ProbewiseError, ArithmeticError, LookupError, ValueError, TypeError, AttributeError, NotImplementedError)
 _OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
 _LEAST_PROBABILITY = 1e-3
 _LEAST_COSINE = 0.5
@@ -199,30 +201,38 @@ class RunCaseInRounds:
 
 @own_arithmetic
 def run_case(task: Task) -> dict[str, Any]:
-    """Draw a case and diagnose it from its recording alone; return the diagnosis and the truth.
-
-    Returns
-    -------
-    A dict for JSON: the stratum ("kind", "size", "other_noise"), the truth ("truth", sorted names; "hidden", a dict per
-    effect), the diagnosis (`statements_to_score`). If drawing or diagnosis failed: "failed", the reason, and "at".
-    """
+    """Draw a case and diagnose it from its recording alone; return a `SensorResult`, or a `Failure`."""
     return _case_result(task, _diagnosis_result)
 
 
 def _case_result(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[str, Any]:
-    stratum, _ = stratum_of(task.number)
-    result: dict[str, Any] = asdict(stratum)
     refit = NullRefit()
+    return result_or_failure(
+        stratum_of(task.number)[0],
+        lambda: draw_case(task.seed, task.number, norm_after_refit=refit),
+        lambda case: _truth_result(case, refit),
+        lambda case: diagnosed(case, task),
+    )
+
+
+def result_or_failure(
+    stratum: Stratum,
+    draw: Callable[[], C],
+    truth: Callable[[C], dict[str, Any]],
+    diagnosed: Callable[[C], dict[str, Any]],
+) -> dict[str, Any]:
+    """Draw a case; return stratum, truth and diagnosis or, where drawing or diagnosis fails, a `Failure`."""
+    result: dict[str, Any] = asdict(stratum)
     at = "drawing"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
         try:
-            case = draw_case(task.seed, task.number, norm_after_refit=refit)
-            result |= _truth_result(case, refit)
+            case = draw()
+            result |= truth(case)
             at = "diagnosis"
-            result |= diagnosed(case, task)
+            result |= diagnosed(case)
         # A campaign of thousands survives a case that breaks the diagnosis, and reports it.
-        except (ProbewiseError, ArithmeticError, LookupError, ValueError) as error:
+        except _BREAKS as error:
             result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
     return result
 

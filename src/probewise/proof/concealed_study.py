@@ -62,8 +62,7 @@ from probewise.world.concealed import (
     SensorTilt,
     SignalDependentNoise,
 )
-from probewise.world.rows import Rows
-from probewise.world.stages import Stage
+from probewise.world.stages import Rows, Stage
 
 _EACH_S = 8.0  # seconds between readings, about
 _MIDDLE_MM = (FIELD.width_mm / 2, FIELD.height_mm / 2)

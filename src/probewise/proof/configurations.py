@@ -75,7 +75,7 @@ class SearchConfiguration:
         Readings chosen together.
     method
         Method of inference and choice: "particles", or "paper" with the utility "entropy" (see
-        `experiment.paper_experiment`).
+        `experiment.paper`).
     nested_stop
         Stopping rule of nested sampling with the method "paper": "change" or "remaining".
     """

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -18,8 +17,8 @@ from probewise.diagnosis import Diagnosis, ModelSamples
 from probewise.diagnosis.diagnose_simulator import diagnose_system
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.effects.noise_distribution import log_gaussian_density
-from probewise.errors import DoubtfulResultWarning, NotConvergedError, ProbewiseError
-from probewise.proof.challenge import Task, effect_truths_and_intervals, statements_to_score
+from probewise.errors import NotConvergedError
+from probewise.proof.challenge import Task, effect_truths_and_intervals, result_or_failure, statements_to_score
 from probewise.proof.scoring import NOISE, names_in_label
 from probewise.proof.systems.alternatives import nats_of_alternative, right_predictions
 from probewise.proof.systems.cases import (
@@ -133,35 +132,13 @@ _LIKELY = 0.05
 
 @own_arithmetic
 def run_system_case(task: Task) -> dict[str, Any]:
-    """Draw a case, diagnose it from its simulator file and table alone, and return the diagnosis and the truth.
-
-    Returns
-    -------
-    A dict for JSON, with keys as of `run_case`. A case that could not be drawn or whose diagnosis failed has "failed",
-    the reason, and "at", "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
-    """
-    stratum, _ = system_stratum_of(task.number)
-    result: dict[str, Any] = asdict(stratum)
-    at = "drawing"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
-        try:
-            case = draw_system_case(task.seed, task.number)
-            result |= _truth_json(case)
-            at = "diagnosis"
-            result |= _diagnosis_result(case, task)
-        # A campaign survives a case that breaks the diagnosis, and reports it.
-        except (
-            ProbewiseError,
-            ArithmeticError,
-            LookupError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            NotImplementedError,
-        ) as error:
-            result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
-    return result
+    """Draw a case and diagnose it from its files alone; return a `SystemResult`, or a `Failure`."""
+    return result_or_failure(
+        system_stratum_of(task.number)[0],
+        lambda: draw_system_case(task.seed, task.number),
+        _truth_json,
+        lambda case: _diagnosis_result(case, task),
+    )
 
 
 def _truth_json(case: SystemCase) -> dict[str, Any]:

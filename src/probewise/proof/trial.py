@@ -18,17 +18,16 @@ from probewise.experiment import (
     AdjustedMixture,
     Experiment,
     NestedSampling,
-    SensorChangeSds,
     Step,
     explore,
     naive_levels_from_world,
     probability_of_length_off,
+    sensor_change_prior,
     student_t_likelihood,
 )
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
 from probewise.nested import NESTED_STOP
-from probewise.priors import Normal, Product
 from probewise.proof.configurations import FIELD, POPULATIONS, SearchConfiguration, noise_of_run_in_sds
 from probewise.recordings import Disc
 from probewise.scene import HypothesisScene
@@ -92,7 +91,9 @@ def experiment_of(row: SearchConfiguration) -> Experiment:
             return Experiment(shape, chain, student_t_likelihood(levels, None), **common)
         return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
     free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
-    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_prior_of_sensor_changes())
+    return Experiment(
+        shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=sensor_change_prior((DARK, BRIGHT))
+    )
 
 
 def experiment_of_trial(trial: Trial) -> Experiment:
@@ -186,20 +187,3 @@ def arm_of(trial: Trial) -> SimulatedArm:
 def footprint_pixels() -> Spot:
     """Return the footprint of the study's simulated sensor as pixels."""
     return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
-
-
-def _prior_of_sensor_changes() -> Product:
-    """Return the normal prior of changes of the SSF and of the levels, about the sensor's true values."""
-    change = SensorChangeSds()
-    level = change.level * (BRIGHT - DARK)
-    size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)
-    return Product(
-        {
-            "log_size_u": size,
-            "log_size_v": size,
-            "shift_u_mm": shift,
-            "shift_v_mm": shift,
-            "I_min": Normal(DARK, level),
-            "I_max": Normal(BRIGHT, level),
-        }
-    )

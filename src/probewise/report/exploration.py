@@ -20,7 +20,7 @@ from probewise.experiment import (
     left_out_after_step,
     probability_of_length_off,
 )
-from probewise.experiment.state import stop_reason_with_checks
+from probewise.experiment.result import stop_reason_with_checks
 from probewise.inquiry import UtilityMap
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots.canvas import grid_of_axes, png

@@ -5,11 +5,10 @@ the model. The summed integral is the paper's eq. RwithSSF.
 """
 
 from probewise.world.concealed import AmbientGradient, Backlash, CorrelatedNoise, GainDrift, Nonlinearity, Saturation
-from probewise.world.painting import CoveredSurface, Oval, Surface, albedo_at
 from probewise.world.rays import seen_white_fraction
-from probewise.world.rows import Rows
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
-from probewise.world.stages import Concealed
+from probewise.world.stages import Concealed, Rows
+from probewise.world.surfaces import CoveredSurface, Oval, Surface, albedo_at
 from probewise.world.world import View, World, simulate
 
 __all__ = [

@@ -16,9 +16,8 @@ from scipy.special import ndtr, stdtrit
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.world.rows import Rows
 from probewise.world.spots import Blob, blurred, gaussian_spot
-from probewise.world.stages import FootprintPart, Stage
+from probewise.world.stages import FootprintPart, Rows, Stage
 
 
 @dataclass(frozen=True)

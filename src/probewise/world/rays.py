@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.recordings.patterns import Image, Ramp
-from probewise.world.edges import distance_to_nearest_edge
-from probewise.world.painting import Surface, albedo_at
 from probewise.world.spots import Spot
+from probewise.world.surfaces import Surface, albedo_at, distance_to_nearest_edge
 
 Retouch: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """(albedo, x_mm, y_mm), places in the lab frame, to changed albedo; arrays of one shape."""

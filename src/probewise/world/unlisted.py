@@ -10,8 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.rows import Rows
-from probewise.world.stages import FootprintPart, Stage
+from probewise.world.stages import FootprintPart, Rows, Stage
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
-from probewise.world.edges import common_edge_normal, distance_to_nearest_edge
-from probewise.world.painting import Surface
 from probewise.world.rays import seen_white_fraction
-from probewise.world.rows import Rows
 from probewise.world.spots import Spot
 from probewise.world.stages import (
     STAGES,
@@ -25,8 +22,10 @@ from probewise.world.stages import (
     Disturbs,
     FootprintPart,
     Retouches,
+    Rows,
     Stage,
 )
+from probewise.world.surfaces import Surface, common_edge_normal, distance_to_nearest_edge
 
 _Surfaces = Sequence[tuple[Surface, IntArray]]
 """Each surface with the rows read over it."""

@@ -2,10 +2,12 @@
 
 Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweights the samples. If the effective share of the
 samples falls below a limit, the reading's likelihood is tempered. At each temperature the samples are resampled and
-moved by Metropolis-Hastings steps on all readings so far. The evidence is the product of the mean weights. Thousands of
-samples still represent the small parts of the prior that a long search has left. The error of the evidence is estimated
-from the genealogy: if few initial samples are ancestors of the current ones, another start would give another evidence
-(Lee & Whiteley 2018).
+moved by Metropolis-Hastings steps on all readings so far. The evidence is the product of the mean weights. The error of
+the evidence is estimated from the genealogy: if few initial samples are ancestors of the current ones, another start
+would give another evidence (Lee & Whiteley 2018).
+
+Steps are proposed from Gaussians about the samples with local covariances, since the posterior after a few readings is
+a thin curved shell (all circles whose edge passes under one grey reading), for which a global covariance is useless.
 """
 
 from __future__ import annotations
@@ -13,50 +15,52 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Self
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
-from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
 from probewise.inference.problem import SensorProblem, checked_log_prob
 from probewise.nested import NestedResult, Weighted, pareto_k
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Prior
 
-_KEEP = 0.5  # least effective share of the samples without resampling
 _SURPRISED = 12.5  # nats by which even the best sample misses the last reading: five sds of Gaussian noise
 _STIFF = 0.5  # accepted steps per sample below which the moves are unreliable
 _MOST_ROUNDS = 6
 _MANY_DEGREES = 4
-_SEARCHED_FOR = 5  # readings that a search from scratch is good for, if its samples follow them with ease
+_SEARCH_HOLDS = 5  # readings for which a search from scratch is good, if its samples follow them with ease
 _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
+
+_MOST_KERNELS = 250
+_NEIGHBOURS = 10  # neighbours per parameter, enough for a covariance
+_RIDGE = 1e-6  # of the overall covariance, to avoid singular ones
+_RESOLUTION = 1e-9  # of a coordinate's mean, below which a spread is rounding error
+_SMALLEST = 1e-100  # spread of a coordinate that is zero in all points, whose square is still a number
+_BLOCK = 256  # points per batch, to fit the cache
+_FEW = 600  # points up to which all distances are faster than a tree
 
 
 @dataclass(frozen=True)
 class UpdateSettings:
     """Settings of an update by one reading: how thoroughly samples are resampled and moved.
 
-    Attributes
-    ----------
-    steps_per_sample
-        Accepted Metropolis-Hastings steps per sample to aim for.
-    n_kernels
-        Number of kernels that propose the steps.
-    least_share
-        Effective share of the samples below which these are resampled and moved.
-    most_temperatures
-        Largest number of temperatures. Samples that need more are far from the new posterior, and marked as strained.
+    `steps_per_sample` accepted Metropolis-Hastings steps per sample are aimed for, with `n_kernels` kernels, where the
+    effective share of the samples is below `least_share`. Samples that need more than `most_temperatures` are far from
+    the new posterior, and marked as strained.
     """
 
     steps_per_sample: float
     n_kernels: int
-    least_share: float = _KEEP
-    most_temperatures: float = math.inf
+    least_share: float
+    most_temperatures: float
 
 
-THOROUGH = UpdateSettings(1.5, MOST_KERNELS)
+THOROUGH = UpdateSettings(1.5, _MOST_KERNELS, 0.5, math.inf)
 STEADY = UpdateSettings(1.2, 120, 0.4, 12)
 BRIEF = UpdateSettings(1.0, 75, 0.3, 10)
 
@@ -108,7 +112,7 @@ class Particles:
 
     def is_search_old(self, n_readings: int) -> bool:
         """Return whether a search from scratch is due: none in five readings, or samples strained or hurried."""
-        return self.strained or self.hurried or n_readings >= self.searched_at + _SEARCHED_FOR
+        return self.strained or self.hurried or n_readings >= self.searched_at + _SEARCH_HOLDS
 
     @property
     def log_z(self) -> float:
@@ -123,10 +127,39 @@ class Particles:
         """
         if self.log_z == -math.inf:
             return math.inf
-        n = len(self.ancestor)
         lineages = np.bincount(self.ancestor, weights=self.weighted.weight)
-        related = float(lineages @ lineages) - (self.n_resampled + 1) / n
+        related = float(lineages @ lineages) - (self.n_resampled + 1) / len(self.ancestor)
         return max(math.sqrt(max(related, 0.0) + self.start_variance), self.weighted.log_z_error)
+
+    def with_zero_evidence(self) -> Self:
+        """Return the samples with an evidence of zero: none of them could have given the readings."""
+        return replace(self, weighted=replace(self.weighted, log_z=-math.inf, log_z_error=math.inf))
+
+
+def evenly_weighted(
+    names: tuple[str, ...],
+    theta: FloatArray,
+    log_likelihood: FloatArray,
+    *,
+    log_z: float,
+    log_z_error: float,
+    n_calls: int,
+    run: NestedResult | None = None,
+) -> Weighted:
+    """Return equally weighted samples with an evidence; theta (n, n_params), log_likelihood (n,)."""
+    n = len(theta)
+    return Weighted(
+        names,
+        theta,
+        log_likelihood=log_likelihood,
+        log_weight=np.full(n, -math.log(n)),
+        log_z=log_z,
+        log_z_error=log_z_error,
+        n_eff=float(n),
+        n_calls=n_calls,
+        pareto_k=-math.inf,
+        run=run,
+    )
 
 
 def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Particles:
@@ -138,18 +171,7 @@ def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator)
             prior.names,
             "one with mass: its draws must have a density above zero. Do its bounds leave room for anything?",
         )
-    even = np.full(n_particles, -math.log(n_particles))
-    drawn = Weighted(
-        prior.names,
-        theta,
-        log_likelihood=np.zeros(n_particles),
-        log_weight=even,
-        log_z=0.0,
-        log_z_error=0.0,
-        n_eff=float(n_particles),
-        n_calls=0,
-        pareto_k=-math.inf,
-    )
+    drawn = evenly_weighted(prior.names, theta, np.zeros(n_particles), log_z=0.0, log_z_error=0.0, n_calls=0)
     return Particles(drawn, np.arange(n_particles))
 
 
@@ -159,35 +181,20 @@ def update(
     *,
     rng: np.random.Generator,
     fall_back: Callable[[], NestedResult] | None = None,
-    effort: UpdateSettings | None = None,
+    effort: UpdateSettings = THOROUGH,
 ) -> Particles:
-    """Update the samples with the last reading of a problem.
+    """Update the samples with the last reading of a problem; `previous` are those given the earlier readings.
 
-    Parameters
-    ----------
-    previous
-        Posterior given the earlier readings.
-    problem
-        Prior, sensor model, likelihood, and all readings.
-    rng
-        Source of randomness.
-    fall_back
-        Function that solves the whole problem from scratch, called if no sample predicts the reading or the samples
-        cannot be moved. None: the samples continue and are marked as strained.
-    effort
-        How thoroughly samples are moved; by default `THOROUGH`, for a probable kind of hypotheses.
+    `fall_back` solves the whole problem from scratch, if no sample predicts the reading or the samples cannot be moved;
+    without it, the samples continue and are marked as strained. `effort` says how thoroughly samples are moved.
 
-    Returns
-    -------
-    Particles
-        As many samples as before; `weighted.run` is the run from scratch, if one was needed. If no sample could have
-        given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
+    Return as many samples as before; `weighted.run` is the run from scratch, if one was needed. If no sample could have
+    given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
     """
     last = _LastReadingEvaluator(problem)
     previous = replace(previous, log_z_limit=previous.log_z_limit + last.perfect_log_likelihood)
     before = previous.weighted
     n = len(before.theta)
-    effort = THOROUGH if effort is None else effort
     least = effort.least_share * n
     if before.log_z == -math.inf:
         return previous
@@ -207,7 +214,7 @@ def update(
         if all_at_once == 0.0:
             if fall_back is not None:
                 return _particles_from_run(fall_back(), n, last, n_calls, rng)
-            return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
+            return replace(previous.with_zero_evidence(), strained=True)
         given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
         strained |= given_up and all_at_once < least
         share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
@@ -219,18 +226,16 @@ def update(
         if share == 1.0 and n_eff >= least:
             break
         rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
-        now, moves = _move_by_metropolis(
-            now.take_rows(rows), share, last, rng, _partition_rows(rows) if fall_back is None else None, effort
-        )
-        n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
-        if moves.accepted < _STIFF:
+        parts = _partition_rows(rows) if fall_back is None else [np.arange(n)]
+        now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), share, last, rng, parts, effort)
+        n_calls, n_resampled, ancestor = n_calls + n_moves, n_resampled + 1, ancestor[rows]
+        if accepted < _STIFF:
             if fall_back is not None:
                 return _particles_from_run(fall_back(), n, last, n_calls, rng)
             strained = True
         base, log_weight = now.log_likelihood_at_power(share), np.full(n, -math.log(n))
         if share == 1.0:
             break
-    tail = pareto_k(log_weight) if n_eff < n else -math.inf
     found = Weighted(
         before.names,
         now.theta,
@@ -240,28 +245,22 @@ def update(
         log_z_error=math.sqrt(variance),
         n_eff=n_effective(log_weight),
         n_calls=before.n_calls + n_calls,
-        pareto_k=tail,
+        pareto_k=pareto_k(log_weight) if n_eff < n else -math.inf,
     )
     degrees = n_resampled - previous.n_resampled
-    hurried, with_ease = previous.hurried or degrees >= _MANY_DEGREES, degrees <= 1 and not strained
     return replace(
         previous,
         weighted=found,
         ancestor=ancestor,
         n_resampled=n_resampled,
         strained=strained,
-        hurried=hurried,
-        refitted=previous.refitted and with_ease,
+        hurried=previous.hurried or degrees >= _MANY_DEGREES,
+        refitted=previous.refitted and degrees <= 1 and not strained,
     )
 
 
 def resample_and_move(
-    particles: Particles,
-    n: int,
-    problem: SensorProblem,
-    *,
-    rng: np.random.Generator,
-    effort: UpdateSettings | None = None,
+    particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: UpdateSettings = THOROUGH
 ) -> Particles:
     """Resample to `n` samples, and move the copies apart; unchanged if there are `n` already or the evidence is 0.
 
@@ -271,35 +270,57 @@ def resample_and_move(
     if n == len(had.theta) or had.log_z == -math.inf:
         return particles
     rows = resampled_rows(had.weight, n, rng)
-    start = _EvaluatedSamples(
-        had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1))
+    log_likelihood = had.log_likelihood[rows]
+    moved = _EvaluatedSamples(
+        had.theta[rows], problem.prior.log_prob(had.theta[rows]), log_likelihood, log_likelihood.copy()
     )
-    moved, moves = (
-        _move_by_metropolis(start, 1.0, _LastReadingEvaluator(problem), rng, effort=effort)
-        if len(problem.recording)
-        else (start, _AcceptedStepsAndCalls(0.0, 0))
-    )
-    found = replace(_equally_weighted_posterior(moved, had), n_calls=had.n_calls + moves.n_calls)
+    n_moves = 0
+    if len(problem.recording):
+        last = _LastReadingEvaluator(problem)
+        moved, _, n_moves = _move_by_metropolis(moved, 1.0, last, rng, [np.arange(n)], effort)
+    found = replace(_replace_samples(had, moved), n_calls=had.n_calls + n_moves)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
 
 
 def particles_from_posterior(
-    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: UpdateSettings | None = None
+    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: UpdateSettings = THOROUGH
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     last = _LastReadingEvaluator(problem)
-    cloud = last.evaluate_samples(found.theta[resampled_rows(found.weight, n, rng)])
-    moved, moves = _move_by_metropolis(cloud, 1.0, last, rng, effort=effort)
-    drawn = replace(_equally_weighted_posterior(moved, found), n_calls=found.n_calls + n + moves.n_calls)
+    start = last.evaluate_samples(found.theta[resampled_rows(found.weight, n, rng)])
+    moved, _, n_moves = _move_by_metropolis(start, 1.0, last, rng, [np.arange(n)], effort)
+    drawn = replace(_replace_samples(found, moved), n_calls=found.n_calls + n + n_moves)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 
 
-def _equally_weighted_posterior(cloud: _EvaluatedSamples, of: Weighted) -> Weighted:
-    """Return `of` with its own samples replaced by those of `cloud`, equally weighted; the evidence stays."""
-    n = len(cloud.theta)
-    even = np.full(n, -math.log(n))
+def _particles_from_run(
+    run: NestedResult, n: int, last: _LastReadingEvaluator, n_calls: int, rng: np.random.Generator
+) -> Particles:
+    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
+    start = last.evaluate_samples(run.samples(n, rng=rng))
+    moved, _, n_moves = _move_by_metropolis(start, 1.0, last, rng, [np.arange(n)], THOROUGH)
+    drawn = evenly_weighted(
+        run.names,
+        moved.theta,
+        moved.after,
+        log_z=run.log_z,
+        log_z_error=run.log_z_error,
+        n_calls=n_calls + run.n_calls + n + n_moves,
+        run=run,
+    )
+    return Particles(drawn, np.arange(n), run.log_z_error**2)
+
+
+def _replace_samples(posterior: Weighted, samples: _EvaluatedSamples) -> Weighted:
+    """Return a posterior with other samples, equally weighted; the evidence stays."""
+    n = len(samples.theta)
     return replace(
-        of, theta=cloud.theta, log_likelihood=cloud.after, log_weight=even, n_eff=float(n), pareto_k=-math.inf
+        posterior,
+        theta=samples.theta,
+        log_likelihood=samples.after,
+        log_weight=np.full(n, -math.log(n)),
+        n_eff=float(n),
+        pareto_k=-math.inf,
     )
 
 
@@ -336,10 +357,7 @@ class _LastReadingEvaluator:
     problem: SensorProblem
 
     def least_misfit_nats(self, predicted: FloatArray) -> float:
-        """Return by how many nats the best of the predictions falls short of a perfect one at the last reading.
-
-        If that reading is missing, return 0.
-        """
+        """Return by how many nats the best prediction of the last reading misses it; 0 if that reading is missing."""
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0
@@ -349,24 +367,23 @@ class _LastReadingEvaluator:
     @property
     def perfect_log_likelihood(self) -> float:
         """Log likelihood of the last reading if predicted exactly; 0 if that reading is missing."""
-        recording = self.problem.recording
-        reading = recording.readings[-1:]
-        return (
-            float(checked_log_prob(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
-        )
+        reading = self.problem.recording.readings[-1:]
+        if not self.problem.recording.usable[-1]:
+            return 0.0
+        return float(checked_log_prob(self.problem.likelihood, reading, reading[None])[0])
 
     def log_likelihoods_without_and_with(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, from predictions, -> (n_samples,) each."""
-        usable = self.problem.recording.usable
+        usable, readings = self.problem.recording.usable, self.problem.recording.readings
         earlier = usable.copy()
         earlier[-1] = False
-        return self._log_likelihood_of_rows(predicted, earlier), self._log_likelihood_of_rows(predicted, usable)
-
-    def _log_likelihood_of_rows(self, predicted: FloatArray, rows: BoolArray) -> FloatArray:
-        """Return the log likelihood, (n_samples,), of the readings that the mask `rows` marks; 0 for none."""
-        if not rows.any():
-            return np.zeros(len(predicted))
-        return checked_log_prob(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
+        without, with_last = (
+            checked_log_prob(self.problem.likelihood, readings[rows], predicted[:, rows])
+            if rows.any()
+            else np.zeros(len(predicted))
+            for rows in (earlier, usable)
+        )
+        return without, with_last
 
     def evaluate_samples(self, theta: FloatArray) -> _EvaluatedSamples:
         """Evaluate prior and likelihoods of samples; those outside the prior get a likelihood of zero."""
@@ -380,34 +397,25 @@ class _LastReadingEvaluator:
         return _EvaluatedSamples(theta, log_prior, before, after)
 
 
-@dataclass(frozen=True)
-class _AcceptedStepsAndCalls:
-    """Mean number of accepted steps per sample, and number of likelihood evaluations."""
-
-    accepted: float
-    n_calls: int
-
-
 def _move_by_metropolis(
     start: _EvaluatedSamples,
     share: float,
     last: _LastReadingEvaluator,
     rng: np.random.Generator,
-    parts: Sequence[IntArray] | None = None,
-    effort: UpdateSettings | None = None,
-) -> tuple[_EvaluatedSamples, _AcceptedStepsAndCalls]:
+    parts: Sequence[IntArray],
+    effort: UpdateSettings,
+) -> tuple[_EvaluatedSamples, float, int]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
     That density has the last reading's likelihood to the power `share`. A round is a proposal from kernels fitted to
     the samples, then one along the difference of two samples (ter Braak 2006): the first follows curved shells in few
     dimensions, the second works in many. Each of `parts` (rows of the samples) is moved by kernels fitted to the
-    previous part, since kernels fitted to the moved samples themselves would be biased.
+    previous part, since kernels fitted to the moved samples themselves would be biased. Return the samples, the mean
+    number of accepted steps per sample, and the number of likelihood evaluations.
     """
     n, n_params = start.theta.shape
     if len(np.unique(start.theta[:, 0])) <= 2 * n_params:  # too few distinct samples to fit kernels
-        return start, _AcceptedStepsAndCalls(0.0, 0)
-    parts = [np.arange(n)] if parts is None else parts
-    effort = THOROUGH if effort is None else effort
+        return start, 0.0, 0
     kernels = [LocalKernels.fitted_to(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
     now, accepted, n_calls = start, 0.0, 0
     for _ in range(_MOST_ROUNDS):
@@ -429,7 +437,7 @@ def _move_by_metropolis(
             accepted += float(taken.mean())
         if accepted >= effort.steps_per_sample:
             break
-    return now, _AcceptedStepsAndCalls(accepted, n_calls)
+    return now, accepted, n_calls
 
 
 def _propose_from_kernels(
@@ -461,13 +469,11 @@ def _partition_rows(rows: IntArray) -> list[IntArray]:
 
 def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, share: float, enough: float) -> float:
     """Return the largest power above `share` of the last reading's likelihood with `enough` effective samples."""
-    low, _ = power_bracket(
-        lambda power: _updated_log_weights(log_weight, now.log_likelihood_at_power(power), base),
-        share,
-        1.0,
-        wanted=enough,
-        n_steps=30,
-    )
+
+    def log_weights_at(power: float) -> FloatArray:
+        return _updated_log_weights(log_weight, now.log_likelihood_at_power(power), base)
+
+    low, _ = power_bracket(log_weights_at, share, 1.0, wanted=enough, n_steps=30)
     return max(low, share + 1e-6)
 
 
@@ -477,28 +483,89 @@ def _updated_log_weights(log_weight: FloatArray, after: FloatArray, before: Floa
     return np.asarray(np.where(alive, log_weight + after - np.where(alive, before, 0.0), -np.inf))
 
 
-def _particles_from_run(
-    run: NestedResult,
-    n: int,
-    last: _LastReadingEvaluator,
-    n_calls: int,
-    rng: np.random.Generator,
-) -> Particles:
-    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
-    found = last.evaluate_samples(run.samples(n, rng=rng))
-    moved, moves = _move_by_metropolis(found, 1.0, last, rng)
-    even = np.full(n, -math.log(n))
-    calls = n_calls + run.n_calls + n + moves.n_calls
-    drawn = Weighted(
-        run.names,
-        moved.theta,
-        log_likelihood=moved.after,
-        log_weight=even,
-        log_z=run.log_z,
-        log_z_error=run.log_z_error,
-        n_eff=float(n),
-        n_calls=calls,
-        pareto_k=-math.inf,
-        run=run,
-    )
-    return Particles(drawn, np.arange(n), run.log_z_error**2)
+@dataclass(frozen=True, eq=False)
+class LocalKernels:
+    """A mixture of equally weighted Gaussians.
+
+    `centre` (n_kernels, n_params) are the means relative to `origin`, `root` (n_kernels, n_params, n_params) the
+    Cholesky factors of the covariances. A point's features (1, its coordinates relative to `origin`, the products of
+    two coordinates) times `form` (n_features, n_kernels) are the log densities of the kernels there.
+    """
+
+    origin: FloatArray
+    centre: FloatArray
+    root: FloatArray
+    form: FloatArray
+
+    @classmethod
+    def fitted_to(
+        cls, points: FloatArray, *, rng: np.random.Generator, widened: float = 1.0, most: int = _MOST_KERNELS
+    ) -> Self:
+        """Fit at most `most` kernels to equally weighted samples, (n_samples, n_params), `widened` times as wide."""
+        n_samples, n_params = points.shape
+        origin = points.mean(axis=0)
+        away = points - origin
+        scale = np.maximum(points.std(axis=0), np.maximum(_RESOLUTION * np.abs(origin), _SMALLEST))
+        rows = rng.permutation(n_samples)[: min(most, (n_samples + 1) // 2)]
+        n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
+        near = _nearest_rows(away / scale, rows, n_near)
+        spread = away[near] - away[near].mean(axis=1, keepdims=True)
+        overall = np.atleast_2d(np.cov(points, rowvar=False))
+        covariance = np.einsum("kni,knj->kij", spread, spread) / n_near
+        covariance += _RIDGE * (overall + np.diag(scale**2))
+        covariance *= widened**2
+        return cls.from_moments(away[rows], covariance, origin=origin)
+
+    @classmethod
+    def from_moments(cls, centre: FloatArray, covariance: FloatArray, *, origin: FloatArray | None = None) -> Self:
+        """Build from centres, (n_kernels, n_params), and covariances, (n_kernels, n_params, n_params).
+
+        The centres are relative to `origin`; without it, absolute.
+        """
+        if origin is None:
+            origin = np.asarray(centre.mean(axis=0))
+            centre = centre - origin
+        n_params = centre.shape[1]
+        root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+        precision = np.linalg.inv(covariance)
+        log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        pull = np.einsum("kij,kj->ki", precision, centre)
+        constant = -0.5 * (np.einsum("ki,ki->k", pull, centre) + log_det + n_params * math.log(2 * math.pi))
+        upper = _upper_triangle_indices(n_params)
+        product = -np.where(upper[0] == upper[1], 0.5, 1.0) * precision[:, upper[0], upper[1]]
+        return cls(origin, centre, root, np.concatenate([constant[:, None], pull, product], axis=1).T)
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, n_params)."""
+        which = rng.integers(len(self.centre), size=n)
+        white = rng.standard_normal((n, self.centre.shape[1]))
+        return np.asarray(self.origin + self.centre[which] + np.einsum("nij,nj->ni", self.root[which], white))
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return the natural log of the mixture's density at points, (n, n_params) -> (n,)."""
+        upper = _upper_triangle_indices(points.shape[1])
+        out = np.empty(len(points))
+        for start in range(0, len(points), _BLOCK):
+            away = points[start : start + _BLOCK] - self.origin
+            features = np.concatenate([np.ones((len(away), 1)), away, away[:, upper[0]] * away[:, upper[1]]], axis=1)
+            each = features @ self.form
+            most = each.max(axis=1)
+            # Only the nearest kernels matter, and single precision suffices for a proposal density.
+            each -= most[:, None]
+            out[start : start + _BLOCK] = most + np.log(np.exp(each.astype(np.float32)).sum(axis=1))
+        return out - math.log(len(self.centre))
+
+
+def _nearest_rows(points: FloatArray, rows: IntArray, n: int) -> IntArray:
+    """Return the indices, (n_rows, n), of the `n` points nearest to each point of `rows`, itself included; no order."""
+    if len(points) > _FEW:
+        return np.asarray(cKDTree(points).query(points[rows], k=n)[1].reshape(len(rows), n))
+    square = (points**2).sum(axis=1)
+    away = square - 2.0 * points[rows] @ points.T  # less the row's own square, the same for all
+    return np.asarray(np.argpartition(away, n - 1, axis=1)[:, :n])
+
+
+@cache
+def _upper_triangle_indices(n_params: int) -> tuple[IntArray, IntArray]:
+    """Return row and column indices of the upper triangle of a matrix, diagonal included."""
+    return np.triu_indices(n_params)

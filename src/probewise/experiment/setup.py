@@ -1,4 +1,4 @@
-"""The configuration of a run: hypotheses, sensor, designs, utility, stopping rule."""
+"""The setup of a run: hypotheses, sensor, arm, designs, utility, stopping rule."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._kinds import checked_number, require_callable
+from probewise._kinds import checked_number, require_callable, require_kind
 from probewise._version import __version__
+from probewise.arm.geometry import Geometry, place_jacobian
 from probewise.arm.instrument import Reading
+from probewise.calibration.sensor_file import FittedSensor
 from probewise.errors import ParameterError
-from probewise.experiment.digest import value_digest
-from probewise.experiment.fitted_arm import FittedArm
-from probewise.experiment.journal import recording_of
+from probewise.experiment.journal import recording_of, value_digest
 from probewise.experiment.kinds import HypothesisKind, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
-from probewise.experiment.pace import Pace
-from probewise.experiment.rivals import SensorModelRival, rivals_of
+from probewise.experiment.rivals import Pace, SensorModelRival, rivals_of
 from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
-from probewise.inference.student_t import StudentT
 from probewise.inquiry import (
     Designs,
     Finishing,
@@ -37,13 +35,76 @@ from probewise.inquiry import (
     forecast_of,
 )
 from probewise.priors import Joint, Prior
-from probewise.recordings.plan import Instrumentation, Recording
+from probewise.recordings.plan import Instrumentation
 from probewise.scene import Card
 from probewise.scene.albedo import Shape, require_shape
 from probewise.scene.any_of import AnyOf
 from probewise.sensor.stages import SensorModel
 
+
+@dataclass(frozen=True, eq=False)
+class FittedArm:
+    """Geometry of a run's arm and levels of its sensor, so that the stated sds include the arm's own error.
+
+    Parameters
+    ----------
+    geometry
+        The arm's geometry, fitted to marks; ParameterError for one without accuracy.
+    levels
+        Readings over black and over white. Light above black falls with the height by `geometry.light_per_mm`, or with
+        the height's square if that is None.
+    calibrated_mm
+        Place on the field where this arm took the readings of the calibration: the sensor's levels include the error of
+        the height there. A sensor's file does not say it; None assumes the middle of the field, where the command `arm
+        record` lays a plan unless it is told otherwise. ParameterError for a place out of the arm's reach.
+    """
+
+    geometry: Geometry
+    levels: tuple[float, float]
+    calibrated_mm: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        require_kind("geometry", self.geometry, Geometry, "a Geometry, such as read_geometry(path) returns")
+        if self.geometry.accuracy is None:
+            raise ParameterError("geometry", "one without [accuracy]", "one that was fitted to marks")
+        if not _reads_at(self.geometry, self.calibration_place_mm):
+            allowed = "a place within the arm's reach, at which it took the readings of the calibration"
+            raise ParameterError("calibrated_mm", self.calibration_place_mm, allowed)
+
+    @property
+    def calibration_place_mm(self) -> tuple[float, float]:
+        """Place of the calibration, or the middle of the field, which is assumed."""
+        return _middle_of_field(self.geometry) if self.calibrated_mm is None else self.calibrated_mm
+
+    @classmethod
+    def from_geometry_and_sensor(cls, geometry: Geometry, sensor: FittedSensor) -> Self:
+        """Build from a fitted geometry, with the sensor's posterior mean levels.
+
+        The calibration is assumed in the middle of the field, or, of an arm that does not reach that, at the nearest
+        place that it does.
+        """
+        require_kind("geometry", geometry, Geometry, "a Geometry, such as read_geometry(path) returns")
+        means, middle = sensor.mean(), _middle_of_field(geometry)
+        places = geometry.reachable_grid_mm
+        calibrated_mm = None
+        if not _reads_at(geometry, middle) and len(places):
+            x_mm, y_mm = places[np.hypot(*(places - middle).T).argmin()].tolist()
+            calibrated_mm = (x_mm, y_mm)
+        return cls(geometry, (means["I_min"], means["I_max"]), calibrated_mm)
+
+
+def _middle_of_field(geometry: Geometry) -> tuple[float, float]:
+    width_mm, height_mm = geometry.field_mm
+    return width_mm / 2, height_mm / 2
+
+
+def _reads_at(geometry: Geometry, place_mm: tuple[float, float]) -> bool:
+    """Return whether the effect of the arm's error at a place is defined: whether the links reach that far and near."""
+    return bool(np.isfinite(place_jacobian(geometry, np.array([place_mm]))).all())
+
+
 _MOST_BATCH = 100
+_LEAST_PARTICLES = 100
 _MOST_LIFTED = 10.0
 """Largest factor between reading height and calibrated height, either way."""
 
@@ -51,26 +112,16 @@ MOST_OFF = 0.01
 """Probability of a wrong length below which a run with doubt in its sensor may end."""
 
 
-@dataclass(frozen=True)
-class OneScan:
-    """Student-t likelihood of any number of readings that share one unknown noise sd (paper, SSF likelihood).
-
-    `sd_floor` and `sd_ceiling` bound the sd, in the sensor's unit; its prior is 1/sigma between them.
-    """
-
-    sd_floor: float
-    sd_ceiling: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.sd_floor < self.sd_ceiling < math.inf:
-            raise ParameterError(
-                "sd_floor, sd_ceiling", (self.sd_floor, self.sd_ceiling), "0 < floor < ceiling, finite"
-            )
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log likelihood, (n_samples,), of readings (n_points,) given predictions (n_samples, n_points)."""
-        one = np.zeros(readings.size, dtype=np.int64)
-        return StudentT(one, self.sd_floor, self.sd_ceiling).log_prob(readings, predicted)
+_SETTINGS_OF_RUN = (
+    "batch",
+    "stop_sd_mm",
+    "stop_probability",
+    "doubt_p",
+    "trust",
+    "n_particles",
+    "n_samples",
+    "n_live",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,54 +212,38 @@ class Experiment:
         require_likelihood(self.likelihood)
         checked_number("noise_sd", self.noise_sd)
         require_callable("utility", self.utility, "a utility of probewise.inquiry, such as InformationGain()")
-        self._require_thresholds_in_range()
-        self._require_counts()
-        self._require_heights()
-        if self.model.names != self.prior.names:
-            raise ParameterError(
-                "model.names",
-                self.model.names,
-                f"{self.prior.names}: the sensor's that are not known, then the shape's",
-            )
-        if not any(name.endswith("_mm") for name in self.shape.prior.names):
-            raise ParameterError("shape", self.names, "a shape with a parameter in mm, which the run can stop on")
+        most = _MOST_BATCH if self.utility in (Finishing(), InformationGain()) else 1
+        many = f"1, or up to {_MOST_BATCH} with the utility Finishing() or InformationGain()"
+        heights, known_mm = self.heights_mm, self.calibrated_height_mm
+        low, high = (0.0, math.inf) if known_mm is None else (known_mm / _MOST_LIFTED, known_mm * _MOST_LIFTED)
+        lifted = f"{low:g} to {high:g}: the sensor was calibrated at {known_mm or 0:g} mm"
+        positive = all(0 < height < math.inf for height in (*heights, known_mm or 1.0))
+        of_shape = f"{self.prior.names}: the sensor's that are not known, then the shape's"
+        has_lengths = any(name.endswith("_mm") for name in self.shape.prior.names)
+        for name, value, fits, allowed in (
+            ("stop_sd_mm", self.stop_sd_mm, 0 < self.stop_sd_mm < math.inf, "finite, greater than 0"),
+            ("stop_probability", self.stop_probability, 0 < self.stop_probability < 1, "between 0 and 1"),
+            ("trust", self.trust, 0 < self.trust <= 1, "greater than 0, up to 1"),
+            ("doubt_p", self.doubt_p, 0 <= self.doubt_p < 1, "0 or more, below 1"),
+            ("n_samples", self.n_samples, self.n_samples >= 2, "2 or more: one hypothesis leaves nothing to ask"),
+            (
+                "n_particles",
+                self.n_particles,
+                self.n_particles >= max(self.n_samples, _LEAST_PARTICLES),
+                f"{_LEAST_PARTICLES} or more, and no fewer than n_samples",
+            ),
+            ("batch", self.batch, 1 <= self.batch <= most, many),
+            ("calibrated_height_mm", None, known_mm or not heights, "a height where heights_mm may be chosen"),
+            ("heights_mm", heights, positive, "finite, greater than 0"),
+            ("heights_mm", heights, all(low <= height <= high for height in heights), lifted),
+            ("model.names", self.model.names, self.model.names == self.prior.names, of_shape),
+            ("shape", self.names, has_lengths, "a shape with a parameter in mm, which the run can stop on"),
+        ):
+            if not fits:
+                raise ParameterError(name, value, allowed)
         if self.trust < 1:
             _ = self._rivals
         _ = self.readout, self.designs  # their constructors check the values
-
-    def _require_thresholds_in_range(self) -> None:
-        """Raise ParameterError unless target sd and probability of the stopping rule, trust and doubt are in range."""
-        if not 0 < self.stop_sd_mm < math.inf:
-            raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
-        if not 0 < self.stop_probability < 1:
-            raise ParameterError("stop_probability", self.stop_probability, "between 0 and 1")
-        if not 0 < self.trust <= 1:
-            raise ParameterError("trust", self.trust, "greater than 0, up to 1")
-        if not 0 <= self.doubt_p < 1:
-            raise ParameterError("doubt_p", self.doubt_p, "0 or more, below 1")
-
-    def _require_counts(self) -> None:
-        """Raise ParameterError unless the numbers of samples, and of readings chosen together, are allowed."""
-        if self.n_samples < 2:
-            raise ParameterError("n_samples", self.n_samples, "2 or more: one hypothesis leaves nothing to ask")
-        if self.n_particles < max(self.n_samples, 100):
-            raise ParameterError("n_particles", self.n_particles, "100 or more, and no fewer than n_samples")
-        most = _MOST_BATCH if self.utility in (Finishing(), InformationGain()) else 1
-        if not 1 <= self.batch <= most:
-            allowed = f"1, or up to {_MOST_BATCH} with the utility Finishing() or InformationGain()"
-            raise ParameterError("batch", self.batch, allowed)
-
-    def _require_heights(self) -> None:
-        """Raise ParameterError unless the heights are positive and within a factor of ten of the calibration's."""
-        if self.heights_mm and self.calibrated_height_mm is None:
-            raise ParameterError("calibrated_height_mm", None, "a height where heights_mm may be chosen")
-        if not all(0 < height < math.inf for height in (*self.heights_mm, self.calibrated_height_mm or 1.0)):
-            raise ParameterError("heights_mm", self.heights_mm, "finite, greater than 0")
-        if self.calibrated_height_mm is not None:
-            low, high = self.calibrated_height_mm / _MOST_LIFTED, self.calibrated_height_mm * _MOST_LIFTED
-            if not all(low <= height <= high for height in self.heights_mm):
-                allowed = f"{low:g} to {high:g}: the sensor was calibrated at {self.calibrated_height_mm:g} mm"
-                raise ParameterError("heights_mm", self.heights_mm, allowed)
 
     @cached_property
     def inference_method(self) -> Method:
@@ -271,7 +306,9 @@ class Experiment:
         """Return the inference problem for these readings; with `trust` below 1, its times are paced (see `Pace`)."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
         if not self.heights_mm and self.calibrated_height_mm is not None:
-            recording = _without_commanded_heights(recording)
+            # All readings count as ones at the declared height, as the designs do.
+            covariates = {name: column for name, column in recording.plan.covariates.items() if name != "height_mm"}
+            recording = replace(recording, plan=replace(recording.plan, covariates=covariates))
         if self.trust < 1:
             recording = Pace.from_readings(readings).recording_with_paced_time(recording)
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
@@ -293,14 +330,9 @@ class Experiment:
     def may_stop(self, sd: FloatArray, shapes: Mapping[str, float], chance_off: float = 0.0) -> bool:
         """Return whether the stopping rule is met: the shape is known to the target precision.
 
-        Parameters
-        ----------
-        sd, shapes
-            Posterior sds of the shape's parameters, and the shapes' probabilities.
-        chance_off
-            Probability that a length is off by three times the target sd, see
-            `stopping_rule.probability_of_length_off`. With `trust` below 1, this probability must be below 1 %, since
-            the posterior then has tails that sds do not show.
+        `sd` and `shapes` are posterior sds of the shape's parameters and the shapes' probabilities, `chance_off` the
+        probability that a length is off by three times the target sd. With `trust` below 1, that must be below 1 %,
+        since the posterior then has tails that sds do not show.
         """
         likely = max(shapes.values(), default=1.0)
         sure = self.trust == 1 or chance_off < MOST_OFF
@@ -313,14 +345,10 @@ class Experiment:
     def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
         """Return the settings for a journal's first line as JSON values; models and likelihoods also by digest."""
         method = {} if self.method is None else {"method": repr(self.method)}
+        entropy = seed.entropy
         return {
             "version": __version__,
-            "field": {
-                "width_mm": self.grid.width_mm,
-                "height_mm": self.grid.height_mm,
-                "n_x": self.grid.n_x,
-                "n_y": self.grid.n_y,
-            },
+            "field": {name: getattr(self.grid, name) for name in ("width_mm", "height_mm", "n_x", "n_y")},
             "shape": repr(self.shape),
             "model": type(self.model).__name__,
             "sensor": value_digest(self.model),
@@ -330,40 +358,20 @@ class Experiment:
             "utility": repr(self.utility),
             **method,
             **({} if self.fitted_arm is None else {"fitted_arm": value_digest(self.fitted_arm)}),
-            "seed": seed_text(seed),
+            # As text, since that integer may exceed a JSON number.
+            "seed": str(entropy) if isinstance(entropy, int) else ",".join(str(word) for word in entropy or ()),
             "spawn_key": list(seed.spawn_key),
             "options": {
-                "noise_sd": self.noise_sd,
-                "step": self.step,
+                **{name: getattr(self, name) for name in ("noise_sd", "step")},
                 "reading_range": [None if math.isinf(end) else end for end in self.reading_range],
-                "orientations_rad": list(self.orientations_rad),
-                "repeats": list(self.repeats),
-                "heights_mm": list(self.heights_mm),
+                **{name: list(getattr(self, name)) for name in ("orientations_rad", "repeats", "heights_mm")},
                 # Journals name it only beside heights to choose from; otherwise the sensor's file stands for it.
                 "calibrated_height_mm": self.calibrated_height_mm if self.heights_mm else None,
-                "batch": self.batch,
-                "stop_sd_mm": self.stop_sd_mm,
-                "stop_probability": self.stop_probability,
-                "doubt_p": self.doubt_p,
-                "trust": self.trust,
-                "n_particles": self.n_particles,
-                "n_samples": self.n_samples,
-                "n_live": self.n_live,
+                **{name: getattr(self, name) for name in _SETTINGS_OF_RUN},
             },
         }
-
-
-def _without_commanded_heights(recording: Recording) -> Recording:
-    """Return a recording whose readings all count as ones at the declared height, as the designs of the run do."""
-    covariates = {name: column for name, column in recording.plan.covariates.items() if name != "height_mm"}
-    return replace(recording, plan=replace(recording.plan, covariates=covariates))
 
 
 def largest_sd_mm(names: tuple[str, ...], sd: FloatArray) -> float:
     """Return the largest sd among the parameters whose names end in _mm; NaN is ignored."""
     return float(np.nanmax([value for name, value in zip(names, sd, strict=True) if name.endswith("_mm")]))
-
-
-def seed_text(seed: np.random.SeedSequence) -> str:
-    """Return the seed's entropy as text, since that integer may exceed a JSON number."""
-    return str(seed.entropy) if isinstance(seed.entropy, int) else ",".join(str(word) for word in seed.entropy or ())

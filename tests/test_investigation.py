@@ -1,6 +1,8 @@
-"""The loop of an investigation: when it goes on, what it asks, and why it ends."""
+"""Investigations: rounds until an explanation is settled, the budget, the folder that keeps the readings."""
 
+import math
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,13 +11,20 @@ import pytest
 from probewise.arm import carry_out
 from probewise.calibration import FittedSensor, posterior_mean_ssf_field
 from probewise.diagnosis import Hypothesis
-from probewise.errors import ParameterError
-from probewise.investigation import Budget, investigate, reason_if_settled
+from probewise.errors import FileError, ParameterError
+from probewise.investigation import (
+    Budget,
+    RoundsFolder,
+    SimulatedRecorder,
+    investigate,
+    parse_concealed,
+    reason_if_settled,
+)
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.sensor import mixture_parameter_names
 from probewise.world import World
-from probewise.world.concealed import Backlash
-from probewise.world.shipped import BLOB
+from probewise.world.concealed import Backlash, Lag, Saturation
+from probewise.world.shipped import BLOB, true_world
 from probewise.world.spots import gaussian_spot
 
 
@@ -42,7 +51,7 @@ def diagnosed(monkeypatch):
             calls.append((list(recordings), options))
             return next(waiting)
 
-        monkeypatch.setattr("probewise.investigation.loop.diagnose", diagnose)
+        monkeypatch.setattr("probewise.investigation.diagnose", diagnose)
         return calls
 
     return with_results
@@ -166,3 +175,150 @@ def test_an_instrument_at_another_height_than_its_sensors_calibration_goes_on_to
     repaired = found.repaired.fitted_sensor(found.recording, rng=np.random.default_rng(0))
     assert repaired.instrumentation.height_mm == 16.0
     assert abs(repaired.median()["u_1"]) < 0.1
+
+
+def first_scans(n):
+    plan = paper_plan()
+    return plan.take(plan.scan < n)
+
+
+def test_a_plan_that_can_be_afforded_is_taken_whole():
+    plan = first_scans(2)
+    assert Budget(len(plan)).affordable_scans(plan, 0.0) is plan
+
+
+def test_scans_are_taken_whole_or_not_at_all():
+    plan = first_scans(2)
+    n_first = int((plan.scan == 0).sum())
+    cut = Budget(len(plan) - 1).affordable_scans(plan, 0.0)
+    assert len(cut) == n_first
+    assert cut.scan_names == plan.scan_names[:1]
+
+
+def test_what_is_too_dear_is_not_taken():
+    plan = first_scans(1)
+    assert Budget(len(plan) - 1).affordable_scans(plan, 0.0) is None
+    assert Budget(minutes=0.001).affordable_scans(plan, 0.0) is None
+
+
+def test_minutes_count_from_the_end_of_the_last_round():
+    plan = first_scans(1)
+    minutes = float(plan.time_s.max() + 600.0) / 60
+    assert Budget(minutes=minutes + 0.01).affordable_scans(plan, -600.0) is plan
+    assert Budget(minutes=minutes - 0.01).affordable_scans(plan, -600.0) is None
+
+
+def test_spending_never_leaves_less_than_nothing():
+    left = Budget(10, 1.0).minus(first_scans(1), 0.0)
+    assert (left.readings, left.minutes) == (0, pytest.approx(max(1.0 - first_scans(1).time_s.max() / 60, 0.0)))
+
+
+@pytest.mark.parametrize("wrong", [-1, math.nan])
+def test_a_budget_below_nothing_is_refused(wrong):
+    with pytest.raises(ParameterError, match="0 or more"):
+        Budget(readings=wrong)
+    with pytest.raises(ParameterError, match="0 or more"):
+        Budget(minutes=wrong)
+
+
+def test_an_empty_budget_affords_nothing():
+    assert Budget(0).affordable_scans(first_scans(1), 0.0) is None
+    assert np.isinf(Budget().minutes)
+
+
+TAKE = SimulatedRecorder(true_world("paper"), seed=3)
+
+
+class Cut(Exception):
+    pass
+
+
+def few_rows():
+    plan = paper_plan()
+    return plan.take(plan.scan < 1)
+
+
+def cut_after(n):
+    def take(number, plan, asked, taken):
+        for k, reading in enumerate(TAKE(number, plan, asked, taken)):
+            if k == n:
+                raise Cut
+            yield reading
+
+    return take
+
+
+@pytest.mark.slow
+def test_a_round_that_was_cut_is_the_round_that_was_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("probewise.investigation._KEPT_AGAIN_S", 0.0)
+    whole = RoundsFolder(tmp_path / "whole", {"seed": 1}, resume=False).record_round(1, few_rows(), "", take=TAKE)
+    with pytest.raises(Cut):
+        RoundsFolder(tmp_path / "cut", {"seed": 1}, resume=False).record_round(1, few_rows(), "", take=cut_after(5))
+    folder = RoundsFolder(tmp_path / "cut", {"seed": 1}, resume=True)
+    assert folder.n_readings == 5
+    resumed = folder.record_round(1, few_rows(), "", take=TAKE)
+    assert (tmp_path / "cut" / "1.csv").read_bytes() == (tmp_path / "whole" / "1.csv").read_bytes()
+    np.testing.assert_array_equal(resumed.readings, whole.readings)
+
+
+def test_an_instrument_that_fails_soon_loses_no_reading(tmp_path):
+    folder = RoundsFolder(tmp_path / "rounds", {"seed": 1}, resume=False)
+    with pytest.raises(Cut):
+        folder.record_round(1, few_rows(), "", take=cut_after(5))
+    assert folder.n_readings == 5
+
+
+def test_a_plan_that_was_written_decides(tmp_path):
+    folder = RoundsFolder(tmp_path / "rounds", {"seed": 1}, resume=False)
+    first = folder.record_round(1, few_rows(), "", take=TAKE)
+    other = few_rows().take(np.arange(3))
+    np.testing.assert_array_equal(folder.record_round(1, other, "", take=TAKE).readings, first.readings)
+
+
+def test_two_investigations_do_not_mix(tmp_path):
+    begin = partial(RoundsFolder, tmp_path / "rounds")
+    with pytest.raises(FileError, match="omit --resume to begin a new one"):
+        begin({"seed": 1}, resume=True)
+    begin({"seed": 1}, resume=False).record_round(1, few_rows(), "", take=TAKE)
+    with pytest.raises(FileError, match="--resume to continue it"):
+        begin({"seed": 1}, resume=False)
+    with pytest.raises(FileError, match="seed 1"):
+        begin({"seed": 2}, resume=True)
+    (tmp_path / "rounds" / "settings.json").write_text("[1]")
+    with pytest.raises(FileError, match="no JSON object"):
+        begin({"seed": 1}, resume=True)
+
+
+def test_a_round_that_was_cut_goes_on_to_the_same_readings():
+    take = SimulatedRecorder(true_world("paper"), seed=3)
+    whole = list(take(2, few_rows(), "", ()))
+    assert list(take(2, few_rows(), "", whole[:7])) == whole[7:]
+
+
+def test_each_round_has_noise_of_its_own():
+    take = SimulatedRecorder(true_world("paper"), seed=3)
+    one, other = ([r.value for r in take(number, few_rows(), "", ())] for number in (1, 2))
+    assert one != other
+
+
+def test_what_a_world_conceals_is_read_from_its_name_and_numbers():
+    assert parse_concealed("nothing") == ()
+    assert parse_concealed("backlash:0.5+lag:2") == (Backlash(0.5), Lag(2.0))
+    assert parse_concealed("saturation:55,1.5") == (Saturation(55.0, 1.5),)
+
+
+@pytest.mark.parametrize(
+    ("text", "way_out"),
+    [
+        ("backlash", "backlash:width_mm"),
+        ("backlash:x", "backlash:width_mm"),
+        ("backlash:1,2", "backlash:width_mm"),
+        ("backlash:nan", "magnitude up to 1e"),
+        ("backlash:0.5+lag:1e300", "magnitude up to 1e"),
+        ("bcklash:1", "did you mean backlash"),
+        ("", "nothing"),
+    ],
+)
+def test_what_is_no_effect_is_refused_with_the_way_out(text, way_out):
+    with pytest.raises(ParameterError, match=way_out):
+        parse_concealed(text)

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.world import Oval, albedo_at
-from probewise.world.edges import common_edge_normal, distance_to_nearest_edge
+from probewise.world.surfaces import common_edge_normal, distance_to_nearest_edge
 
 SURFACES = {
     "half plane": HalfPlane(0.7, 1.3),

@@ -1,30 +1,23 @@
-"""The sensor learnt along with the shape: a wrong SSF is rescued."""
+"""The experiment of a fitted sensor: its effects, and the sensor as an unknown beside the shape."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from exploring import run
 
 from probewise.arm.instrument import Reading
-from probewise.errors import ParameterError
-from probewise.experiment import AdjustedMixture, SensorChangeSds, run
+from probewise.calibration import FittedSensor
+from probewise.effects import Origin
+from probewise.experiment import AdjustedMixture, experiment_for, sensor_change_prior
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
-from probewise.priors import Normal, Product
+from probewise.recordings import Instrumentation
 from probewise.scene import Circle, Field, HypothesisScene
-from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, SSFField, mixture_parameter_names
 
 TRUE = FixedMixture([0.6, 0.4], [[0.5, 1.5], [0.0, -1.0]], [[[16.0, 2.0], [2.0, 9.0]], [[30.0, 0.0], [0.0, 12.0]]])
-SENSOR = Product(
-    {
-        "log_size_u": Normal(0.0, 0.3),
-        "log_size_v": Normal(0.0, 0.3),
-        "shift_u_mm": Normal(0.0, 1.0),
-        "shift_v_mm": Normal(0.0, 1.0),
-        "I_min": Normal(10.0, 1.5),
-        "I_max": Normal(60.0, 1.5),
-    }
-)
+SENSOR = sensor_change_prior((10.0, 60.0))
 
 
 def rng(seed=0):
@@ -53,11 +46,6 @@ def test_an_adjustment_stretches_about_the_mean_and_shifts():
     var_u = weight @ (foot.var_u[0, 0] + u**2) - (weight @ u) ** 2
     cov = weight @ (foot.cov_uv[0, 0] + u * v) - (weight @ u) * (weight @ v)
     np.testing.assert_allclose([var_u, cov], [np.var(moved[:, 0]), np.cov(moved.T)[0, 1]], rtol=0.1, atol=0.1)
-
-
-def test_a_change_below_zero_is_refused():
-    with pytest.raises(ParameterError, match="shift_mm"):
-        SensorChangeSds(shift_mm=-1.0)
 
 
 class TrueArm:
@@ -101,3 +89,20 @@ def test_a_footprint_taken_for_a_half_too_wide_is_put_right(small):
     size, error = found.last.sensor["log_size_u"]
     assert abs(size - np.log(1 / 1.5)) < 5 * error
     assert "log_size_u" in found.summary()
+
+
+def test_effects_of_a_sensor_from_far_away_count_from_0_in_a_run():
+    names = (*mixture_parameter_names(1), "I_min", "I_max", "gain_drift.frac", "gain_drift.tau_s")
+    sensor = FittedSensor(
+        names=names,
+        samples=np.tile([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0, 0.2, 30.0], (500, 1)),
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.5),
+        field=SSFField(np.ones((1, 1)), 1.0, (0.0, 0.0)),
+        instrumentation=Instrumentation(),
+        effects=("gain_drift",),
+        origins={"gain_drift": Origin(time_s=1.7e9)},
+    )
+    (kept,) = sensor.effects_on_new_scans
+    (of_run,) = experiment_for(sensor, Circle(), Field(), trust=1.0).model.effects
+    assert (kept.origin, of_run.effect.origin) == (Origin(time_s=1.7e9), Origin())

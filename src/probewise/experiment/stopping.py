@@ -1,0 +1,322 @@
+"""Judge: what the posterior says of the shape, whether it explains the readings, and whether the run may stop."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtrc
+
+from probewise._arrays import FloatArray
+from probewise.arm.instrument import Reading
+from probewise.experiment.arm_error import ArmError, arm_error_in_posterior, draw_shape_shifts_from_arm_error
+from probewise.experiment.journal import PATTERN
+from probewise.experiment.kinds import Posterior
+from probewise.experiment.setup import Experiment, largest_sd_mm
+from probewise.inference.problem import SensorProblem
+from probewise.inference.rounded import ScaleEnds
+from probewise.inquiry import Bound, UtilityMap, capacity_bits, fewest_readings, prior_entropy, target_entropy
+from probewise.nested import Weighted
+from probewise.scene.any_of import AnyOf
+from probewise.scene.symmetry import mean_angles, with_angles_near
+
+OFF_SDS = 3.0
+"""Error, in units of the stopping rule's sd, above which a length counts as wrong: 12 mm for 4 mm."""
+
+MOST_MISSING = 8
+"""Missing readings (NaN) in a row after which a run ends."""
+
+_ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on the shape
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What a posterior says.
+
+    Attributes
+    ----------
+    mean, sd, shapes
+        Mean and sd of the shape's parameters, (n_params,) each, and the probability of each shape, see `Step`.
+    may_stop, chance_off
+        Whether the stopping rule is met, arm included; probability that a length is off by three times its sd.
+    p_value, notes
+        p-value of the best hypothesis, None if it was not tested; warnings.
+    arm_error
+        Effect of the arm's own error; None far from the end of a run, or if that error is not known.
+    """
+
+    mean: FloatArray
+    sd: FloatArray
+    shapes: Mapping[str, float]
+    may_stop: bool
+    chance_off: float
+    p_value: float | None
+    notes: tuple[str, ...]
+    arm_error: ArmError | None = None
+
+
+def judge(
+    experiment: Experiment,
+    kinds: Posterior,
+    posterior: Weighted,
+    readings: Sequence[Reading],
+    *,
+    rng: np.random.Generator,
+) -> Judgement:
+    """Judge a posterior, the arm's error included if the readings alone know the lengths.
+
+    `kinds` and `posterior` are as `infer` returns them; `rng` draws the arm's errors.
+    """
+    mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
+    p_value, notes = None, () if posterior.run is None else posterior.run.warnings
+    leader, samples = kinds.kinds[kinds.most_probable_kind_index], kinds.particles[kinds.most_probable_kind_index]
+    if leader.likelihood is experiment.likelihood:  # chi-square is of this noise
+        problem = leader.problem(experiment.problem(readings).recording)
+        p_value, worst = p_value_and_worst_reading(experiment, samples.weighted, problem)
+        if experiment.fit_is_doubtful(p_value):
+            doubt = (
+                f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading "
+                f"{worst + 1} ({readings[worst].value:g}); the hypothesis space excludes what lies there, or the "
+                "sensor model leaves something out"
+            )
+            notes = (*notes, doubt)
+    may_stop, off = may_stop_and_chance_off(experiment, posterior)
+    judged = Judgement(mean, sd, shapes, may_stop, off, p_value, notes)
+    if largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm:
+        return with_arm_error(judged, experiment, kinds, posterior, readings, rng=rng)
+    return judged
+
+
+def with_arm_error(
+    judged: Judgement,
+    experiment: Experiment,
+    kinds: Posterior,
+    posterior: Weighted,
+    readings: Sequence[Reading],
+    *,
+    rng: np.random.Generator,
+) -> Judgement:
+    """Return the judgement with the arm's error included, as it is if that is not known; parameters as for `judge`."""
+    likely = max(judged.shapes, key=judged.shapes.__getitem__, default="")
+    arm = arm_error_in_posterior(
+        experiment,
+        readings,
+        posterior.theta[:, experiment.shape_columns],
+        kinds.with_raised_fault_odds(),
+        mean=judged.mean,
+        sd=judged.sd,
+        likely_shape=likely,
+        rng=rng,
+    )
+    if arm is None:
+        return judged
+    theta = posterior.theta.copy()
+    own = theta[:, experiment.shape_columns]
+    shifts = draw_shape_shifts_from_arm_error(experiment, arm.slopes, own, likely, rng=rng)
+    theta[:, experiment.shape_columns] = own + shifts
+    may_stop, off = may_stop_and_chance_off(experiment, posterior, theta=theta, arm_sd=arm.sd)
+    return replace(judged, may_stop=may_stop, chance_off=off, arm_error=arm)
+
+
+def may_stop_and_chance_off(
+    experiment: Experiment,
+    posterior: Weighted,
+    *,
+    theta: FloatArray | None = None,
+    arm_sd: FloatArray | float = 0.0,
+) -> tuple[bool, float]:
+    """Return whether a posterior meets the stopping rule, and its `probability_of_length_off`.
+
+    With an arm's error, `theta` are the samples with it, and `arm_sd` its sds, (n_params,).
+    """
+    _, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
+    shifted = posterior if theta is None else replace(posterior, theta=theta)
+    off = probability_of_length_off(experiment, shifted, OFF_SDS * experiment.stop_sd_mm)
+    return experiment.may_stop(np.hypot(sd, arm_sd), shapes, off), off
+
+
+def with_aligned_angles(experiment: Experiment, posterior: Weighted) -> Weighted:
+    """Return the posterior of the same shapes with angles brought near their circular mean, and sides swapped to match.
+
+    An angle may then lie outside its prior's range.
+    """
+    theta = theta_with_aligned_angles(experiment, posterior.theta, posterior.weight)
+    return posterior if theta is posterior.theta else replace(posterior, theta=theta)
+
+
+def theta_with_aligned_angles(experiment: Experiment, theta: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return samples, (n_samples, n_params), aligned as by `with_aligned_angles`; `weight` (n_samples,)."""
+    own = theta[:, experiment.shape_columns]
+    aligned = with_angles_near(experiment.shape, own, mean_angles(experiment.shape, own, weight))
+    if aligned is own:
+        return theta
+    out = theta.copy()
+    out[:, experiment.shape_columns] = aligned
+    return out
+
+
+def information_nats(posterior: Weighted) -> float:
+    """Return the relative entropy of posterior to prior, nats: mean log likelihood minus log evidence."""
+    some = posterior.weight > 0  # excluded samples have a log likelihood of minus infinity
+    return float(posterior.weight[some] @ posterior.log_likelihood[some]) - posterior.log_z
+
+
+def shape_moments_and_probabilities(
+    experiment: Experiment, posterior: Weighted
+) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+    """Return mean and sd of the shape's parameters, (n_params,) each, and the probability of each shape by name.
+
+    Angles are taken as they are, see `with_aligned_angles`. For a set of shapes, mean and sd are those given the most
+    probable shape, with NaN for parameters of other shapes. For a single shape the probabilities are empty.
+    """
+    theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
+    if not isinstance(experiment.shape, AnyOf):
+        mean = weight @ theta
+        return mean, np.sqrt(weight @ (theta - mean) ** 2), {}
+    which = experiment.shape.shape_index(theta)
+    share = np.bincount(which, weights=weight, minlength=len(experiment.shape.shape_names))
+    likely = int(share.argmax())
+    columns = experiment.shape.prior.columns_by_shape[likely]
+    own = theta[np.ix_(which == likely, columns)]
+    given = weight[which == likely] / share[likely]
+    mean, sd = np.full((2, theta.shape[1]), np.nan)
+    mean[columns] = given @ own
+    sd[columns] = np.sqrt(given @ (own - mean[columns]) ** 2)
+    return mean, sd, dict(zip(experiment.shape.shape_names, (float(p) for p in share / share.sum()), strict=True))
+
+
+def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
+    """Return the probability that some length differs by more than `off_mm` from its posterior mean.
+
+    For a set of shapes: from the mean given the most probable shape, and other shapes count as wrong.
+    """
+    theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
+    mean, _, _ = shape_moments_and_probabilities(experiment, posterior)
+    lengths = [
+        k for k, name in enumerate(experiment.shape.prior.names) if name.endswith("_mm") and np.isfinite(mean[k])
+    ]
+    off = (np.abs(theta[:, lengths] - mean[lengths]) > off_mm).any(axis=1)
+    if isinstance(experiment.shape, AnyOf):
+        which = experiment.shape.shape_index(theta)
+        off |= which != np.bincount(which, weights=weight).argmax()
+    return float(weight[off].sum() / weight.sum())
+
+
+def sensor_moments(experiment: Experiment, posterior: Weighted) -> dict[str, tuple[float, float]]:
+    """Return posterior mean and sd of the sensor's parameters by name; empty if the sensor is known."""
+    n_sensor = int(experiment.shape_columns[0])
+    mean, sd = posterior.mean(), posterior.sd()
+    return {name: (float(mean[k]), float(sd[k])) for k, name in enumerate(experiment.names[:n_sensor])}
+
+
+def p_value_and_worst_reading(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
+    """Return the p-value of the most likely hypothesis, and the index of the reading that it predicts worst.
+
+    The p-value is the upper tail of chi-square with one degree of freedom per reading, so that it is conservative. A
+    reading at an end of the scale fits every prediction beyond.
+    """
+    recording = problem.recording
+    best = posterior.theta[[int(posterior.log_likelihood.argmax())]]
+    sd = np.hypot(experiment.noise_sd, (experiment.step or 0.0) / np.sqrt(12.0))
+    z = (recording.readings - problem.model.predict(best, recording.plan)[0]) / sd
+    # A reading at an end of the scale stands for every value beyond.
+    ends = ScaleEnds.from_range(
+        *experiment.reading_range, experiment.step or experiment.noise_sd, whole_steps=experiment.step is not None
+    )
+    z = np.where(ends.highest_reading_mask(recording.readings), np.maximum(z, 0.0), z)
+    z = np.where(ends.lowest_reading_mask(recording.readings), np.minimum(z, 0.0), z)
+    z = np.where(recording.usable, z, 0.0)
+    return float(chdtrc(max(int(recording.usable.sum()), 1), float(z @ z))), int(np.argmax(np.abs(z)))
+
+
+def n_missing_at_end(readings: Sequence[Reading]) -> int:
+    """Count the missing readings since the last value."""
+    return sum(1 for _ in itertools.takewhile(lambda reading: math.isnan(reading.value), reversed(readings)))
+
+
+def stop_reason(
+    experiment: Experiment,
+    judged: Judgement,
+    utilities: UtilityMap,
+    *,
+    must_continue: bool,
+    n_readings: int,
+    max_readings: int | None,
+    n_missing: int,
+) -> str | None:
+    """Return the reason why a run ends, or None if it continues.
+
+    `must_continue`: whether it goes on for a check though the lengths are known. `n_missing`: missing readings in a
+    row, if they are too many, else 0.
+    """
+    names, known = experiment.shape.prior.names, judged.may_stop and not must_continue
+    included, of_arm, sd = "", 0.0, judged.sd
+    if judged.arm_error is not None:
+        included, of_arm = ", the arm's own error included", largest_sd_mm(names, judged.arm_error.sd)
+        sd = np.hypot(sd, judged.arm_error.sd)
+    widest = largest_sd_mm(names, sd)
+    widest_known = f"the widest length is known to {widest:.1f} mm{included}"
+    if known and experiment.fit_is_doubtful(judged.p_value):
+        return (
+            f"no hypothesis explains the readings (p = {judged.p_value:.1g}), so the posterior, narrow as it is "
+            f"({widest:.1f} mm), is not to be trusted; a diagnosis of the readings asks what the model leaves out"
+        )
+    if known:
+        return f"every length is known to better than {experiment.stop_sd_mm:g} mm{included}"
+    if of_arm >= experiment.stop_sd_mm > largest_sd_mm(names, judged.sd):
+        return (
+            f"the readings know every length to better than {experiment.stop_sd_mm:g} mm, but the arm's own error "
+            f"leaves {of_arm:.1f} mm, which no reading lowers: `probewise arm fit-geometry` "
+            "does, with more marks or with marks met more closely"
+        )
+    if n_missing:
+        return (
+            f"the last {n_missing} readings are all missing: does the instrument still return values, and can it read "
+            f"there? T{widest_known[1:]}; a journal can be resumed"
+        )
+    if utilities.is_flat:
+        promise = (
+            "every reading within reach promises the same"
+            if np.count_nonzero(utilities.reachable) > 1
+            else "the only reading within reach promises nothing more"
+        )
+        return (
+            f"{promise}, {utilities.highest_utility:.2g}: none would tell the hypotheses apart that are left; "
+            f"{widest_known}"
+        )
+    if max_readings is not None and n_readings >= max_readings:
+        return f"all {max_readings} readings that it may take are taken; {widest_known}"
+    return None
+
+
+def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_samples: int = 20_000) -> Bound:
+    """Return a lower bound on the mean number of readings: bits needed over bits per reading, search plus refinement.
+
+    The search ends with the first reading on the shape. Any reading before is on the shape with probability p at most,
+    that of the best first place, and so carries at most the information of a yes or no with probability p; a yes leaves
+    a share p of all hypotheses. From there to the target sd, a reading carries at most the sensor's capacity. The
+    experiment has one shape and a known sensor; `n_samples` are drawn from the prior.
+    """
+    prior = experiment.prior
+    theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
+    weight = np.full(n_samples, 1.0 / n_samples)
+    designs = experiment.designs
+    plan = replace(designs.plan(PATTERN), instrumentation=experiment.instrumentation)
+    predictive = experiment.forecast.predictive(
+        theta, weight, designs, plan, np.arange(experiment.grid.n_places), experiment.noise_sd
+    )
+    _, mass = next(predictive.level_weights(weight))
+    levels = predictive.levels
+    beside = levels[int(mass.sum(axis=0).argmax())]
+    covered = float(mass[:, np.abs(levels - beside) > _ON_SHAPE * experiment.noise_sd].sum(axis=1).max())
+    prior_bits = prior_entropy(prior, rng=rng)
+    return fewest_readings(
+        prior_bits,
+        prior_bits + math.log2(covered),
+        target_entropy(len(prior.names), experiment.stop_sd_mm),
+        most_covered=covered,
+        capacity=capacity_bits(float(levels[0]), float(levels[-1]), experiment.readout),
+    )

@@ -62,7 +62,7 @@ from probewise.world import World
 from probewise.world.challenge import INSIDE, NEEDS_SENSOR, EffectSizer
 from probewise.world.challenge.cases import _draw_effect_of_size as conceal_in_sensor
 from probewise.world.challenge.effect_samplers import CleanSetup
-from probewise.world.systems import KINDS, DrawnSystem, SystemCase, draw_system, write_system_case
+from probewise.world.systems import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
 from probewise.world.systems.cases import _draw_effect_of_size as conceal_in_system
 from probewise.world.systems.forms.form import Form
 from probewise.world.systems.noise import OTHER_NOISE, noise_of_size
@@ -157,11 +157,16 @@ def _names_of_forms(kind: str) -> frozenset[str]:
 
 def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
     """Draw a system of a kind and its readings with a form or a noise."""
-    for wanted in np.repeat(SIZES, 3):
+    for wanted in (*np.repeat(SIZES, 3), None):
         drawn = small_system(kind, rng)
         forms = forms_by_name(drawn).get(what, [])
+        effects: list[SystemEffect] = []
         with contextlib.suppress(errors.NotConvergedError):
-            effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, rng)] if forms else []
+            if forms and wanted is not None:
+                effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, rng)]
+            elif forms:  # the parameters take it up, whatever its size
+                amplitude = min(20 * forms[0].first, forms[0].limit)
+                effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)), 0.0, {}, ())]
             free = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
             if np.abs(free).max() < 1e3 * np.abs(drawn.fit_without_effects.readings).max():
                 break

@@ -85,6 +85,15 @@ SYSTEMS = ("orifice flow meter", "DC motor", "thermometer in a bath")  # others 
 NOISES = tuple({"quantised": "quantisation"}.get(name, name) for name in OTHER_NOISE if name != "t4")
 FRICTION = "friction of a column"
 FITTED = ("repaired.json", "sensor.json")
+ARM = """from dataclasses import replace
+from probewise.study.concealed import ConcealedTrial, _arm_in_concealed_world
+
+def connect():
+    arm = _arm_in_concealed_world({trial})
+    measure = arm.measure
+    arm.measure = lambda pose: replace(found := measure(pose), value=min(max(found.value, 1.0), 100.0))
+    return arm
+"""
 
 
 def plan_named(name: str) -> Plan:
@@ -195,9 +204,8 @@ def commands(cell: Cell, folder: Path) -> tuple[list[list[str]], float | None]:
     write_sensor(calibrated(), folder / "known.json")
     known = ["--sensor", str(folder / "known.json")]
     if verb == "explore":
-        module = "from probewise.study.concealed import ConcealedTrial, _arm_in_concealed_world as world"
         trial = f"ConcealedTrial({what.replace('nothing', '')!r}, 2, 0, {TRUST}, seed={seed})"
-        (folder / "arm.py").write_text(f"{module}\n\ndef connect():\n    return world({trial})\n")
+        (folder / "arm.py").write_text(ARM.format(trial=trial))
         return [[verb, *known, "--arm", str(folder / "arm.py"), "--field", "1048,520", "--max-readings", "20"]], None
     if where not in PLANS:
         case = conceal_form(where, what, rng)
@@ -237,7 +245,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
                 with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
                     status = command_line([*words, "--out", str(target)])
                 if status != 0:
-                    raise SystemExit(f"{words[0]} exits {status}: {said.getvalue().strip()[-160:]}")
+                    raise SystemExit(f"{words[0]} exits {status}: {said.getvalue().strip().splitlines()[-1][:200]}")
             results = [call.args[0] for summary in shown for call in summary.call_args_list]
             row |= _of_result(cell, out, results)
             row["failure"] = next(complaints(out, said.getvalue(), results), "")

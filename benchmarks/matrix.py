@@ -50,25 +50,25 @@ from probewise import errors
 from probewise._display import ShowsItself
 from probewise._progress import progress_shown
 from probewise.calibration import read_sensor, write_sensor
-from probewise.campaign import run_campaign
-from probewise.challenge.null_refit import NullRefit
 from probewise.cli import main as command_line
 from probewise.experiment import TRUST, left_out_after_step
+from probewise.proof.campaign import run_campaign
+from probewise.proof.concealed_study import CONCEALED
+from probewise.proof.null_refit import NullRefit
+from probewise.proof.sensors.cases import Stratum
+from probewise.proof.sensors.cases import _draw_effect_of_size as conceal_in_sensor
+from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
+from probewise.proof.sensors.sizing import EffectSizer
+from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
+from probewise.proof.systems.cases import _draw_effect_of_size as conceal_in_system
+from probewise.proof.systems.form import Form
+from probewise.proof.systems.forms import FAMILIES, forms_of
+from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
+from probewise.proof.systems.rivals import vocabulary_name
+from probewise.proof.trial import BRIGHT, DARK, footprint_pixels
 from probewise.recordings import Plan, paper_plan, two_way_plan, write_recording, write_text_atomically
 from probewise.recordings.plans import with_jittered_times
-from probewise.study.concealed import CONCEALED
-from probewise.study.trial import BRIGHT, DARK, footprint_pixels
 from probewise.world import World
-from probewise.world.challenge import INSIDE, NEEDS_SENSOR, EffectSizer
-from probewise.world.challenge.cases import _draw_effect_of_size as conceal_in_sensor
-from probewise.world.challenge.effect_samplers import CleanSetup
-from probewise.world.systems import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
-from probewise.world.systems.cases import _draw_effect_of_size as conceal_in_system
-from probewise.world.systems.forms.form import Form
-from probewise.world.systems.noise import OTHER_NOISE, noise_of_size
-from probewise.world.systems.rivals import vocabulary_name
-from probewise.world.systems.strata import Stratum
-from probewise.world.systems.vocabulary import FAMILIES, forms_of
 
 Cell: TypeAlias = tuple[str, str, str, int]
 """A verb, a plan or kind of system, what is concealed, and a seed."""
@@ -86,7 +86,7 @@ NOISES = tuple({"quantised": "quantisation"}.get(name, name) for name in OTHER_N
 FRICTION = "friction of a column"
 FITTED = ("repaired.json", "sensor.json")
 ARM = """from dataclasses import replace
-from probewise.study.concealed import ConcealedTrial, _arm_in_concealed_world
+from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world
 
 def connect():
     arm = _arm_in_concealed_world({trial})

@@ -235,7 +235,8 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         shown = [stack.enter_context(summary) for summary in summaries]
         stack.enter_context(warnings.catch_warnings())
         try:
-            wanted, row["lambda"] = commands(cell, Path(name))
+            wanted, size = commands(cell, Path(name))
+            row["lambda"] = size and round(size, 1)
             warnings.simplefilter("error")
             for own in (errors.DoubtfulResultWarning, errors.SlowWarning):  # a person sees one line
                 warnings.simplefilter("default", own)
@@ -295,7 +296,8 @@ def _of_result(cell: Cell, out: Path, results: Sequence[Any]) -> dict[str, Any]:
     drawn = sorted(path.name for path in out.glob("*.[sp][vn]g") if "witness" not in path.name)
     if (out / "diagnosis.json").exists():
         found = json.loads((out / "diagnosis.json").read_text())
-        of = {name: found[key] for name, key in (("verdict", "verdict"), ("p", "p_value"), ("set", "credible_set"))}
+        of = {name: found[key] for name, key in (("verdict", "verdict"), ("set", "credible_set"))}
+        of["p"] = float(f"{found['p_value']:.2g}")
         of |= {"first": found["hypotheses"][0]["effects"], "effects": [effect["name"] for effect in found["effects"]]}
         drawn += sorted({f"witness of {place['covariate']}" for place in found["where"]})
     elif cell[0] == "explore":
@@ -372,7 +374,10 @@ def main() -> None:
         "failing": {key: row["failure"] for key, row in rows.items() if row["kind"]},
     }
     print(json.dumps(document, indent=1))
-    lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(row)}" for key, row in rows.items())
+    lines = ",\n".join(
+        f"  {json.dumps(key)}: {json.dumps({**row, 'figures': len(row.get('figures', ()))})}"
+        for key, row in rows.items()
+    )
     text = f'{json.dumps(document, indent=1)[:-2]},\n "rows": {{\n{lines}\n }}\n}}\n'
     write_text_atomically(asked.out / "matrix.json", text)
     sys.exit(bool(document["failing"]))

@@ -82,6 +82,13 @@ def test_the_same_predictions_tell_nothing():
     assert mutual_information_lower_bound([one, one, one], np.full(3, 1 / 3)) == pytest.approx(0.0, abs=1e-12)
 
 
+def test_a_prediction_that_ran_away_tells_nothing_and_gives_no_warning():
+    """A cubic term in a rate ran away at a candidate: NumPy's warning reached the terminal."""
+    known = predictives(0, 1.0)[0]
+    wild = replace(known, factor=np.full((4, 2), 1e200))
+    assert np.isnan(mutual_information_lower_bound([known, wild], np.full(2, 0.5)))
+
+
 def rival(name: str, probability: float, settings: list[float], plan: Plan) -> Rival:
     extent = Extent(10.0, 60.0, plan)
     sensor = default_sensor(extent, 1)

@@ -263,8 +263,9 @@ def measurement_at_place(
     )
 
 
+@np.errstate(all="ignore")  # of predictions that ran away
 def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
-    """Return a lower bound on the mutual information of hypothesis and readings, in nats.
+    """Return a lower bound on the mutual information of hypothesis and readings, in nats; NaN if one is not finite.
 
     Parameters
     ----------
@@ -283,6 +284,7 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
 
 
+@np.errstate(all="ignore")  # of predictions that ran away
 def _shortlisted_command_indices(
     rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
 ) -> list[int]:
@@ -298,9 +300,9 @@ def _shortlisted_command_indices(
     kept: dict[int, None] = {}
     for a, b in itertools.combinations(range(len(rivals)), 2):
         apart = means[a] - means[b]
-        squares = [_squared_distance(apart[own], None if of_run is None else of_run[own]) for own in rows]
-        # Separation beyond this adds nothing.
-        worth = np.minimum(squares, _ENOUGH) / minutes
+        squares = np.array([_squared_distance(apart[own], None if of_run is None else of_run[own]) for own in rows])
+        # Separation beyond this adds nothing; a model that runs away there says nothing.
+        worth = np.minimum(np.where(np.isfinite(squares), squares, 0.0), _ENOUGH) / minutes
         kept |= dict.fromkeys(np.argsort(-worth, kind="stable")[:_PROMISING].tolist())
     return list(kept)
 

@@ -285,10 +285,11 @@ def test_runs_of_another_noise_are_named_and_a_run_that_was_not_seen_gets_one_li
     diagnosis = diagnose_system(_line(run="run"), table, rng=rng)
     assert diagnosis.combination == ("noise_per_run",)
     later = {name: np.append(values, 9.0 if name == "run" else values[-1]) for name, values in table.items()}
-    predicted = predict_system(repaired_of(diagnosis), later, rng=rng)
-    assert predicted.sd[100] == pytest.approx(0.3, rel=0.3)
-    assert predicted.sd[0] == pytest.approx(0.05, rel=0.3)
-    assert 0.05 < predicted.sd[-1] < 2.0
+    several = [predict_system(repaired_of(diagnosis), later, rng=np.random.default_rng(seed)).sd for seed in range(8)]
+    np.testing.assert_allclose([sd[100] for sd in several], 0.3, rtol=0.3)
+    np.testing.assert_allclose([sd[0] for sd in several], 0.05, rtol=0.3)
+    # Three sds of runs leave a heavy tail: a single draw of samples may have a mean far out.
+    assert 0.05 < np.median([sd[-1] for sd in several]) < 2.0
 
 
 @pytest.mark.slow

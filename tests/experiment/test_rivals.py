@@ -368,8 +368,8 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
         named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
         return arm_error_in_posterior(*of, **named, rng=np.random.default_rng(1)).slopes
 
-    np.testing.assert_allclose(last.arm.slopes, slopes(last.kinds.with_raised_fault_odds()))
-    assert not np.allclose(last.arm.slopes, slopes(last.kinds))
+    np.testing.assert_allclose(last.arm_error.slopes, slopes(last.kinds.with_raised_fault_odds()))
+    assert not np.allclose(last.arm_error.slopes, slopes(last.kinds))
 
 
 @pytest.mark.parametrize(("angles_deg", "asked_deg"), [((0, 20, 40), 200), ((0, 120, 240), None), ((0, 180), None)])
@@ -496,7 +496,7 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     assert steps[-1].map.label == NAMES
     assert steps[-1].map.highest_utility < ENOUGH_BITS
     assert left_out_after_step(steps[-1], 0.9).credible_set == ("ambient_step",)
-    assert np.abs(steps[-1].mean - trial.truth).max() < 2.0
+    assert np.abs(steps[-1].mean - trial.true_circle_in_arm_frame).max() < 2.0
 
 
 def test_rows_of_the_study_are_summed_up():

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from probewise import __version__
 from probewise.cli import VERBS, main
-from probewise.cli.arm import TASKS
 
 HERE = Path(__file__).parent
+TASKS = ("check", "fit-geometry", "heights", "home", "jog", "read", "record", "scan")  # of `probewise arm`
 
 project = "probewise"
 author = "the probewise authors"

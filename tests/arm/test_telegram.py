@@ -2,7 +2,6 @@
 
 import dataclasses
 import pickle
-import struct
 
 import pytest
 from hypothesis import given
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from probewise.arm.nxt import BrickError, Reply, Request, TelegramError, decode, encode, framed
 from probewise.arm.nxt import telegram as t
 from probewise.arm.nxt.telegram import MEANINGS
+from probewise.errors import ParameterError
 
 LED_ON, LED_OFF = t.SensorType.LIGHT_ACTIVE, t.SensorType.LIGHT_INACTIVE
 
@@ -129,9 +129,33 @@ def test_every_status_but_zero_is_a_clear_error():
         assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
-def test_a_value_that_its_bytes_cannot_hold_is_not_sent():
-    with pytest.raises(struct.error):
-        encode(t.SetOutputState(0, limit_counts=-1))
+WRONG = [
+    (t.SetOutputState, (3, 0, 0, 0, 0, 0, 0), "port"),
+    (t.SetOutputState, (0, 101, 0, 0, 0, 0, 0), "power"),
+    (t.SetOutputState, (0, -128, 0, 0, 0, 0, 0), "power"),
+    (t.SetOutputState, (0, 0, 8, 0, 0, 0, 0), "mode"),
+    (t.SetOutputState, (0, 0, 0, 3, 0, 0, 0), "regulation"),
+    (t.SetOutputState, (0, 0, 0, 0, 101, 0, 0), "turn_ratio"),
+    (t.SetOutputState, (0, 0, 0, 0, 0, 0x30, 0), "run_state"),
+    (t.SetOutputState, (0, 0, 0, 0, 0, 0, -1), "limit_counts"),
+    (t.SetOutputState, (0, 0, 0, 0, 0, 0, 2**32), "limit_counts"),
+    (t.SetOutputState, (0, 1.0, 0, 0, 0, 0, 0), "power"),
+    (t.SetOutputState, (True, 0, 0, 0, 0, 0, 0), "port"),
+    (t.GetOutputState, (255,), "port"),
+    (t.ResetMotorPosition, (0, 2), "relative"),
+    (t.GetInputValues, (4,), "port"),
+    (t.SetInputMode, (0, 0x13, 0), "type"),
+    (t.SetInputMode, (0, 0, 256), "mode"),
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "fields", "name"), WRONG, ids=[f"{w[0].__name__} {k}" for k, w in enumerate(WRONG)]
+)
+def test_a_value_out_of_bounds_cannot_be_made(command, fields, name):
+    with pytest.raises(ParameterError) as caught:
+        command(*fields)
+    assert caught.value.name == name
 
 
 @pytest.mark.parametrize("telegram", ["", "02", "02 07", "00 07 00", "80 09 00 03 68 69 00", "82 07 00"])

@@ -13,9 +13,10 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from types import MappingProxyType
 from typing import ClassVar, Generic, Self, TypeVar, cast
 
-from probewise.errors import LinkError
+from probewise.errors import LinkError, ParameterError
 
 
 class TelegramError(LinkError):
@@ -141,6 +142,16 @@ class Request(Body, Generic[A_co]):
 
     OPCODE: ClassVar[int]
     REPLY: ClassVar[type[Body]] = Done
+    BOUNDS: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    """Least and greatest value of each field, and others that are allowed: a wrong power or port moves an arm."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high, *others) in self.BOUNDS.items():
+            value = getattr(self, name)
+            plain = isinstance(value, int) and not isinstance(value, bool)
+            if not plain or not (low <= value <= high or value in others):
+                more = "".join(f" or {other}" for other in others)
+                raise ParameterError(name, value, f"a whole number from {low} to {high}{more}")
 
     @property
     def is_repeatable(self) -> bool:
@@ -179,6 +190,17 @@ class SetOutputState(Request[Done]):
 
     OPCODE = 0x04
     LAYOUT = "BbBBbBI"
+    BOUNDS = MappingProxyType(
+        {
+            "port": (0, 2, ALL_OUTPUTS),
+            "power": (-100, 100),
+            "mode": (0, 7),
+            "regulation": (0, 2),
+            "turn_ratio": (-100, 100),
+            "run_state": (0, 0, 0x10, 0x20, 0x40),
+            "limit_counts": (0, 0xFFFFFFFF),
+        }
+    )
     port: int
     power: int = 0
     mode: int = OutputMode.IDLE
@@ -199,6 +221,7 @@ class SetInputMode(Request[Done]):
 
     OPCODE = 0x05
     LAYOUT = "BBB"
+    BOUNDS = MappingProxyType({"port": (0, 3), "type": (0, 0x12), "mode": (0, 0xFF)})
     port: int
     type: int
     mode: int
@@ -228,6 +251,7 @@ class GetOutputState(Request[OutputState]):
     OPCODE = 0x06
     REPLY = OutputState
     LAYOUT = "B"
+    BOUNDS = MappingProxyType({"port": (0, 2)})
     port: int
 
 
@@ -254,6 +278,7 @@ class GetInputValues(Request[InputValues]):
     OPCODE = 0x07
     REPLY = InputValues
     LAYOUT = "B"
+    BOUNDS = MappingProxyType({"port": (0, 3)})
     port: int
 
 
@@ -263,6 +288,7 @@ class ResetMotorPosition(Request[Done]):
 
     OPCODE = 0x0A
     LAYOUT = "BB"
+    BOUNDS = MappingProxyType({"port": (0, 2), "relative": (0, 1)})
     port: int
     relative: int
 

@@ -17,7 +17,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from io import FileIO
@@ -30,6 +30,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
 from probewise.arm.instrument import Pose, Reading
+from probewise.effects import NamedEffect
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.atomic import write_and_sync, write_text_atomically
 from probewise.recordings.locking import hold_lock
@@ -45,6 +46,7 @@ _SUMMARY_KEY = ', "belief": '
 _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
 # Settings that journals of earlier versions lack.
 _LATER = frozenset({"geometry_sha256"})
+_EFFECT, _WITH_EFFECTS = b"<effect>", "effects-"
 
 
 @dataclass(frozen=True)
@@ -257,10 +259,13 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
     """Raise FileError with every setting in which a journal differs from the run that would resume it.
 
     Version, arm, spawn key and the name of the sensor's file may differ. The arm's geometry is compared only if the
-    journal has it, since those of earlier versions do not.
+    journal has it, since those of earlier versions do not. Nor do they name effects in the digest of a model with some:
+    then the sensor's file, which a journal names by its own digest, and all other settings have to be the same.
     """
     there, here = _flattened_settings(journal.settings), _flattened_settings(json.loads(json.dumps(settings)))
     compared = {*there, *here} - _FREE - {name for name in _LATER if name not in there}
+    with_effects = {name for name, value in here.items() if str(value).startswith(_WITH_EFFECTS)}
+    compared -= {name for name in with_effects if not str(there.get(name)).startswith(_WITH_EFFECTS)}
     different = sorted(name for name in compared if there.get(name) != here.get(name))
     if different:
         had = "; ".join(f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
@@ -383,38 +388,42 @@ def value_digest(value: object) -> str:
     """Digest a value built of dataclasses, arrays, mappings, sequences, numbers and texts (sha256, hex).
 
     Two values have the same digest when their types, their fields and every bit of their numbers are the same, in
-    whatever process; a list counts as a tuple. ParameterError if the value holds anything else, such as a function,
-    which has no reproducible digest.
+    whatever process; a list counts as a tuple. An effect counts by its name, its origin and the scans and patterns to
+    which it is restricted, however it is written; "effects-" precedes the digest of a value that holds one.
+    ParameterError if the value holds anything else, such as a function, which has no reproducible digest.
     """
-    digest = hashlib.sha256()
-    _add_to_digest(digest, value)
-    return digest.hexdigest()
+    parts = list(_digested(value))
+    digest = hashlib.sha256(b"".join(parts)).hexdigest()
+    return f"{_WITH_EFFECTS}{digest}" if _EFFECT in parts else digest
 
 
-def _add_to_digest(digest: Any, value: object) -> None:
-    """Add types, names of fields and bits of a value to a digest."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        digest.update(f"<{type(value).__qualname__}>".encode())
+def _digested(value: object) -> Iterator[bytes]:
+    """Yield types, names of fields and bits of a value, to be digested."""
+    if isinstance(value, NamedEffect):
+        yield _EFFECT
+        yield from _digested((value.name, getattr(value, "origin", None), value.scans, value.patterns))
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield f"<{type(value).__qualname__}>".encode()
         for item in dataclasses.fields(value):
-            digest.update(item.name.encode())
-            _add_to_digest(digest, getattr(value, item.name))
+            yield item.name.encode()
+            yield from _digested(getattr(value, item.name))
     elif isinstance(value, np.ndarray):
-        digest.update(f"[{value.dtype.str}{value.shape}]".encode())
-        digest.update(np.ascontiguousarray(value).tobytes())
+        yield f"[{value.dtype.str}{value.shape}]".encode()
+        yield np.ascontiguousarray(value).tobytes()
     elif isinstance(value, Enum):
-        digest.update(f"<{value}>".encode())
+        yield f"<{value}>".encode()
     elif value is None or isinstance(value, (bool, int, float, str, np.generic)):
         plain = value.item() if isinstance(value, np.generic) else value
-        digest.update(f"{type(plain).__name__}:{plain!r};".encode())
+        yield f"{type(plain).__name__}:{plain!r};".encode()
     elif isinstance(value, Mapping):
-        digest.update(f"{{{len(value)}".encode())
+        yield f"{{{len(value)}".encode()
         for key in sorted(value, key=str):
-            _add_to_digest(digest, key)
-            _add_to_digest(digest, value[key])
+            yield from _digested(key)
+            yield from _digested(value[key])
     elif isinstance(value, Sequence):
-        digest.update(f"({len(value)}".encode())
+        yield f"({len(value)}".encode()
         for item in value:
-            _add_to_digest(digest, item)
+            yield from _digested(item)
     else:
         raise ParameterError(
             "fingerprint of", value, "frozen dataclasses of arrays, numbers and texts, so that a journal can name them"

@@ -40,19 +40,10 @@ def slopes_split_by_run(slopes: FloatArray, of_run: IntArray, plan: Plan) -> tup
 
     A planned run is predicted at the values of a recorded run, by whose coordinates the slopes are.
 
-    Parameters
-    ----------
-    slopes
-        Slopes by a model's coordinates, (n_points, n_params).
-    of_run
-        Indices of the coordinates of which each run has a value of its own, with a standard normal prior.
-    plan
-        The planned runs, (n_points,).
-
-    Returns
-    -------
-    The slopes with 0 in the columns `of_run`, (n_points, n_params); and, for each run and each of these columns that
-    acts there, a column that is 0 in all other runs, (n_points, n_columns).
+    `slopes`: slopes by a model's coordinates, (n_points, n_params); `of_run`: indices of the coordinates of which each
+    run has a value of its own, with a standard normal prior; `plan`: the planned runs, (n_points,). Returns the slopes
+    with 0 in the columns `of_run`, (n_points, n_params); and, for each run and each of these columns that acts there, a
+    column that is 0 in all other runs, (n_points, n_columns).
     """
     shared = slopes.copy()
     shared[:, of_run] = 0.0
@@ -153,16 +144,7 @@ def measurement_separating_rivals(
 ) -> NextMeasurement | None:
     """Choose scans, of at most 102 readings in all, that separate the rivals; None if none is possible or informative.
 
-    Parameters
-    ----------
-    rivals
-        Two or more hypotheses.
-    sd
-        Noise sd of a reading, in the unit of the readings.
-    plan
-        The plan already measured.
-    apparatus
-        The apparatus that can measure more.
+    `sd`: noise sd of a reading, in the unit of the readings.
     """
     leader = max(rivals, key=lambda rival: rival.probability)
     level = leader.model.predict(leader.z[None, :])[0]
@@ -221,16 +203,7 @@ def measurement_at_place(
     A planned reading repeats the recorded one with the nearest settings, and its mean residual, if that is in the
     place. The readings with most nats per minute are chosen, of those with three nats over no effect; None if none has.
 
-    Parameters
-    ----------
-    place
-        A place in all readings of `everything`, with its curve of mean residuals.
-    null
-        The null fit.
-    sd
-        Noise sd of a reading.
-    plan, apparatus
-        The plan already measured, and the apparatus that can measure more.
+    `place`: a place in all readings of `everything`, with its curve of mean residuals.
     """
     from scipy.spatial import KDTree  # a tenth of a second, which few diagnoses need
 
@@ -267,12 +240,7 @@ def measurement_at_place(
 def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
     """Return a lower bound on the mutual information of hypothesis and readings, in nats; NaN if one is not finite.
 
-    Parameters
-    ----------
-    predictives
-        Predictive distribution of the same readings under each hypothesis.
-    weights
-        Probabilities (n_hypotheses,), which sum to one.
+    `weights`: probabilities (n_hypotheses,), which sum to one.
     """
     covariances = [predictive.covariance for predictive in predictives]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]

@@ -72,14 +72,8 @@ class LinearReadings:
 class ReadingsWithEffects:
     """Old readings and possible further ones, linearised about a fit, with the columns of several effects.
 
-    Parameters
-    ----------
-    old, further
-        The readings.
-    of_effect
-        Numbers of each effect's columns, by name.
-    of_run, columns_of_run
-        Masks of the coordinates, and of the columns, of which each run has a value of its own.
+    `old`, `further`: the readings; `of_effect`: numbers of each effect's columns, by name; `of_run`, `columns_of_run`:
+    masks of the coordinates, and of the columns, of which each run has a value of its own.
     """
 
     old: LinearReadings
@@ -237,14 +231,9 @@ def _projected_basis(problem: Linearised, whitened: FloatArray) -> tuple[FloatAr
 def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
     """List the pairs of effects whose projected templates have a cosine of 0.9 or more, the most collinear first.
 
-    Parameters
-    ----------
-    problem
-        The linearised null fit, whose parameters are projected out of the templates.
-    templates
-        For each effect, its best-fitting template columns (n_points, k).
-    otherwise
-        The `settle_by` of each pair; its `readings` are 0.
+    `problem`: the linearised null fit, whose parameters are projected out of the templates; `templates`: for each
+    effect, its best-fitting template columns (n_points, k); `otherwise`: the `settle_by` of each pair; its `readings`
+    are 0.
     """
     out = []
     for pair in itertools.combinations(sorted(templates), 2):
@@ -258,13 +247,6 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
     """List the aliased pairs of effects of the vocabulary on the mean, each with the scan that separates it best.
 
     An effect's template is the best-fitting entry of its bank (its changes of readings, at a grid of its parameters).
-
-    Parameters
-    ----------
-    searched
-        Result of the search.
-    problem, found
-        The null fit, linearised and as a fit.
     """
     prepared, misfit_templates = searched.prepared, searched.misfit_templates
     telling: dict[str, FloatArray] = {}
@@ -301,18 +283,7 @@ def pairs_with_separating_scans(
     of the two cases, that the one acts or the other, the harder one counts. The effect that acts has lambda 8 in the
     old readings. A pair that no scan separates is unchanged.
 
-    Parameters
-    ----------
-    pairs
-        The aliased pairs.
-    problem, found
-        The null fit, linearised and as a fit.
-    entries
-        The entry of each effect's bank that is taken for it, by name.
-    usable
-        The rows of the plan with a usable reading.
-    apparatus
-        The apparatus that can measure more.
+    `entries`: the entry of each effect's bank that is taken for it, by name.
     """
     plan = found.model.plan
     scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])

@@ -118,15 +118,9 @@ def excerpts_of_scan(
 ) -> list[Excerpt]:
     """Return the parts of a scan that could be scans of their own, of 8 to 102 readings.
 
-    Parameters
-    ----------
-    scan
-        Its row numbers.
-    strides
-        Strides to try; those that leave fewer than eight readings are skipped, and if all are, stride 1 is tried.
-    level
-        Expected readings, in the order of `scan`: adds the 26 successive readings over which they change most, if the
-        scan is longer.
+    `strides`: strides to try; those that leave fewer than eight readings are skipped, and if all are, stride 1 is
+    tried; `level`: expected readings, in the order of `scan`: adds the 26 successive readings over which they change
+    most, if the scan is longer.
     """
     out = []
     for stride in [s for s in strides if len(scan[::s]) >= LEAST_ROWS] or [1]:
@@ -148,14 +142,7 @@ def excerpts_of_scan(
 def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
     """List the scans that could follow a plan, each timed to start after it.
 
-    Parameters
-    ----------
-    plan
-        The plan measured, or to be measured.
-    strides
-        Strides to try for each scan.
-    level
-        Expected readings, (n_points,): adds the part of each scan where they change most.
+    `level`: expected readings, (n_points,): adds the part of each scan where they change most.
     """
     controls = plan.instrumentation.controls
     height_mm = plan.instrumentation.height_mm

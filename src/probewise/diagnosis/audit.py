@@ -629,19 +629,6 @@ def choose_cure_scans(
 
     They are timed one after another, in the order chosen. The deficit of an effect is 0 if it is detected and told from
     others, up to 1 if aliased, 1 to 2 if invisible.
-
-    Parameters
-    ----------
-    plan
-        The plan.
-    expected
-        The expected sensor.
-    effects
-        The vocabulary, by name.
-    ailing
-        Names of the effects that are aliased or invisible under the plan.
-    progress
-        Called before every choice.
     """
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Scan] = []

@@ -32,14 +32,7 @@ def mix_over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: 
 
     All are converted to the largest order, by splitting Gaussians into two equal halves.
 
-    Parameters
-    ----------
-    parts
-        Samples of each order, in equal numbers.
-    weights
-        Probability of each order, (n_parts,).
-    rng
-        Source of randomness.
+    `weights`: probability of each order, (n_parts,).
     """
     largest = max(parts, key=lambda part: part.n_gaussians)
     n = len(largest.theta)
@@ -78,18 +71,8 @@ def mix_over_hypotheses(
 
     In samples of a hypothesis without an effect, the effect's parameters change nothing and `absent` marks it.
 
-    Parameters
-    ----------
-    parts
-        Samples of each hypothesis, in equal numbers; they fit in one model (`can_share_one_model`).
-    shares
-        Probability of each, (n_parts,).
-    null
-        The model without effects, that of the part with the most Gaussians.
-    plan
-        What was read.
-    rng
-        Source of randomness.
+    `parts`: samples of each hypothesis, in equal numbers; they fit in one model (`can_share_one_model`); `shares`:
+    probability of each, (n_parts,); `null`: the model without effects, that of the part with the most Gaussians.
     """
     largest = max(parts, key=lambda part: part.n_gaussians)
     effects = {e.name: e for part in parts for e in cast(Sequence[NamedEffect[Any]], part.chain.effects)}

@@ -87,19 +87,7 @@ def improvement_of(
     shown: tuple[Fit, Fit],
     rng: np.random.Generator,
 ) -> Improvement:
-    """Measure the gain of the best fit over the null: in evidence and, under the same noise, on held-out parts, in rms.
-
-    Parameters
-    ----------
-    searched, test
-        Result of the search; global test of the null.
-    best, noise, after
-        The best fit, its noise model, and its linearisation.
-    shown
-        The null and the best fit under that noise.
-    rng
-        Random generator, for the null distribution of the test of the repaired model.
-    """
+    """Measure the gain of the best fit over the null: in evidence and, under one noise, on held-out parts, in rms."""
     null = test.null
     law = best.evidence[noise].likeliest_law
     rms = [searched.prepared.recording.rms(residuals_beside_walk(found.residuals, law)) for found in shown]
@@ -168,9 +156,7 @@ def judged_and_best_repair(
 ) -> tuple[Judged, BestRepair]:
     """Choose the fit that belongs to a verdict; the null if nothing was found.
 
-    Returns
-    -------
-    The verdict, withdrawn if the named effects predict held-out readings far worse; and the fit.
+    Returns the verdict, withdrawn if the named effects predict held-out readings far worse; and the fit.
     """
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
@@ -215,14 +201,7 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
 
     Of the bases whose evidence is within 5 nats of the best, that of the fewest columns is taken.
 
-    Parameters
-    ----------
-    found, problem
-        The fit, and its linearisation under the noise model found.
-    bases
-        The candidate bases, as templates of several columns.
-    part
-        Number of the part of each usable row, to hold parts out in turn, (n_usable,).
+    `part`: number of the part of each usable row, to hold parts out in turn, (n_usable,).
     """
     scores = bases.log_bayes_factors(problem)[:, 0]
     # Among bases of about equal evidence, the one with the fewest columns: a basis with one amplitude per scan cannot
@@ -252,10 +231,8 @@ def improvement_and_correction(
     gain's sd. If the first gains nothing on other scans, blocks within scans are held out instead, for residuals that
     are local in time. Where nothing can be held out, one basis is added without that check.
 
-    Returns
-    -------
-    improvement, change
-        The improvement of `best` including the correction, and the correction of the usable readings, (n_usable,).
+    Returns `improvement, change`: the improvement of `best` including the correction, and the correction of the usable
+    readings, (n_usable,).
     """
     prepared, bases, problem = searched.prepared, searched.misfit_templates.unknown_bases, best.problem
     found, gain = best.repaired, best.improvement

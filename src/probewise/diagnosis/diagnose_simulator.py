@@ -322,14 +322,7 @@ def searched_at_step(
     None if one of them, the most probable first, gains or loses more than a nat: then errors of the integration may
     have led the search, and it has to be made again.
 
-    Parameters
-    ----------
-    searched
-        The search of a law.
-    max_step, stiff
-        The step, in the unit of time, and whether a linearly implicit method takes it.
-    progress
-        Called at every refit.
+    `max_step`, `stiff`: the step, in the unit of time, and whether a linearly implicit method takes it.
     """
     prepared = searched.prepared
     apparatus = cast(SimulatorApparatus, prepared.apparatus)

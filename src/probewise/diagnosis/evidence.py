@@ -328,18 +328,7 @@ def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_
     The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
     the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
 
-    Parameters
-    ----------
-    blocks
-        The templates.
-    residuals
-        Projected residuals, shape (n_rows, n_draws).
-    n_kept
-        Number of readings that are not lost.
-
-    Returns
-    -------
-    Log Bayes factors, shape (n_blocks, n_draws).
+    `residuals`: projected residuals, shape (n_rows, n_draws). Returns log Bayes factors, shape (n_blocks, n_draws).
     """
     scores = (blocks.u.T @ residuals) ** 2
     scores /= np.maximum(np.sum(residuals**2, axis=0), 1e-300)
@@ -358,18 +347,9 @@ def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_kep
     At smaller scales the projected template has an rms lambda below `LEAST_VISIBLE`: the Bayes factor is near one
     whatever the readings, and would keep irrelevant effects.
 
-    Parameters
-    ----------
-    explained
-        Share of the residual's sum of squares along each axis, (n_templates, width, n_draws).
-    gain
-        Squared length of the projection along each axis, (n_templates, width).
-    n_kept
-        Number of readings that are not lost.
-
-    Returns
-    -------
-    Log Bayes factors, (n_templates, n_draws); about -48 for a template that is detectable at no scale.
+    `explained`: share of the residual's sum of squares along each axis, (n_templates, width, n_draws); `gain`: squared
+    length of the projection along each axis, (n_templates, width). Returns log Bayes factors, (n_templates, n_draws);
+    about -48 for a template that is detectable at no scale.
     """
     terms = np.empty((len(SCALES), explained.shape[0], explained.shape[2]))
     visible = SCALES[:, None] ** 2 * gain.sum(axis=1) >= LEAST_VISIBLE**2
@@ -541,14 +521,7 @@ def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArr
     posterior is normal with unit sd. This probability, multiplied with the evidence, removes the part of a hypothesis
     that readings cannot tell from the hypothesis without the effect.
 
-    Parameters
-    ----------
-    found
-        The fit.
-    law
-        Its noise model.
-    usable
-        Row numbers of the usable readings, (n_usable,).
+    `usable`: row numbers of the usable readings, (n_usable,).
     """
     sizes = linearised_sizes(found, law, usable, found.model.names)
     return float(sum(log_ndtr(size - LEAST_VISIBLE) for size in sizes))

@@ -83,17 +83,8 @@ def effects_found(
 ) -> tuple[EffectFound, ...]:
     """Return the findings on every effect with a name and a probability above 0.001, most probable first.
 
-    Parameters
-    ----------
-    searched
-        Result of the search.
-    hypotheses
-        All hypotheses with their probabilities.
-    best, samples
-        The repair and its posterior samples, which give size and parameters of its effects; those of other effects are
-        from the most probable fit that contains them or, if there is none, from the linearised null.
-    rng
-        Source of randomness.
+    `best`, `samples`: the repair and its posterior samples, which give size and parameters of its effects; those of
+    other effects are from the most probable fit that contains them or, if there is none, from the linearised null.
     """
     prepared = searched.prepared
     out, plan = [], prepared.everything.plan
@@ -147,12 +138,7 @@ def _likeliest_candidate_with(searched: Searched, name: str) -> tuple[WeighedFit
 def _samples_of_insignificant(
     searched: Searched, effect: NamedEffect[Any], *, rng: np.random.Generator
 ) -> tuple[NamedEffect[Any], FloatArray, float]:
-    """Draw parameters of an effect that no refit contains: amplitudes by the linearised null, others from the prior.
-
-    Returns
-    -------
-    The middle one of its variants (discrete choices), the samples, (N_SAMPLES, n_params), and lambda at the best.
-    """
+    """Draw parameters of an effect that no refit contains: amplitudes by the linearised null, others from the prior."""
     null, misfit_templates = searched.null, searched.misfit_templates
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(null.found, best.likeliest_law)

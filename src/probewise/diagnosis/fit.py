@@ -296,24 +296,12 @@ def fit(
 ) -> Fit:
     """Find the maximum of the posterior, with the noise sd that is most likely at each point.
 
-    Maximises the log likelihood under the noise model minus |z|^2 / 2, over the box |z| <= 6.
-    Each step differentiates in one vectorised prediction and tries five dampings in another.
+    Maximises the log likelihood under the noise model minus |z|^2 / 2, over the box |z| <= 6. Each step differentiates
+    in one vectorised prediction and tries five dampings in another.
 
-    Parameters
-    ----------
-    model, recording
-        Model and data.
-    start
-        Coordinates to start from, shape (n_params,).
-    law
-        The noise model.
-    max_steps
-        Largest number of steps.
-    tolerance
-        Gain of a step, in nats, below which to stop.
-    hopeless_above
-        Objective above which a fit is of no use: one that would stay above it if all steps left gained as much as the
-        last is given up.
+    `start`: coordinates to start from, shape (n_params,); `tolerance`: gain of a step, in nats, below which to stop;
+    `hopeless_above`: objective above which a fit is of no use: one that would stay above it if all steps left gained as
+    much as the last is given up.
     """
     (found,) = fit_each_start(
         model, recording, [start], law, max_steps=max_steps, tolerance=tolerance, hopeless_above=hopeless_above
@@ -466,14 +454,8 @@ def _steps_along_valley(curvature: FloatArray, downhill: FloatArray) -> FloatArr
 def residual_degrees_of_freedom(slopes: FloatArray, sd: float, n_kept: int) -> float:
     """Return the residual degrees of freedom: n minus the number of parameters that readings, not priors, determine.
 
-    Parameters
-    ----------
-    slopes
-        Slopes of the whitened readings by the coordinates, (n_points, n_params).
-    sd
-        Noise of a whitened reading.
-    n_kept
-        Number of readings that are not lost; the slopes of the others are 0.
+    `slopes`: slopes of the whitened readings by the coordinates, (n_points, n_params); `n_kept`: number of readings
+    that are not lost; the slopes of the others are 0.
     """
     squares = np.linalg.svd(slopes / max(sd, LEAST_SCALE), compute_uv=False) ** 2
     return max(n_kept - float(np.sum(squares / (1 + squares))), 1.0)

@@ -53,16 +53,8 @@ def held_out_gain(
     together they have the joint density of the part given the rest. Parts of fewer than eight readings are not held
     out, and of more than ten parts only ten.
 
-    Parameters
-    ----------
-    null, repaired
-        The two models, fitted to all readings.
-    recording
-        What was read.
-    law, law_of_null
-        Noise distribution of the repaired model, and of the null.
-    held_out
-        Number of the part of each usable reading, and names of the parts.
+    `law`, `law_of_null`: noise distribution of the repaired model, and of the null; `held_out`: number of the part of
+    each usable reading, and names of the parts.
     """
     plan, usable = recording.plan, recording.usable
     parts, names = held_out
@@ -92,18 +84,9 @@ def mean_gain_over_parts(
 ) -> HeldOutGain:
     """Hold out one part at a time, at most ten, and average the gains of their readings.
 
-    Parameters
-    ----------
-    scan
-        Number of the part of each usable reading, such as its scan, (n_usable,).
-    gain
-        Function of a mask of held-out readings (n_usable,); returns the gain of each of them, in nats.
-    scan_names
-        Names of the parts; without, their numbers.
-
-    Returns
-    -------
-    The gain; no readings and gain 0 if fewer than two parts are long enough.
+    `scan`: number of the part of each usable reading, such as its scan, (n_usable,); `gain`: function of a mask of
+    held-out readings (n_usable,); returns the gain of each of them, in nats. Returns the gain; no readings and gain 0
+    if fewer than two parts are long enough.
     """
     long_enough = [int(k) for k in np.unique(scan) if np.sum(scan == k) >= LEAST_ROWS]
     if len(long_enough) < 2:
@@ -184,22 +167,10 @@ def sequential_log_densities(
 ) -> FloatArray:
     """Return the log density of each held-out reading given the others and those held out before it, 0 for lost ones.
 
-    Parameters
-    ----------
-    law
-        Noise distribution of all readings.
-    out
-        Mask of the held-out readings, (n_points,).
-    miss, slopes
-        Residuals of all readings, (n_points,), and slopes, (n_points, n_params), at one point.
-    mean, covariance
-        Of the coordinates about that point, from the readings that are not held out.
-    sigma_2
-        Variance of a whitened reading.
-
-    Returns
-    -------
-    Log densities, (n_out,), whose sum is the log of the joint density; of censored readings, relative to the peak.
+    `out`: mask of the held-out readings, (n_points,); `miss`, `slopes`: residuals of all readings, (n_points,), and
+    slopes, (n_points, n_params), at one point; `mean`, `covariance`: of the coordinates about that point, from the
+    readings that are not held out. Returns log densities, (n_out,), whose sum is the log of the joint density; of
+    censored readings, relative to the peak.
     """
     whitened, sd = innovations_given_rest(law, np.concatenate([slopes, miss[:, None]], axis=1), out)
     turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]

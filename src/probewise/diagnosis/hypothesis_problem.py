@@ -66,12 +66,8 @@ class StandardNormal:
 class HypothesisProblem:
     """A model in its coordinates with a recording; noise sd and parameters of the noise model are marginalised.
 
-    Parameters
-    ----------
-    model, recording
-        Model and data.
-    noise
-        Evidence of a fit by node of the noise model (a set of its parameters); the probable nodes are averaged over.
+    `model`, `recording`: model and data; `noise`: evidence of a fit by node of the noise model (a set of its
+    parameters); the probable nodes are averaged over.
     """
 
     model: Model
@@ -129,14 +125,8 @@ class FoldedNormal(StandardNormal):
 
     The density of a point is the sum of the normal's densities over all orders (permutations of the Gaussians).
 
-    Parameters
-    ----------
-    n_params
-        Number of coordinates.
-    sensor
-        Sensor with exchangeable Gaussians; its coordinates come first.
-    near
-        The point, (n_params,).
+    `n_params`: number of coordinates; `sensor`: sensor with exchangeable Gaussians; its coordinates come first; `near`:
+    the point, (n_params,).
     """
 
     sensor: GaussianMixtureSensor
@@ -192,16 +182,8 @@ class FoldedProblem:
 def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProblem | FoldedProblem:
     """Fold a problem onto the order of its Gaussians that is nearest to a point, such as its best fit.
 
-    Parameters
-    ----------
-    problem
-        A hypothesis with its recording.
-    near
-        The point, (n_params,).
-
-    Returns
-    -------
-    A problem with the same evidence; the problem itself if its sensor has no exchangeable Gaussians.
+    `near`: the point, (n_params,). Returns a problem with the same evidence; the problem itself if its sensor has no
+    exchangeable Gaussians.
     """
     sensor = problem.model.sensor
     if not (isinstance(sensor, GaussianMixtureSensor) and sensor.has_exchangeable_gaussians and sensor.n_gaussians > 1):

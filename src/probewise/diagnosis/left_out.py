@@ -33,10 +33,7 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     Of more than 2,400 readings, about that many are used, in stretches of six, and a note says so; the simulator still
     predicts every row.
 
-    Raises
-    ------
-    ParameterError
-        If the column is missing or contains no number, or if time falls within a run.
+    Raises ParameterError if the column is missing or contains no number, or if time falls within a run.
     """
     if simulator.reading not in table.columns:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
@@ -59,11 +56,8 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     If there is such a row, missing values of all columns are interpolated from the other rows of the run, so that
     effects with a memory, such as backlash, are defined in later rows.
 
-    Raises
-    ------
-    ParameterError
-        If the simulator gives no finite reading in a row where no column is missing: one with a reading or, if
-        `every_row`, any, since the change by an effect would not be finite there.
+    Raises ParameterError if the simulator gives no finite reading in a row where no column is missing: one with a
+    reading or, if `every_row`, any, since the change by an effect would not be finite there.
     """
     table = cast(RunTable, recording.plan)
     tried = system.chain(table, ()).predict(system.theta(system.starts), table)
@@ -115,9 +109,7 @@ def without_readings_at_stop(
 ) -> tuple[RunRecording, MeterStop | None]:
     """Leave out, with a note, readings at an undeclared stop of the meter.
 
-    Returns
-    -------
-    The recording without them, and the stop; None if there is none.
+    Returns the recording without them, and the stop; None if there is none.
     """
     found = find_meter_stop_and_mask(as_recording(simulator, table), simulator.reading)
     if found is None:

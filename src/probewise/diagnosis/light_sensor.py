@@ -68,14 +68,8 @@ def slope_along_motion(predict: Callable[[Plan], FloatArray], plan: Plan) -> Flo
 def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatArray) -> list[Covariate]:
     """List the covariates that vary in this recording.
 
-    Parameters
-    ----------
-    plan
-        The plan of all rows.
-    usable
-        Row numbers of the usable readings, shape (n_usable,).
-    level, slope
-        Predicted reading and its slope along the motion, both (n_usable,).
+    `usable`: row numbers of the usable readings, shape (n_usable,); `level`, `slope`: predicted reading and its slope
+    along the motion, both (n_usable,).
     """
     everything = np.arange(len(usable))
     sign = sign_of_motion(plan)[usable]
@@ -127,18 +121,8 @@ def covariate_of_effect(
 ) -> Covariate | None:
     """Return the first of an effect's covariates that varies here; None if none varies, or `change` is 0 everywhere.
 
-    Parameters
-    ----------
-    effect
-        The effect.
-    change
-        Its change of the readings, (n_points,).
-    without
-        Predicted readings without it, (n_points,), the values of the covariate `level`.
-    plan
-        Plan of the readings; a place is along the scans with the largest change.
-    known
-        Covariates of the recording.
+    `change`: its change of the readings, (n_points,); `without`: predicted readings without it, (n_points,), the values
+    of the covariate `level`; `plan`: plan of the readings; a place is along the scans with the largest change.
     """
     pooled = {c.name: c for c in known if c.scan is None}
     sign = sign_of_motion(plan)

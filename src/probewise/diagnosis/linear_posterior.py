@@ -89,12 +89,7 @@ class LinearAmplitudes:
     def of(cls, found: Fit, slopes: FloatArray, residual: FloatArray) -> Self | None:
         """Find the amplitudes of a fit that are wide in their coordinate; None if there is none.
 
-        Parameters
-        ----------
-        found
-            The fit.
-        slopes, residual
-            Whitened slopes (n_points, n_params) and residuals (n_points,), in noise sds.
+        `slopes`, `residual`: whitened slopes (n_points, n_params) and residuals (n_points,), in noise sds.
         """
         z_sd = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes + np.eye(len(found.z)))))
         groups = tuple(group for group in two_sided_amplitude_groups(found) if np.any(z_sd[list(group.at)] > _STRAIGHT))
@@ -164,16 +159,8 @@ class LinearView:
     function of the parameter; for one of an effect it is its coordinate, whose prior is standard normal. Many
     simulations are linear in a parameter, such as a starting level, but not in the coordinate of its uniform prior.
 
-    Parameters
-    ----------
-    model
-        The model.
-    z
-        Coordinates at which the tangent touches, (n_params,).
-    view
-        What is simulated there, (n_points,).
-    slopes
-        Its derivatives, (n_params, n_points); 0 for coordinates of effects on the readings.
+    `model`: the model; `z`: coordinates at which the tangent touches, (n_params,); `view`: what is simulated there,
+    (n_points,); `slopes`: its derivatives, (n_params, n_points); 0 for coordinates of effects on the readings.
     """
 
     model: Model
@@ -261,22 +248,10 @@ class ConditionallyLinearDensity:
     Those are the value of the effect's amplitude, in units of its typical size, and the straight coordinates (see
     `LinearView`) of every other parameter.
 
-    Parameters
-    ----------
-    view
-        The tangent of the simulation.
-    at
-        Index of the coordinate of the grid.
-    amplitude
-        The amplitude.
-    nodes
-        The grid, equally spaced, (n_nodes,).
-    log_shares
-        Log probability of each node and component, (n_nodes, n_components).
-    means
-        Means of the others, (n_nodes, n_components, n_params - 1).
-    roots
-        Lower Cholesky factors of their precisions, (n_nodes, n_components, n_params - 1, n_params - 1).
+    `view`: the tangent of the simulation; `at`: index of the coordinate of the grid; `amplitude`: the amplitude;
+    `nodes`: the grid, equally spaced, (n_nodes,); `log_shares`: log probability of each node and component, (n_nodes,
+    n_components); `means`: means of the others, (n_nodes, n_components, n_params - 1); `roots`: lower Cholesky factors
+    of their precisions, (n_nodes, n_components, n_params - 1, n_params - 1).
     """
 
     view: LinearView
@@ -293,14 +268,7 @@ class ConditionallyLinearDensity:
 
         It can be that of an effect on the readings, without change points, with one amplitude of either sign.
 
-        Parameters
-        ----------
-        found, law, recording
-            The fit, the law of its noise, and what was fitted.
-        covariance
-            Of the coordinates, by Laplace's approximation, (n_params, n_params).
-        sd
-            Of a whitened reading.
+        `covariance`: of the coordinates, by Laplace's approximation, (n_params, n_params).
         """
         able = list(_grid_coordinates_with_amplitudes(found))
         if not able:

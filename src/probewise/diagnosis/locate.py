@@ -113,18 +113,9 @@ class Place:
 def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], draws: FloatArray) -> float:
     """Test for a missing effect on the mean, by the weighted mean of the Bayes factors of all templates.
 
-    Parameters
-    ----------
-    problem
-        The fit under the noise model found.
-    banks
-        All templates compared, with labels; each label has equal weight, divided among its templates.
-    draws
-        Residuals under the null, (n_rows, n_draws). Only the first fifth is used if that gives a p-value above 0.25.
-
-    Returns
-    -------
-    The p-value: the share of draws with as large a mean; for a mean b beyond their resolution, the bound 1/b.
+    `banks`: all templates compared, with labels; each label has equal weight, divided among its templates; `draws`:
+    residuals under the null, (n_rows, n_draws). Only the first fifth is used if that gives a p-value above 0.25.
+    Returns the p-value: the share of draws with as large a mean; for a mean b beyond their resolution, the bound 1/b.
     """
     families = [(number, label) for number, bank in enumerate(banks) for label in bank.labels]
     names = list(dict.fromkeys(families))
@@ -152,9 +143,7 @@ def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[Floa
 
     Equal values stay together. Of a categorical covariate, one window per value.
 
-    Returns
-    -------
-    Indicator columns, (n_points, n_windows), and the covariate's least and largest value in each window.
+    Returns indicator columns, (n_points, n_windows), and the covariate's least and largest value in each window.
     """
     values, rows = covariate.values, covariate.rows
     columns: list[FloatArray] = []
@@ -199,18 +188,8 @@ def significant_places(
 ) -> list[Place]:
     """Return, for each covariate, its most significant window if that has p up to 0.05; most significant first.
 
-    Parameters
-    ----------
-    problem
-        The fit under the noise model found.
-    covariates
-        Covariates to search.
-    scan_names
-        Names of the scans or runs, for the covariates `scan` and `run`.
-    residuals
-        Reading minus prediction, (n_points,), for the mean curves.
-    draws
-        Residuals under the null, (n_rows, n_draws).
+    `residuals`: reading minus prediction, (n_points,), for the mean curves; `draws`: residuals under the null, (n_rows,
+    n_draws).
     """
     out: list[Place] = []
     norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_kept)
@@ -258,28 +237,12 @@ def places_of_effect(
 ) -> list[Place]:
     """Locate a named effect: the interval of a covariate in which it is at least half its maximum.
 
-    In `level` a twentieth suffices; in `direction` its deviation from its mean counts; in `run`, it is the run of
-    the largest change. The list holds one place, or, for an effect bound to scans, one per scan in which it is a
-    twentieth of its maximum or more.
+    In `level` a twentieth suffices; in `direction` its deviation from its mean counts; in `run`, it is the run of the
+    largest change. The list holds one place, or, for an effect bound to scans, one per scan in which it is a twentieth
+    of its maximum or more.
 
-    Parameters
-    ----------
-    effect
-        The effect.
-    change
-        Its change of the readings, (n_points,).
-    covariate
-        Covariate in which to locate it.
-    scans
-        The covariate `scan`, if there are several.
-    plan
-        Plan of the usable readings.
-    residuals
-        Residuals of the null, (n_points,), for the mean curve.
-    p_value, size
-        p-value of the global test, and the effect's lambda.
-    sd
-        Noise sd of a reading.
+    `change`: its change of the readings, (n_points,); `scans`: the covariate `scan`, if there are several; `residuals`:
+    residuals of the null, (n_points,), for the mean curve.
     """
     name = covariate.name
     if name == "run":

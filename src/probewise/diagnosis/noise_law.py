@@ -34,13 +34,9 @@ class RoundedNormal:
 
     The methods are those of `Tail`, with residuals (n_points, k) or (n_points, 1); pass this `sigma` to each.
 
-    Parameters
-    ----------
-    half, sigma
-        The noise of a reading of relative sd 1.
-    sd
-        Sds of the readings relative to that one, (n_points, 1), 1 for lost readings; 1.0 if all are equal. Residuals
-        are whitened by `whitening_sd`, so that each tells as much of the mean as one of relative sd 1.
+    `half`, `sigma`: the noise of a reading of relative sd 1; `sd`: sds of the readings relative to that one, (n_points,
+    1), 1 for lost readings; 1.0 if all are equal. Residuals are whitened by `whitening_sd`, so that each tells as much
+    of the mean as one of relative sd 1.
     """
 
     half: float | FloatArray
@@ -180,34 +176,18 @@ class NoiseLaw:
     Beside a random walk the tail is of each reading's own noise: given the probabilities of readings to be `wide`,
     which a fit's residuals tell (`wide_readings`), the noise is normal, with sds that include them.
 
-    Parameters
-    ----------
-    sd
-        Sd of each reading relative to the overall one, (n_points,).
-    carry
-        Correlation with the previous reading, 0 for the first of a scan, (n_points,).
-    lost
-        Mask of lost readings, which do not depend on the target, (n_points,).
-    share, times
-        Parameters of the heavy tail; none by default.
-    log_extra
-        Log probability of the lost readings.
-    flat, sigma
-        Rounding, if there is no tail: a uniform part of half width `flat` sigma, with known sigma, in every reading
-        whatever its relative sd.
-    least
-        Least sd of a reading, given those before it; not used if sigma is known.
-    walk
-        Increments in variance of a random walk of the offset from row to row, also between runs, relative to the
-        overall variance, (n_points,); empty without one. Then there is no other correlation.
-    before
-        Number of the reading with which each has the correlation `carry`, (n_points,), arbitrary where that is 0.
-        Empty: the reading above, as always unless the rows of scans are interleaved.
-    wide
-        Probability of each reading to be wide, (n_points,), where `sd` includes it; empty without or if unknown.
-    censored
-        Mask of the readings at an end of the instrument's range, (n_points,); empty without one. The prediction there
-        is limited to the end, so that the likelihood is 1 where the signal is beyond it. They do not count in the sd.
+    `sd`: sd of each reading relative to the overall one, (n_points,); `carry`: correlation with the previous reading, 0
+    for the first of a scan, (n_points,); `lost`: mask of lost readings, which do not depend on the target, (n_points,);
+    `share`, `times`: parameters of the heavy tail; none by default; `log_extra`: log probability of the lost readings;
+    `flat`, `sigma`: rounding, if there is no tail: a uniform part of half width `flat` sigma, with known sigma, in
+    every reading whatever its relative sd; `least`: least sd of a reading, given those before it; not used if sigma is
+    known; `walk`: increments in variance of a random walk of the offset from row to row, also between runs, relative to
+    the overall variance, (n_points,); empty without one. Then there is no other correlation. `before`: number of the
+    reading with which each has the correlation `carry`, (n_points,), arbitrary where that is 0. Empty: the reading
+    above, as always unless the rows of scans are interleaved. `wide`: probability of each reading to be wide,
+    (n_points,), where `sd` includes it; empty without or if unknown; `censored`: mask of the readings at an end of the
+    instrument's range, (n_points,); empty without one. The prediction there is limited to the end, so that the
+    likelihood is 1 where the signal is beyond it. They do not count in the sd.
     """
 
     sd: FloatArray
@@ -592,20 +572,10 @@ def noise_statistics(
 ) -> FloatArray:
     """Return statistics that vanish for white normal noise.
 
-    Parameters
-    ----------
-    residuals
-        Whitened residuals, shape (n_points, n_draws).
-    steps
-        Rows back to the previous reading of the scan, 0 for none, shape (n_points,).
-    level
-        Predicted readings, shape (n_points,).
-    before
-        Number of the previous reading of the scan, shape (n_points,); None where it is the one above.
-
-    Returns
-    -------
-    Lag-1 autocorrelation, excess kurtosis, and projection of the squares on the level, (3, n_draws).
+    `residuals`: whitened residuals, shape (n_points, n_draws); `steps`: rows back to the previous reading of the scan,
+    0 for none, shape (n_points,); `level`: predicted readings, shape (n_points,); `before`: number of the previous
+    reading of the scan, shape (n_points,); None where it is the one above. Returns lag-1 autocorrelation, excess
+    kurtosis, and projection of the squares on the level, (3, n_draws).
     """
     r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
     neighbours = np.flatnonzero(steps == 1)

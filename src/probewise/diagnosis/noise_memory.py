@@ -56,21 +56,10 @@ class _Chain:
 def innovations_given_rest(law: NoiseLaw, columns: FloatArray, asked: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Whiten the noise of some readings given that of all others: what the others and earlier ones do not tell of each.
 
-    Parameters
-    ----------
-    law
-        Joint distribution of all readings' noise, its tail aside.
-    columns
-        Residuals, or slopes, of all readings, (n_points, n_columns).
-    asked
-        Mask of the readings to whiten, (n_points,); those that are lost are neither whitened nor given.
-
-    Returns
-    -------
-    innovations, sd
-        Whitened columns of the readings asked for, (n_asked, n_columns), of sd sigma each and independent, 0 where
-        lost; and the sd of each reading in units of sigma, given the other readings and those asked for before it,
-        (n_asked,), 1 where lost.
+    `columns`: residuals, or slopes, of all readings, (n_points, n_columns); `asked`: mask of the readings to whiten,
+    (n_points,); those that are lost are neither whitened nor given. Returns `innovations, sd`: whitened columns of the
+    readings asked for, (n_asked, n_columns), of sd sigma each and independent, 0 where lost; and the sd of each reading
+    in units of sigma, given the other readings and those asked for before it, (n_asked,), 1 where lost.
     """
     chain = _Chain.of(law)
     seen, own = ~law.lost[chain.order], asked[chain.order]
@@ -163,15 +152,7 @@ _FARTHEST = 1e100  # residual whose square is a number
 def with_known_wide_readings(law: NoiseLaw, residuals: FloatArray) -> NoiseLaw:
     """Return a random walk's distribution with the tail on each reading's own noise, given the residuals of a fit.
 
-    Parameters
-    ----------
-    law
-        Noise with a walk and a tail (`share`, `times`).
-    residuals
-        Residuals of the fit, (n_points,).
-
-    Returns
-    -------
+    `law`: noise with a walk and a tail (`share`, `times`); `residuals`: residuals of the fit, (n_points,). Returns
     Gaussian noise with the probability of each reading to be wide (`wide`), and sds that include it. Its `log_extra` is
     what the log density of these residuals, averaged over the sets of wide readings, exceeds that of this noise by.
     """

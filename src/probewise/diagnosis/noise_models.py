@@ -49,18 +49,9 @@ class NoiseNodes:
 class NoiseModel:
     """A set of effects on the noise.
 
-    Parameters
-    ----------
-    effects
-        The effects; empty for white noise.
-    recording
-        What was read.
-    likely
-        For some effects by name, the nodes to use, (n_nodes, n_params), and their log prior weights.
-    rounding
-        Rounding step of all readings, if there is no other noise effect, or 0.
-    least_sd
-        Least plausible sd of a reading, given those before it.
+    `effects`: the effects; empty for white noise; `recording`: what was read; `likely`: for some effects by name, the
+    nodes to use, (n_nodes, n_params), and their log prior weights; `rounding`: rounding step of all readings, if there
+    is no other noise effect, or 0; `least_sd`: least plausible sd of a reading, given those before it.
     """
 
     effects: tuple[NoiseEffect, ...]

@@ -49,16 +49,8 @@ def outlier_probabilities(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
 def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
     """Return log Bayes factors for another share of outlying readings in a window of a covariate than elsewhere.
 
-    Parameters
-    ----------
-    far_out
-        Probability of each reading to be outlying, (n_points,).
-    covariates
-        Covariates to test.
-
-    Returns
-    -------
-    By the covariate's name with the suffix `FAR_OUT`; Bayes factors are averaged over its windows.
+    `far_out`: probability of each reading to be outlying, (n_points,). Returns by the covariate's name with the suffix
+    `FAR_OUT`; Bayes factors are averaged over its windows.
     """
     n, total = len(far_out), float(far_out.sum())
     even = float(betaln(total + _A, n - total + _A) - betaln(_A, _A))
@@ -149,9 +141,7 @@ def find_lost_readings(
     of a fit). Nothing is fitted unless a residual of the fit `first`, to all readings, is improbable, or their rms is
     over twice a noise sd that is known without it.
 
-    Returns
-    -------
-    The readings; None if there are none, or if they cluster.
+    Returns the readings; None if there are none, or if they cluster.
     """
     law, usable = white_noise_of_recording(recording), np.flatnonzero(recording.usable)
     n_most, size = int(MOST_OUTLYING * len(usable)), np.abs(law(first.residuals))

@@ -52,23 +52,11 @@ def importance_resample(
 ) -> FloatArray | None:
     """Draw from a density by importance resampling, if the effective sample size suffices.
 
-    Parameters
-    ----------
-    first
-        Samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated.
-    log_q, log_p
-        Unnormalised log densities of the proposal and the target, (n, n_params) -> (n,); `log_p` is minus infinity
-        outside its support.
-    n_wanted
-        Number of samples to draw; the effective sample size should be half of it.
-    rng
-        Source of randomness.
-    least
-        Least acceptable effective sample size, as a share of `n_wanted`.
-
-    Returns
-    -------
-    Samples in random order, (n_wanted, n_params); None if the effective sample size is too small.
+    `first`: samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated;
+    `log_q`, `log_p`: unnormalised log densities of the proposal and the target, (n, n_params) -> (n,); `log_p` is minus
+    infinity outside its support; `n_wanted`: number of samples to draw; the effective sample size should be half of it;
+    `least`: least acceptable effective sample size, as a share of `n_wanted`. Returns samples in random order,
+    (n_wanted, n_params); None if the effective sample size is too small.
     """
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
     share = _n_distinct_effective(gain, first[:n_wanted]) / len(gain)
@@ -105,25 +93,10 @@ def draw_by_annealing(
 ) -> FloatArray:
     """Draw from a density by sequential Monte Carlo, starting from samples of another one.
 
-    Parameters
-    ----------
-    first
-        Samples of the other density, (n_walkers, n_params), an even number.
-    log_q, log_p, n_wanted, rng
-        As in `importance_resample`.
-    n_moves
-        Moves of each sample after a step of beta, and between collections of samples.
-    progress
-        Called at each step of beta, and then with the number of collected samples.
-
-    Returns
-    -------
-    Samples in random order, (n_wanted, n_params), collected from the walkers every `n_moves` moves.
-
-    Raises
-    ------
-    NotConvergedError
-        If no initial sample is in the support of the target.
+    `first`: samples of the other density, (n_walkers, n_params), an even number; `log_q`, `log_p`, `n_wanted`, `rng`:
+    as in `importance_resample`; `n_moves`: moves of each sample after a step of beta, and between collections of
+    samples. Returns samples in random order, (n_wanted, n_params), collected from the walkers every `n_moves` moves.
+    Raises NotConvergedError if no initial sample is in the support of the target.
     """
     n_walkers = len(first)
     z, heights = first, (log_q(first), log_p(first))
@@ -207,14 +180,8 @@ class QuadraticPredictions:
     def of(cls, predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float) -> QuadraticPredictions:
         """Build the surrogate; it is exact, but for negligible changes, at every step, its reverse, and sums of two.
 
-        Parameters
-        ----------
-        predict
-            The model as a function of steps, (n_samples, n_params) -> (n_samples, n_points); finite at step 0.
-        n_params
-            Number of parameters, one step each.
-        sd
-            Noise sd of a reading: changes by less than 0.02 sd over all readings together are neglected.
+        `predict`: the model as a function of steps, (n_samples, n_params) -> (n_samples, n_points); finite at step 0;
+        `sd`: noise sd of a reading: changes by less than 0.02 sd over all readings together are neglected.
         """
         first, second = np.triu_indices(n_params)
         apart = first != second

@@ -44,9 +44,7 @@ def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArra
     Whole scans are chosen, to preserve correlations between readings; or, if these would be fewer than eight, stretches
     of six successive rows. Both are spread evenly but not regularly, so that what repeats itself is seen at all phases.
 
-    Returns
-    -------
-    Row numbers, ascending.
+    Returns row numbers, ascending.
     """
     n_usable, n_points = int(recording.usable.sum()), len(recording)
     if n_usable <= most:
@@ -70,16 +68,8 @@ def positions_in_stretches(run: IntArray, most: int) -> IntArray:
     The gaps between stretches are a half to one and a half of their mean, the same for every table of this length: with
     equal gaps a table that repeats itself, as by the hour, may show the same hours in every stretch.
 
-    Parameters
-    ----------
-    run
-        Number of each row's run, (n_rows,). Neighbours are successive rows of a run, also where runs are interleaved.
-    most
-        Number of rows to choose.
-
-    Returns
-    -------
-    Row numbers, ascending.
+    `run`: number of each row's run, (n_rows,). Neighbours are successive rows of a run, also where runs are
+    interleaved. Returns row numbers, ascending.
     """
     n_rows, n_stretches = len(run), round(most / _STRETCH)
     if n_rows <= most:
@@ -101,18 +91,9 @@ _WILD = 5.0  # spans of the middle 80 % of the readings from their median: no sc
 class Prepared:
     """Input of a diagnosis.
 
-    Parameters
-    ----------
-    recording
-        The readings used.
-    effects
-        Effects that could act in them, by name.
-    null
-        The null model; None: calibrated from the recording.
-    apparatus
-        The apparatus that took the readings.
-    everything
-        All readings; the same as `recording` if all are used.
+    `recording`: the readings used; `effects`: effects that could act in them, by name; `null`: the null model; None:
+    calibrated from the recording; `apparatus`: the apparatus that took the readings; `everything`: all readings; the
+    same as `recording` if all are used.
     """
 
     recording: Recording

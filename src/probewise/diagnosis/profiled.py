@@ -34,18 +34,10 @@ _INDEPENDENT = 0.25  # least effective sample size, as a share of the samples wa
 class ProfiledDensity:
     """A density of a fit's coordinates: the sliced one has the evidence of each slice, the others are Student-t in it.
 
-    Parameters
-    ----------
-    at
-        Index of the sliced coordinate.
-    nodes
-        Its values in the slices, rising, (n_nodes,).
-    modes
-        The other coordinates' best values in each slice, (n_nodes, n_params - 1).
-    roots
-        Lower Cholesky factors of their covariances there, (n_nodes, n_params - 1, n_params - 1).
-    log_evidence
-        Log evidence of each slice, up to a constant, (n_nodes,).
+    `at`: index of the sliced coordinate; `nodes`: its values in the slices, rising, (n_nodes,); `modes`: the other
+    coordinates' best values in each slice, (n_nodes, n_params - 1); `roots`: lower Cholesky factors of their
+    covariances there, (n_nodes, n_params - 1, n_params - 1); `log_evidence`: log evidence of each slice, up to a
+    constant, (n_nodes,).
     """
 
     at: int

@@ -30,33 +30,15 @@ _OPEN = 0.05  # least probability of a rival: what has less is no open question
 class Grounds:
     """The facts, in addition to the verdict, for the sentence that gives its reason.
 
-    Parameters
-    ----------
-    words
-        The apparatus' words.
-    n_readings, least_readings
-        Usable readings, and the fewest for a verdict.
-    form
-        Description of the calibrated SSF, "" if there is none.
-    sentences
-        Sentence on each effect, by name.
-    like
-        Sentences on the effects that the unknown one resembles.
-    family
-        The most probable family of bases of the unknown effect, such as "time".
-    beside
-        Effects that act in addition to the unknown one.
-    shows_in
-        Names of the covariates in which effects and residuals are located, in the order of `Diagnosis.where`.
-    p_value_after
-        p-value of the global test of the repaired model.
-    settles
-        The readings that would separate the hypotheses that the sentence names, in words; "" if no such readings do,
-        None if that is not known.
-    apart
-        Which of these hypotheses they separate, in words.
-    nuisances
-        Sentences on the noise that was found beside what has a name in the vocabulary.
+    `words`: the apparatus' words; `n_readings`, `least_readings`: usable readings, and the fewest for a verdict;
+    `form`: description of the calibrated SSF, "" if there is none; `sentences`: sentence on each effect, by name;
+    `like`: sentences on the effects that the unknown one resembles; `family`: the most probable family of bases of the
+    unknown effect, such as "time"; `beside`: effects that act in addition to the unknown one; `shows_in`: names of the
+    covariates in which effects and residuals are located, in the order of `Diagnosis.where`; `p_value_after`: p-value
+    of the global test of the repaired model; `settles`: the readings that would separate the hypotheses that the
+    sentence names, in words; "" if no such readings do, None if that is not known; `apart`: which of these hypotheses
+    they separate, in words; `nuisances`: sentences on the noise that was found beside what has a name in the
+    vocabulary.
     """
 
     words: Words

@@ -140,12 +140,8 @@ class Repair:
 def repair_of(prepared: Prepared, best: BestRepair, drawn: NullBestAndRepairedSamples, change: FloatArray) -> Repair:
     """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
 
-    Parameters
-    ----------
-    prepared, best, drawn
-        Input of the search; the best fit; samples of the models.
-    change
-        Correction of the predictions of the readings that are used, (n_usable,), 0 if there is none.
+    `prepared`, `best`, `drawn`: input of the search; the best fit; samples of the models; `change`: correction of the
+    predictions of the readings that are used, (n_usable,), 0 if there is none.
     """
     everything, law = prepared.everything, best.problem.law
     used = prepared.usable_rows_of_everything
@@ -184,14 +180,7 @@ def locate_effects_and_residuals(
 
     A place is a range of a covariate, such as time. Of several places with the same figure, only the first is kept.
 
-    Parameters
-    ----------
-    searched, test, judged, best
-        Result of the search; global test of the null; the verdict; the repair.
-    sizes
-        Lambda of each effect, by name.
-    rng
-        Random generator, for a second test under normal noise, if heavy-tailed noise leaves nothing significant.
+    `searched`, `test`, `judged`, `best`: result of the search; global test of the null; the verdict; the repair.
     """
     prepared, problem, law = searched.prepared, test.problem, test.problem.law
     covariates, residuals = searched.misfit_templates.covariates, test.null.found.residuals

@@ -34,17 +34,8 @@ def weights_beside_other_effects(
 ) -> Mapping[str, FloatArray]:
     """Return the probabilities of each effect's variants (discrete choices), given a fit with several effects.
 
-    Parameters
-    ----------
-    found
-        The fit, in which each effect is bound to one variant.
-    law
-        The noise.
-    usable
-        Rows of the readings, (n_usable,).
-    weights
-        The probabilities as each effect was added, by effect, (n_variants,). They are returned for a single effect, and
-        for one whose choice no parameter shows.
+    `usable`: rows of the readings, (n_usable,); `weights`: the probabilities as each effect was added, by effect,
+    (n_variants,). They are returned for a single effect, and for one whose choice no parameter shows.
     """
     effects = found.model.effects
     if len(effects) < 2:
@@ -157,21 +148,9 @@ def sample_model(
 
     `posterior_draws` draws their coordinates. Parameters of noise effects, variants and the noise's sd are drawn here.
 
-    Parameters
-    ----------
-    found, noise
-        The fit and its evidence under a noise model; parameters of noise effects are drawn about its nodes, by weight.
-    recording
-        What was fitted.
-    weights
-        By effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,), when it
-        was added.
-    rng
-        Source of randomness.
-    annealed
-        Whether samples are of the posterior; otherwise of Laplace's approximation, with `LinearAmplitudes`.
-    progress
-        Called with the progress of annealing.
+    `weights`: by effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,),
+    when it was added; `annealed`: whether samples are of the posterior; otherwise of Laplace's approximation, with
+    `LinearAmplitudes`.
     """
     law, n_samples = noise.likeliest_law, N_SAMPLES
     weights = weights_beside_other_effects(found, law, np.flatnonzero(recording.usable), weights)

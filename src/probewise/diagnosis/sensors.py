@@ -298,10 +298,7 @@ def sensor_from_posterior(
 
     Only the SSF's and the levels' columns are used; effects of the earlier model are dropped.
 
-    Raises
-    ------
-    ParameterError
-        If the names are not those of a mixture of Gaussians with two free levels.
+    Raises ParameterError if the names are not those of a mixture of Gaussians with two free levels.
     """
     names = list(names)
     n_gaussians = sum(name.startswith("a_") for name in names)
@@ -451,18 +448,7 @@ def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> Floa
     one to three noise sds in all, which are not physics. Narrow Gaussians of small weight, spread over the footprint,
     absorb them to first order. They are part of no fit: the global test asks whether its alarm persists beside them.
 
-    Parameters
-    ----------
-    model
-        A sensor calibrated from the recording, without effects.
-    z
-        Its coordinates, (n_params,).
-    usable
-        Numbers of the plan's rows to use.
-
-    Returns
-    -------
-    Slopes, (n_usable, n_places), in reading units.
+    `z`: its coordinates, (n_params,). Returns slopes, (n_usable, n_places), in reading units.
     """
     sensor = model.sensor
     assert isinstance(sensor, CalibratedSensor)

@@ -75,16 +75,8 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
 
     At most four recorded runs are taken, those that differ in their controls.
 
-    Parameters
-    ----------
-    table
-        The recorded rows.
-    reading
-        The predicted column, which is empty in rows yet to be taken.
-    controls
-        Columns that can be set; without any, runs can only be repeated.
-    time_unit
-        Unit of the table's time.
+    `reading`: the predicted column, which is empty in rows yet to be taken; `controls`: columns that can be set;
+    without any, runs can only be repeated.
     """
     out: list[RunCommand] = []
     settable = [name for name in controls if name in table.covariates]
@@ -273,17 +265,10 @@ _UNLIKELY = 0.1
 class SimulatorApparatus(Apparatus):
     """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects.
 
-    Parameters
-    ----------
-    about
-        The system, its table, the first fit, and the sd of a reading.
-    stop
-        The level at which the meter stops without having declared it, if the readings show one.
-    finer
-        The system with a finer integration step, if the leading hypotheses were refitted with one. Effects keep the
-        scales and origins of `about`.
-    lost
-        The effect that lost readings which were left out, if any.
+    `about`: the system, its table, the first fit, and the sd of a reading; `stop`: the level at which the meter stops
+    without having declared it, if the readings show one; `finer`: the system with a finer integration step, if the
+    leading hypotheses were refitted with one. Effects keep the scales and origins of `about`. `lost`: the effect that
+    lost readings which were left out, if any.
     """
 
     about: ReferenceFit

@@ -41,14 +41,8 @@ _MOST_BYTES = 2**28
 class TemplateBank:
     """Labelled templates, concatenated by columns, with their Bayes factors about any fit.
 
-    Parameters
-    ----------
-    columns
-        Columns of all templates, (n_points, n_columns).
-    widths
-        Number of columns of each template, (n_templates,).
-    labels
-        Label of each template; several may have the same, such as the name of their effect.
+    `columns`: columns of all templates, (n_points, n_columns); `widths`: number of columns of each template,
+    (n_templates,); `labels`: label of each template; several may have the same, such as the name of their effect.
     """
 
     columns: FloatArray
@@ -86,16 +80,8 @@ class TemplateBank:
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
         """Return the log Bayes factor of adding each template to a fit, as `block_log_bayes_factors` does.
 
-        Parameters
-        ----------
-        problem
-            The fit, linearised.
-        residuals
-            Projected residuals, (n_rows, n_draws); the fit's own by default.
-
-        Returns
-        -------
-        Log Bayes factors, (n_templates, n_draws).
+        `residuals`: projected residuals, (n_rows, n_draws); the fit's own by default. Returns log Bayes factors,
+        (n_templates, n_draws).
         """
         own = problem.residual[:, None] if residuals is None else residuals
         n, n_kept = problem.n_points, problem.n_kept

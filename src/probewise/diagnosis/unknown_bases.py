@@ -62,21 +62,10 @@ def bank_of_unknown_effects(
 ) -> TemplateBank:
     """Build the template bank of unknown effects: basis functions over every covariate.
 
-    Parameters
-    ----------
-    covariates
-        Covariates of the usable readings.
-    signal, slope
-        Predicted reading above its minimum, and its slope along the motion, (n_usable,) each.
-    scan
-        Number of each usable row's scan, (n_usable,); rows of scans may be mixed. None: rows are in no order, and
-        nothing depends on the rows before.
-    multiplied
-        Covariates of which the product of every two is a basis; all products are one family.
-
-    Returns
-    -------
-    Bank of bases, (n_usable, n_columns) each, labelled by family; families have equal prior weight.
+    `signal`, `slope`: predicted reading above its minimum, and its slope along the motion, (n_usable,) each; `scan`:
+    number of each usable row's scan, (n_usable,); rows of scans may be mixed. None: rows are in no order, and nothing
+    depends on the rows before. `multiplied`: covariates of which the product of every two is a basis; all products are
+    one family. Returns bank of bases, (n_usable, n_columns) each, labelled by family; families have equal prior weight.
     """
     numbers = np.zeros(len(signal), dtype=np.int64) if scan is None else scan
     order = np.argsort(numbers, kind="stable")  # those of each scan together

@@ -165,10 +165,6 @@ def _search_for_shapes(
     """Search for shapes that fit the readings, with the sensor at its prior mean.
 
     Shapes are drawn from the prior, then repeatedly about the best ones.
-
-    Returns
-    -------
-    Sum of squared residuals of the best shape, and coordinates of sensor and shape for the four best, (4, n_params).
     """
     usable = recording.usable
     if not usable.any():

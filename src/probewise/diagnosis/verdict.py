@@ -48,10 +48,7 @@ class GlobalTest:
 def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTest:
     """Test whether effects are missing in the mean of the null; the p-value is 1 where all readings are equal.
 
-    Raises
-    ------
-    NotConvergedError
-        If the fit of the null did not converge, with enough readings to tell.
+    Raises NotConvergedError if the fit of the null did not converge, with enough readings to tell.
     """
     prepared, null, noise = searched.prepared, searched.null, searched.posterior.likeliest_noise()
     problem = Linearised.of(null.found, null.evidence[null.possible_noise(noise)].likeliest_law)
@@ -327,12 +324,8 @@ def with_shared_effects(
       open beside them. As for any other name, the p-value must be .01 or less. Beside them the combination has those
       effects of the leading set that have more than half of the probability: the best answer, though not certain.
 
-    Parameters
-    ----------
-    judged
-        The judgement by single combinations.
-    noise_names, certain
-        Effects on the noise; effects that the readings show beyond doubt, which need no significant test.
+    `noise_names`, `certain`: effects on the noise; effects that the readings show beyond doubt, which need no
+    significant test.
     """
     probability = {h.effects: h.probability for h in judged.hypotheses}
     shared = shared_effects(probability)
@@ -412,12 +405,7 @@ def verdict_and_combination(
 def _joined_over_noise(
     hypotheses: tuple[Hypothesis, ...], noise_names: frozenset[str]
 ) -> tuple[tuple[Hypothesis, ...], dict[Names, Names]]:
-    """Join hypotheses with the same effects on the mean; those with effects on the noise alone stay apart.
-
-    Returns
-    -------
-    The joined hypotheses, by their effects on the mean; and by these the effects of the most probable one of each.
-    """
+    """Join hypotheses with the same effects on the mean; those with effects on the noise alone stay apart."""
     joined, fullest = dict[Names, float](), dict[Names, Names]()
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
         mean = tuple(name for name in hypothesis.effects if name not in noise_names) or hypothesis.effects

@@ -241,9 +241,7 @@ class NoiseModels:
 
         Only those within three nats of the best are added.
 
-        Returns
-        -------
-        Whether any pair was tried.
+        Returns whether any pair was tried.
         """
         known, singles = dict(evidence), list(evidence)
         for size in range(1, MOST_FAULTS):
@@ -355,10 +353,7 @@ _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
 def checked_finite_fit(found: Fit) -> Fit:
     """Return a fit after checking that its predictions are finite.
 
-    Raises
-    ------
-    NotConvergedError
-        If they are not, with the fit as its `partial`.
+    Raises NotConvergedError if they are not, with the fit as its `partial`.
     """
     if not np.isfinite(found.objective):
         raise NotConvergedError("the model predicts readings that are not finite; check the model and its prior", found)
@@ -368,10 +363,7 @@ def checked_finite_fit(found: Fit) -> Fit:
 def require_converged_fit(found: Fit, problem: Linearised) -> None:
     """Refuse a fit that one more step would improve by over ten nats, unless it is at the bounds of its prior.
 
-    Raises
-    ------
-    NotConvergedError
-        With the fit as its `partial`.
+    Raises NotConvergedError with the fit as its `partial`.
     """
     shift = problem.absorbing_shift(found, np.zeros(len(found.residuals)))
     slopes = problem.whiten(found.slopes)
@@ -483,10 +475,8 @@ class Refits:
         A refit made before is returned as it was; an effect that changes the readings exactly as one refitted before
         takes over that fit and evidence.
 
-        Returns
-        -------
-        The fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats; and the
-        effect's log Bayes factor by screening, by noise model.
+        Returns the fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats;
+        and the effect's log Bayes factor by screening, by noise model.
         """
         key = parent, effect, against
         if key not in self.known:

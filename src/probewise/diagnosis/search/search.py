@@ -69,9 +69,7 @@ def prune_out_of_vocabulary(
     A combination is dropped if it predicts so much the same as a named one that its expected lead is below three nats.
     If its observed lead is below three nats, its evidence is reduced to that of the best named one.
 
-    Returns
-    -------
-    The candidates that stay, and the combinations that were dropped.
+    Returns the candidates that stay, and the combinations that were dropped.
     """
 
     def average_log_evidence(candidate: WeighedFit) -> float:
@@ -96,20 +94,11 @@ def prune_out_of_vocabulary(
 class UnknownEffects:
     """Evidence of an unknown effect, by basis functions, added to candidates, under each of their leading noise models.
 
-    Parameters
-    ----------
-    scores
-        Function of a fit, a noise distribution and a bank: log Bayes factors of its templates, by label.
-    bases
-        Bank of the basis functions.
-    covariates
-        Covariates in which outlying readings may cluster.
-    noises
-        The noise models.
-    complexity_penalty
-        Function of the degrees of freedom of an SSF: penalty in nats of an unknown effect added to the null.
-    log_n_choices
-        Function of names: log of the number of combinations of this size, relative to single names.
+    `scores`: function of a fit, a noise distribution and a bank: log Bayes factors of its templates, by label; `bases`:
+    bank of the basis functions; `covariates`: covariates in which outlying readings may cluster; `noises`: the noise
+    models; `complexity_penalty`: function of the degrees of freedom of an SSF: penalty in nats of an unknown effect
+    added to the null; `log_n_choices`: function of names: log of the number of combinations of this size, relative to
+    single names.
     """
 
     scores: Callable[[Fit, NoiseLaw, TemplateBank], Mapping[str, FloatArray]]
@@ -199,26 +188,10 @@ def search(
 ) -> Searched:
     """Compute evidence and probability of combinations of effects, with and without an unknown effect.
 
-    Parameters
-    ----------
-    prepared
-        The readings, the effects, and the null if one is given.
-    prior
-        Prior odds; by default those of the apparatus.
-    max_order
-        Largest number of Gaussians of the SSF if no null is given; one more is tried if this is not far behind.
-        Default: three, or one for fewer than 40 readings.
-    depth
-        Largest number of effects of a combination.
-    after
-        An earlier search of the same recording with a given null, with fewer effects: its fits are not made again.
-    progress
-        Called at every refit.
-
-    Returns
-    -------
-    Searched
-        Evidences and probabilities of all hypotheses, and the refits.
+    `prepared`: the readings, the effects, and the null if one is given; `max_order`: largest number of Gaussians of the
+    SSF if no null is given; one more is tried if this is not far behind. Default: three, or one for fewer than 40
+    readings. `after`: an earlier search of the same recording with a given null, with fewer effects: its fits are not
+    made again. Returns `Searched`: evidences and probabilities of all hypotheses, and the refits.
     """
     recording, effects = prepared.recording, prepared.effects
     if max_order is None:

@@ -40,16 +40,9 @@ class Evidences:
     A hypothesis is a pair (mean, noise): the names of its effects on the mean, and on the noise. The mean ("unknown",)
     stands for an unknown effect, alone or with others. The SSF order is the number of Gaussians.
 
-    Parameters
-    ----------
-    fits
-        Refits by (SSF order, mean), with their evidence by noise.
-    screened
-        Combinations not refitted, by templates: (mean, noise) -> log evidence.
-    unknown
-        Unknown effects added to fits: (SSF order, mean, noise) -> log evidence.
-    unknown_shares
-        Share of each family of bases, such as "time", in the evidence of an unknown effect.
+    `fits`: refits by (SSF order, mean), with their evidence by noise; `screened`: combinations not refitted, by
+    templates: (mean, noise) -> log evidence; `unknown`: unknown effects added to fits: (SSF order, mean, noise) -> log
+    evidence; `unknown_shares`: share of each family of bases, such as "time", in the evidence of an unknown effect.
     """
 
     fits: Mapping[tuple[int, Names], WeighedFit]
@@ -186,19 +179,7 @@ class Posterior:
 
 
 def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
-    """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians).
-
-    Parameters
-    ----------
-    evidences
-        Log evidences.
-    prior
-        Prior odds.
-    certain
-        Noise effects that the readings show beyond doubt.
-    n_forms
-        Number of fitted SSF orders, with equal prior probability.
-    """
+    """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians)."""
     outlying = evidences.only_outlying_readings_differ(prior, certain)
     log_z: dict[tuple[Names, Names], float] = {}
     for (_, names), fit in evidences.fits.items():
@@ -261,22 +242,10 @@ class MisfitTemplates:
 class Searched:
     """Result of a search.
 
-    Parameters
-    ----------
-    prepared
-        Input of the search.
-    prior
-        Prior odds.
-    noise_models, certain
-        Noise models by the names of their effects; names of the noise effects beyond doubt.
-    nulls
-        The null by SSF order (number of Gaussians), without fits.
-    misfit_templates
-        Templates by which a fit is tested.
-    refits
-        All refits, for another search of the same recording.
-    evidences, posterior
-        Evidences and probabilities of all hypotheses.
+    `prepared`: input of the search; `prior`: prior odds; `noise_models`, `certain`: noise models by the names of their
+    effects; names of the noise effects beyond doubt; `nulls`: the null by SSF order (number of Gaussians), without
+    fits; `misfit_templates`: templates by which a fit is tested; `refits`: all refits, for another search of the same
+    recording; `evidences`, `posterior`: evidences and probabilities of all hypotheses.
     """
 
     prepared: Prepared

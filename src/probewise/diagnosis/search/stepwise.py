@@ -57,26 +57,11 @@ from probewise.progress import Progress, silent
 class SearchState:
     """The mutable state of a search. A candidate is a refitted combination of effects with one number of Gaussians.
 
-    Parameters
-    ----------
-    effects
-        Effects on the mean, by name.
-    prior
-        Prior odds.
-    noises
-        The noise models.
-    templates
-        Cache of templates of effects about fits.
-    refits
-        Fits of the recording.
-    tried_always
-        Effects that are always refitted alone, whatever their score by screening.
-    progress
-        Called at every refit.
-    share_is_spent
-        Function of a share: whether that share of this search's budget of refits is spent.
-    share
-        Share of the budget that may be spent by now.
+    `effects`: effects on the mean, by name; `prior`: prior odds; `noises`: the noise models; `templates`: cache of
+    templates of effects about fits; `refits`: fits of the recording; `tried_always`: effects that are always refitted
+    alone, whatever their score by screening; `progress`: called at every refit; `share_is_spent`: function of a share:
+    whether that share of this search's budget of refits is spent; `share`: share of the budget that may be spent by
+    now.
     """
 
     effects: Mapping[str, NamedEffect[Any]]
@@ -178,9 +163,7 @@ class SearchState:
 
         Otherwise the combination is recorded as undetected. Nothing is refitted once the share of the budget is spent.
 
-        Returns
-        -------
-        The best candidate of the resulting combination, possibly an earlier one; None if there is none.
+        Returns the best candidate of the resulting combination, possibly an earlier one; None if there is none.
         """
         against = self.penalty_of_extending(parent)
         if self.share_is_spent(self.share):
@@ -454,9 +437,7 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     behind an end stop says nothing of a drag before it. The log evidence of each resulting combination, by noise model,
     is stored in the state.
 
-    Returns
-    -------
-    `proposals` with the new ones added, the best for each combination.
+    Returns `proposals` with the new ones added, the best for each combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
     about = parent if state.null_is_given and parent.log_z > null.log_z + FAR_FROM_NULL else null

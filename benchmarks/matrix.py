@@ -35,7 +35,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -62,9 +62,8 @@ from probewise.proof.sensors.sizing import EffectSizer
 from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
 from probewise.proof.systems.cases import _draw_effect_of_size as conceal_in_system
 from probewise.proof.systems.form import Form
-from probewise.proof.systems.forms import FAMILIES, forms_of
+from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, family_of, forms_of
 from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
-from probewise.proof.systems.rivals import vocabulary_name
 from probewise.proof.trial import BRIGHT, DARK, footprint_pixels
 from probewise.recordings import Plan, paper_plan, two_way_plan, write_recording, write_text_atomically
 from probewise.recordings.plans import with_jittered_times
@@ -83,7 +82,6 @@ LEVELS: Mapping[str, Mapping[str, float]] = {  # like NEEDS_SENSOR, seen only be
 }
 SYSTEMS = ("orifice flow meter", "DC motor", "thermometer in a bath")  # others where these lack a form
 NOISES = tuple({"quantised": "quantisation"}.get(name, name) for name in OTHER_NOISE if name != "t4")
-FRICTION = "friction of a column"
 FITTED = ("repaired.json", "sensor.json")
 ARM = """from dataclasses import replace
 from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world
@@ -134,21 +132,11 @@ def small_system(name: str, rng: np.random.Generator) -> DrawnSystem:
 
 
 def forms_by_name(drawn: DrawnSystem) -> dict[str, list[Form]]:
-    """Return the world's forms by name without target, and two that it lacks: a polynomial and a friction."""
+    """Return the world's forms by family."""
     forms: dict[str, list[Form]] = {}
     for form in forms_of(drawn.true_system):
-        forms.setdefault(vocabulary_name(form).split(":")[0], []).append(form)
-    for form in forms["sensitivity"]:
-        column = form.name.removeprefix("sensitivity:")
-        for name, shape in (("curve", lambda u: u**3 - 3 * u), (FRICTION, lambda u: np.tanh(3 * u))):
-            own = dataclasses.replace(form, name=f"{name}:{column}", act=_added(column, shape, drawn))
-            forms.setdefault(name, []).append(own)
+        forms.setdefault(family_of(form), []).append(form)
     return forms
-
-
-def _added(column: str, shape: Callable[[Any], Any], drawn: DrawnSystem) -> Callable[..., Any]:
-    middle, sd = drawn.true_system.mean_of(column), drawn.true_system.sd_of(column)
-    return lambda y, rows, v: y + v["a"] * sd * shape((rows.columns[column] - middle) / sd)
 
 
 @functools.cache
@@ -316,7 +304,7 @@ def all_cells(seed: int) -> dict[str, Cell]:
     one_each = enumerate(["nothing", *(name for name in INSIDE if name not in ONE_SCAN)])
     rows = [
         *(("diagnose", plan, what) for what in ("nothing", *INSIDE, *LEVELS) for plan in PLANS),
-        *(("diagnose", k, form) for form in (*FAMILIES, "curve", FRICTION, *NOISES) for k in kinds_with(form)),
+        *(("diagnose", k, form) for form in (*FAMILIES, *ADDED_FAMILIES, *NOISES) for k in kinds_with(form)),
         *(("investigate", PLANS[k % 3], what) for k, what in one_each),
         *(("explore", "field", what) for what in ("nothing", *CONCEALED)),
         *(("audit", plan, what) for plan in PLANS for what in ("nothing", "a known sensor")),

@@ -165,9 +165,12 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
     out |= {"offset_per_run": one_run, "gain_per_run": one_run, "nonlinearity": nothing, "saturation": nothing}
     out |= {"hysteresis": "the readings move one way only"}
     out |= dict.fromkeys(("lag", "delay", "settling", "interference"), timeless)
-    out |= {
-        f"sensitivity:{c}": "the column does not vary" for c in table.covariates if c not in (own.reading, own.noise.sd)
-    }
+    for column in (c for c in table.covariates if c not in (own.reading, own.noise.sd)):
+        out |= {
+            f"sensitivity:{column}": "the column does not vary",
+            f"curve:{column}": "it has fewer than three values",
+        }
+        out |= {f"friction:{column}": "the column does not move both ways"}
     for column in driving_columns(about):
         out |= {f"{kind}:{column}": nothing for kind in ("input_offset", "input_gain", "input_saturation", "dead_zone")}
         out |= {f"backlash:{column}": f"{column} does not turn back", f"input_delay:{column}": timeless}

@@ -255,9 +255,10 @@ _WHITE = 0.97
 # noise, is more likely than one of each.
 _NOT_WHITE_ALONE = 0.2
 _TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
-# Of a term in a rate that is another state by definition, such as that of a position, and of a jump at a row of a table
-# that an input sorts. A slip may look like the one, a ramp may be recorded in order: so both stay possible, and their
-# handicap is below the three nats that tell aliases apart.
+# Of a term in a rate that is another state by definition, such as that of a position; of a jump at a row of a table
+# that an input sorts; and of a curve of a column that drives the simulator, what is wrong with which has names of its
+# physics (a bend, a dead zone). A slip may look like the first, a ramp may be recorded in order: so all stay possible,
+# and their handicap is below the three nats that tell aliases apart.
 _UNLIKELY = 0.1
 
 
@@ -367,6 +368,7 @@ class SimulatorApparatus(Apparatus):
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
         usual = PriorOdds.for_effects(effects)
+        curves = {f"curve:{name.removeprefix('input_gain:')}" for name in effects if name.startswith("input_gain:")}
         return replace(
             usual,
             by_size=_BY_SIZE,
@@ -377,7 +379,7 @@ class SimulatorApparatus(Apparatus):
             unknown_explains_most=True,
             named_needs_half=True,
             shared_is_named=True,
-            unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects),
+            unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects) | curves,
             unlikely_weight=_UNLIKELY,
         )
 

@@ -232,10 +232,10 @@ def templates_of_effect(
     variants = effect.variants()
     banks = [variant.bank() for variant in variants]
     choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
-    entries = np.concatenate(banks)
+    entries = [entry for bank in banks for entry in bank]
     if most is not None and most < len(entries):
         kept = np.linspace(0, len(entries) - 1, most).round().astype(np.int64)
-        choice, entries = choice[kept], entries[kept]
+        choice, entries = choice[kept], [entries[k] for k in kept]
     gates = effect.variant_masks(found.model.plan)
     if gates is not None:
         (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
@@ -243,10 +243,10 @@ def templates_of_effect(
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
-        bound = [(variants[k].scans, variants[k].patterns) for k in choice]
+        bound = [(variants[k].scans, variants[k].patterns, len(e)) for k, e in zip(choice, entries, strict=True)]
         for _, group in itertools.groupby(range(len(choice)), key=bound.__getitem__):
             at = list(group)
-            columns += _predicted_changes(found, variants[choice[at[0]]], entries[at], usable)
+            columns += _predicted_changes(found, variants[choice[at[0]]], np.stack([entries[k] for k in at]), usable)
     return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
 
 

@@ -31,7 +31,6 @@ from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import STANDS_STILL, System, SystemChain, with_converged_step
 from probewise.systems.table import RunRecording, RunTable, column_error, covariate_of_column, relative_sds_of_column
 
-_OF_A_COLUMN = "sensitivity:", "depends:"  # effects, besides those on an input, that name a column last
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
 _SOME = 200  # samples used to estimate the scatter of predictions in each row
@@ -347,7 +346,7 @@ def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]
     of_column = [
         name.removesuffix(AGAIN)
         for name, form in forms.items()
-        if form.stage is Stage.INPUT or name.startswith(_OF_A_COLUMN)
+        if form.stage in (Stage.INPUT, Stage.OFFSET) or name.startswith("depends:")
     ]
     return {
         name

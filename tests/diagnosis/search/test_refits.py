@@ -281,11 +281,11 @@ def test_no_formula_is_searched_for_beside_a_name_that_explains_everything(searc
 
 
 def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):
-    """0.3 of the room's deviation, and a curve of its square of lambda about 10, which has no name here."""
+    """0.3 of the room's deviation, and its product with the force, of lambda about 10, which has no name."""
 
     def change(u):
         room = u["room"] - u["room"].mean()
-        return 0.3 * room + 0.05 * (room**2 - np.mean(room**2))
+        return 0.3 * room + 0.02 * room * (u["force"] - u["force"].mean())
 
     searched = searching.search(_line(change))
     asked = []

@@ -13,7 +13,7 @@ from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.readings import sign_of_change, values_at_earlier_times
-from probewise.systems.forms.reference import clipping_levels
+from probewise.systems.forms.reference import clipping_levels, switch_points
 from probewise.systems.law import LawWithEffects
 
 SD = 0.01
@@ -65,7 +65,32 @@ def test_every_name_of_the_contract_that_this_table_can_show_is_bound():
     reading = {"offset_drift", "offset_step", "offset_per_run", "gain_drift", "gain_step", "gain_per_run", "lag"}
     reading |= {"nonlinearity", "saturation", "hysteresis", "delay", "settling", "interference", "sensitivity"}
     inputs = {"input_offset", "input_gain", "input_delay", "input_saturation", "dead_zone", "periodic_error"}
-    assert reading | inputs | {"backlash", "drifts", "steps", "differs", "depends"} <= own
+    assert reading | inputs | {"backlash", "drifts", "steps", "differs", "depends", "curve", "friction"} <= own
+
+
+def test_a_curve_is_a_polynomial_in_the_scaled_column_of_an_order_of_two_to_five():
+    form, column = FORMS["curve:room_c"], TABLE.columns["room_c"]
+    z = 2 * (column - column.min()) / np.ptp(column) - 1
+    found = _read("curve:room_c", 0.1, -0.2, 0.3, 0.4, -0.5) - NOTHING
+    np.testing.assert_allclose(found, 0.1 * z - 0.2 * z**2 + 0.3 * z**3 + 0.4 * z**4 - 0.5 * z**5, atol=1e-12)
+    assert [len(variant.fixed) for variant in form.variants()] == [3, 2, 1, 0]
+    assert form.sentence(np.array([0.1, 0.2, 0, 0, 0]), np.array([0.01, 0.01, 1e-12, 1e-12, 1e-12])).count("z^") == 1
+
+
+def test_a_column_that_moves_both_ways_may_have_dry_friction_sharp_or_smooth():
+    sharp, smooth = FORMS["friction:drive"].variants()
+    drive = TABLE.columns["drive"]
+    width = sharp.bank()[0, 0, 1]
+    np.testing.assert_allclose(_read("friction:drive", 0.2, width) - NOTHING, 0.2 * np.sign(drive), atol=1e-12)
+    np.testing.assert_allclose(_read("friction:drive", 0.2, 0.5) - NOTHING, 0.2 * np.tanh(drive / 0.5), atol=1e-12)
+    assert (sharp.fixed, smooth.fixed) == (("width",), ())
+    assert "friction:room_c" not in FORMS
+
+
+def test_a_switch_has_five_rows_and_three_values_on_either_side():
+    assert switch_points(np.arange(9.0)).size == 0
+    np.testing.assert_array_equal(switch_points(np.arange(12.0)), [4.0, 5.0, 6.0, 7.0])
+    np.testing.assert_array_equal(switch_points(np.repeat([0.0, 1.0, 2.0, 3.0, 4.0, 5.0], 4)), [2.0, 3.0])
 
 
 @pytest.mark.parametrize("name", sorted(name for name, form in FORMS.items() if form.nothing))
@@ -493,9 +518,7 @@ def test_the_influence_of_a_column_is_a_quadratic_function_of_the_reading():
     found = form.apply(level[None, :], np.array([[0.2, -0.1, 0.3]]), TABLE)[0] - level
     z = np.linspace(-1, 1, N_ROWS)
     np.testing.assert_allclose(found, (0.2 - 0.1 * z + 0.3 * z**2) * (column - column.mean()) / column.std())
-    sentence = form.sentence(np.array([0.2, -0.1, 0.3]), np.full(3, 0.01))
-    assert "0.200 ± 0.010 V per sd in the middle" in sentence
-    assert "0.600 ± 0.014 V at its low end" in sentence
+    assert "a = 0.200 ± 0.010 V, b = -0.100" in form.sentence(np.array([0.2, -0.1, 0.3]), np.full(3, 0.01))
 
 
 def test_a_law_is_tried_with_as_many_waves_as_its_rows_tell_apart():

@@ -25,7 +25,7 @@ from probewise.proof.systems.fit import (
     project_out,
 )
 from probewise.proof.systems.form import Form, FormWithParameters, TrueSystem, parameter_arrays
-from probewise.proof.systems.forms import FAMILIES, forms_of
+from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, family_of, forms_of
 from probewise.proof.systems.kind import SystemKind, SystemTable, design_runs
 from probewise.proof.systems.kinds import FORMULAS, LAWS
 from probewise.proof.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
@@ -251,7 +251,7 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
     """
     stratum, n_earlier = system_stratum_of(number)
     drawing, noise = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
-    shuffled = np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES)
+    shuffled = [*np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES), *ADDED_FAMILIES]
     failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):
         family = str(shuffled[(n_earlier + (attempt // 8)) % len(shuffled)])
@@ -342,13 +342,11 @@ def _draw_effects(
         one = _draw_effect_of_size(_draw_form(own, wanted, rng), stratum.size, drawn, rng)
         return (_effect_with_rivals(one, forms, drawn, ()),), None
     if stratum.kind == "single":
-        own = [f for f in forms if vocabulary_name(f).split(":")[0] == family]
+        own = [f for f in forms if family_of(f) == family]
         one = _draw_effect_of_size(_draw_form(own, family, rng), stratum.size, drawn, rng)
         return (_effect_with_rivals(one, forms, drawn, ()),), None
     names = rng.choice(FAMILIES, 2, replace=False)
-    both = [
-        _draw_form([f for f in forms if vocabulary_name(f).split(":")[0] == name], str(name), rng) for name in names
-    ]
+    both = [_draw_form([f for f in forms if family_of(f) == name], str(name), rng) for name in names]
     first, second = (_draw_effect_of_size(form, stratum.size, drawn, rng) for form in both)
     cosine = _cosine_of_effects(drawn, first, second)
     if abs(cosine) >= _APART:

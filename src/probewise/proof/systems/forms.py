@@ -76,10 +76,60 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
         yield modulated_reading_form(true, f"gain_{kind}", how, gain=True)
     for column in true.varying_columns:
         yield modulated_reading_form(true, f"sensitivity:{column}", proportional_to_column(true, column))
+        yield from _curve_and_friction_forms(true, column)
     if timed:
         yield modulated_reading_form(true, "interference", sinusoid_in_time(true, _N_WAVES))
         if true.kind.run is not None:  # a table that does not name its runs cannot show that it settles in each
             yield modulated_reading_form(true, "settling", settling(true))
+
+
+def _curve_and_friction_forms(true: TrueSystem, column: str) -> Iterator[Form]:
+    """Yield a polynomial of an order of two to five in a column, and its friction if it moves both ways."""
+    values, sd = true.table.columns[column], true.noise_sd
+    middle, half = 0.5 * float(values.max() + values.min()), 0.5 * float(np.ptp(values))
+    orders = range(1, 6)
+
+    def curve(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        z = (rows.columns[column] - middle) / half
+        return np.asarray(y + z * (v["a1"] + z * (v["a2"] + z * (v["a3"] + z * (v["a4"] + z * v["a5"])))))
+
+    def draw_coefficients(rng: np.random.Generator) -> dict[str, float]:
+        order = int(rng.integers(2, 6))
+        size = np.append(rng.uniform(-1, 1, order - 1), 1.0)  # the highest is the largest
+        return {f"a{k}": float(size[k - 1]) if k <= order else 0.0 for k in orders}
+
+    none = {f"a{k}": 0.0 for k in orders}
+    common: dict[str, Any] = {
+        "covariates": (column,),
+        "uses": (column,),
+        "order": OFFSET,
+        "first": sd,
+        "limit": 1e4 * sd,
+    }
+    if len(np.unique(values)) > len(orders):
+        yield Form(
+            f"curve:{column}",
+            "reading",
+            act=curve,
+            of_amplitude=lambda a, drawn: {name: a * size for name, size in drawn.items()},
+            draw=draw_coefficients,
+            bank=[[{**none, f"a{k}": sd} for k in orders]],
+            start_values=lambda group, amounts: {f"a{k}": sd * float(amounts[k - 1]) for k in orders},
+            steps={f"a{k}": sd for k in orders},
+            **common,
+        )
+    speeds = np.sort(np.abs(values[values != 0]))
+    if min(np.count_nonzero(values < 0), np.count_nonzero(values > 0)) >= 8:
+        widths = np.geomspace(speeds[len(speeds) // 20], 0.3 * speeds[-1], 5)
+        yield Form(
+            f"friction:{column}",
+            "reading",
+            act=lambda y, rows, v: y + v["a"] * np.tanh(rows.columns[column] / np.maximum(v["width"], 1e-12 * half)),
+            draw=lambda rng: {"width": 0.0 if rng.random() < 0.5 else draw_log_uniform(rng, widths[0], widths[-1])},
+            bank=[[{"a": sd, "width": float(width)}] for width in (0.0, *widths)],
+            steps={"a": sd, "width": 0.02 * float(widths[0])},
+            **common,
+        )
 
 
 def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
@@ -559,6 +609,16 @@ FAMILIES = (
     "limit",
 )
 """Names of forms without targets."""
+
+
+ADDED_FAMILIES = "curve", "friction of a column"
+"""Further families, drawn after all others: the cases of a seed without them stay as they are."""
+
+
+def family_of(form: Form) -> str:
+    """Return the family of a form."""
+    of_column = form.side == "reading" and form.name.startswith("friction:")
+    return ADDED_FAMILIES[1] if of_column else form.name.split(":")[0].removesuffix(" (floor)")
 
 
 def forms_of(true: TrueSystem) -> list[Form]:

@@ -134,15 +134,16 @@ class Form(NamedEffect[Any]):
     @property
     def fixed(self) -> tuple[str, ...]:
         """Names of the parameters that this one of several variants fixes; reports leave them out."""
-        return tuple(name for name, prior in self._marginals.items() if isinstance(prior, Fixed))
+        return tuple(name for name, prior in self.marginals.items() if isinstance(prior, Fixed))
 
     @property
     def relative_odds(self) -> float:
         """Prior odds of this one of several variants against the first."""
-        return math.prod((prior.odds for prior in self._marginals.values() if isinstance(prior, Fixed)), start=1.0)
+        return math.prod((prior.odds for prior in self.marginals.values() if isinstance(prior, Fixed)), start=1.0)
 
     @property
-    def _marginals(self) -> Mapping[str, Marginal]:
+    def marginals(self) -> Mapping[str, Marginal]:
+        """Prior of each parameter, by name; none of values with one scale in common."""
         return {} if isinstance(self.parameters, SharedScalePrior) else self.parameters
 
     @property
@@ -198,7 +199,7 @@ class StepForm(Form):
         for low, high in pairwise(self.change_points.at):
             entries = self.entries.copy()
             entries[:, :, -1] = 0.5 * (low + high)
-            priors = {**self._marginals, list(self._marginals)[-1]: Uniform(low, high)}
+            priors = {**self.marginals, list(self.marginals)[-1]: Uniform(low, high)}
             out.append(replace(self, parameters=priors, entries=entries))
         return tuple(out)
 

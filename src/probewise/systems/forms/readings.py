@@ -14,9 +14,9 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, 
 from probewise._words import value_with_sd
 from probewise.effects.effect import single_column_bank
 from probewise.effects.reading import decaying_sum
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, Act, Form, flag
+from probewise.systems.forms.form import AMPLITUDE, Act, Fixed, Form, flag
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
@@ -26,14 +26,16 @@ from probewise.systems.forms.modulations import (
     sinusoid_modulation,
     value_per_run_modulation,
 )
-from probewise.systems.forms.reference import ReferenceFit
-from probewise.systems.table import RunTable
+from probewise.systems.forms.reference import ROWS_OF_A_SIDE, ReferenceFit, switch_points
+from probewise.systems.table import RunTable, covariate_of_column
 
 _N_SIZES = 9
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
 _ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
 _BEND_DEGREE = 4
+_HIGHEST_ORDER = 5  # of a curve
+_NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
 _OUTLYING = 5.0  # medians of the residual's size
 
 
@@ -264,9 +266,74 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     for name, values in table.covariates.items():
         if name not in (reading, about.system.simulator.noise.sd) and varies(values):
             yield from added(f"sensitivity:{name}", column_proportional_modulation(name, table))
+            yield from _curve_form(about, name)
+            if name not in about.states:
+                yield from _friction_form(about, name)
     yield from _hysteresis_form(about)
     yield from _nonlinearity_form(about)
     yield from _saturation_form(about)
+
+
+def _curve_form(about: ReferenceFit, name: str) -> Iterator[Form]:
+    """Yield a polynomial in a column scaled to [-1, 1]; its order, less than the number of values, is a variant."""
+    column, reading = about.table.covariates[name], about.system.simulator.reading
+    low, high = float(np.nanmin(column)), float(np.nanmax(column))
+    orders, names = np.arange(1, _HIGHEST_ORDER + 1)[:, None], [f"a{k}" for k in range(1, _HIGHEST_ORDER + 1)]
+
+    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+        z = np.nan_to_num((2 * rows.covariates[name] - low - high) / (high - low))
+        return np.asarray(value + theta @ z**orders)
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        each = enumerate(
+            value_with_sd(m, s, about.reading_unit) for m, s in zip(mean, sd, strict=True) if s > _HARDLY * sd.max()
+        )
+        said = " + ".join(f"({size}) z^{k + 1}" if k else f"({size}) z" for k, size in each)
+        return f"{reading} follows a curve of {name}: {said}, z from -1 at {name} = {low:.4g} to 1 at {high:.4g}"
+
+    along, units = (covariate_of_column(name),), (about.reading_unit,) * _HIGHEST_ORDER
+    bank, amplitudes = np.eye(_HIGHEST_ORDER)[None], tuple(range(_HIGHEST_ORDER))
+    any_size = dict.fromkeys(names, AMPLITUDE)
+    form = Form(f"curve:{name}", Stage.OFFSET, any_size, units, along, act, bank, says, amplitudes)
+    for whole in about.scaled(form, about.sd):
+        none: Marginal = Fixed(-_NONE * whole.entries.max(), _NONE * whole.entries.max())
+        last = min(len(distinct_values(column[about.has_reading])) - 1, _HIGHEST_ORDER)
+        variants = [
+            replace(
+                whole, parameters={**whole.marginals, **dict.fromkeys(names[k:], none)}, entries=whole.entries[:, :k]
+            )
+            for k in range(2, last + 1)
+        ]
+        yield from (replace(first, alternatives=tuple(variants[1:])) for first in variants[:1])
+
+
+def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
+    """Yield the friction of a column that moves both ways: a sign or, another variant, a smooth one.
+
+    The width of that is from the fifth least speed, below which the rows show a sign, to half of the largest, above
+    which they show a bend alone.
+    """
+    column, unit, reading = about.table.covariates[name], about.reading_unit, about.system.simulator.reading
+    read = column[about.has_reading]
+    points, speeds = switch_points(read), np.sort(np.abs(read[read != 0]))
+    if not points.size or not points[0] < 0 < points[-1]:
+        return
+    low, high = float(speeds[ROWS_OF_A_SIDE - 1]), 0.5 * float(np.nanmax(speeds))
+
+    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+        return np.asarray(value + theta[:, :1] * np.tanh(np.nan_to_num(rows.covariates[name]) / theta[:, 1:2]))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        by = f"tanh({name} / width), width {value_with_sd(mean[1], sd[1])}" if mean[1] > _NONE * low else "its sign"
+        return f"{reading} has dry friction of {name}: {value_with_sd(mean[0], sd[0], unit)} times {by}"
+
+    priors: dict[str, Marginal] = {"a": AMPLITUDE, "width": Fixed(0.0, _NONE * low)}
+    along, bank = (covariate_of_column(name),), np.array([[[1.0, 0.5 * _NONE * low]]])
+    form = Form(f"friction:{name}", Stage.OFFSET, priors, (unit, name), along, act, bank, says)
+    for sign in about.scaled(form, about.sd):
+        smooth = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, _N_SIZES))
+        prior = {**sign.marginals, "width": LogUniform(low, high)}
+        yield replace(sign, alternatives=(replace(sign, parameters=prior, entries=smooth),) if low < high else ())
 
 
 def time_since_start_of_run(table: RunTable) -> FloatArray:
@@ -452,5 +519,7 @@ READING_WORDS = {
     "settling": "readings that settle at the start of each run",
     "interference": "a wave in the readings",
     "sensitivity": "readings that depend on {0}",
+    "curve": "readings that follow a curve of {0}",
+    "friction": "dry friction of {0}",
 }
 """A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""

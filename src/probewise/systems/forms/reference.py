@@ -141,6 +141,20 @@ def clipping_levels(values: FloatArray) -> ClippingLevels | None:
     return ClippingLevels(float(inner[0]), float(inner[-1]), float(ordered[-1]))
 
 
+ROWS_OF_A_SIDE, _VALUES_OF_A_SIDE = 5, 3  # at least, on either side of a switch
+
+
+def switch_points(values: FloatArray) -> FloatArray:
+    """Return the distinct values between which a switch has five rows and three values on either side, (n_points,)."""
+    ordered, distinct = np.sort(values[np.isfinite(values)]), distinct_values(values)
+    below = np.searchsorted(ordered, distinct, side="right")
+    values_below = np.arange(1, len(distinct) + 1)
+    least_rows = np.minimum(below, len(ordered) - below) >= ROWS_OF_A_SIDE
+    least_values = np.minimum(values_below, len(distinct) - values_below) >= _VALUES_OF_A_SIDE
+    at = np.flatnonzero(least_rows & least_values)
+    return distinct[at[0] : at[-1] + 2] if at.size else distinct[:0]
+
+
 _ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
 
 

@@ -203,6 +203,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "sentence": e.sentence,
                 "parameters": [_parameter_json(p) for p in e.parameters],
             }
+            | ({} if e.formula is None else {"formula": _formula_json(e.formula)})
             for e in diagnosis.effects
         ],
         "unknown_probability": diagnosis.judged.unknown_probability,

@@ -20,6 +20,7 @@ from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_sa
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.templates import TemplateCache, log_bayes_factors_by_label, log_mean_exp
 from probewise.diagnosis.verdict import N_DRAWS, Hypothesis, Judged
 from probewise.diagnosis.words import p_in_words, substitute_reading_unit
 from probewise.effects import NamedEffect, NoiseEffect, is_out_of_vocabulary
@@ -49,7 +50,7 @@ class EffectFound:
 
     `size_lambda` is the norm of the effect's change of the readings in noise sds, after a refit of all else. Of a noise
     effect it is that of an effect on the mean with equal evidence; of rounding that is certain, that of the rounding
-    error, step / sqrt(12), over all readings.
+    error, step / sqrt(12), over all readings. `formula` is the one that fits best in place of a curve.
     """
 
     name: str
@@ -58,6 +59,7 @@ class EffectFound:
     sentence: str
     parameters: tuple[ParameterFound, ...]
     scans: tuple[str, ...] = ()
+    formula: Formula | None = None
 
 
 @dataclass(frozen=True)
@@ -111,14 +113,17 @@ def effects_found(
                 own = sample_model(holder.found, evidence, prepared.recording, weights=weights, rng=rng, annealed=False)
                 drawn[holder, noise] = own
             values, size = own.effect_samples(name), _lambda_of(searched, holder, name, noise)
+        of_curve = name.startswith("curve:") and name in samples.effects
+        formula, said = _formula_of_curve(searched, best, name, rng=rng) if of_curve else (None, "")
         out.append(
             EffectFound(
                 name,
                 min(p, 1.0),
                 size,
-                sentence_from_samples(effect, values),
+                sentence_from_samples(effect, values) + said,
                 (*parameters_found(effect, values, unit), *_scan_numbers_found(effect, plan)),
                 effect.scans,
+                formula,
             )
         )
     return tuple(sorted(out, key=lambda e: -e.probability))
@@ -331,6 +336,26 @@ def _formula_beside(
     unit = prepared.recording.plan.instrumentation.unit
     formula = _formula_from_samples(effect, values, unit, gained, held.per_reading)
     return formula, f"; a formula describes it: {sentence_from_samples(effect, values)}"
+
+
+def _formula_of_curve(
+    searched: Searched, best: BestRepair, name: str, *, rng: np.random.Generator
+) -> tuple[Formula | None, str]:
+    """Return the formula of the column alone that fits best in place of a curve, and a clause on what it gains."""
+    prepared = searched.prepared
+    parent = searched.best_refit_of(tuple(own for own in best.fit.names if own != name), best.noise)
+    curve, every = prepared.effects[name], prepared.apparatus.proposed_formulas()
+    formulas = [form for form in every.values() if (form.covariates, form.stage) == (curve.covariates, curve.stage)]
+    if parent is None or not formulas:
+        return None, ""
+    problem = Linearised.of(parent.found, best.fit.evidence[best.noise].likeliest_law)
+    bank = TemplateCache(prepared.usable_rows).coarse_bank(parent.found, formulas)
+    scores = log_bayes_factors_by_label(problem, bank)
+    chosen = max(formulas, key=lambda form: log_mean_exp(scores[form.name]))
+    fit, _ = searched.refits.refit_with_effect(parent, chosen)
+    formula, _ = _formula_beside(searched, best, fit, rng=rng)
+    gains = "gains" if formula.log_evidence > 0 else "loses"
+    return formula, f"; {formula.expression}, the formula that fits best, {gains} {abs(formula.log_evidence):.1f} nats"
 
 
 def formula_of(searched: Searched, judged: Judged, best: BestRepair, samples: ModelSamples) -> Formula | None:

@@ -55,6 +55,11 @@ _SIGNIFICANT = 0.05  # of the maximum of an effect: below it, it is negligible
 _PLAIN = 0.25  # p-value of the first draws above which more draws are not needed
 
 
+def figure_name_of(name: str) -> str:
+    """Return the file name of a figure, of letters, digits, - and _ alone."""
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name) + ".svg"
+
+
 @dataclass(frozen=True, eq=False)
 class Place:
     """A window of a covariate in which residuals, or an effect, are significant, with the curve of mean residuals.
@@ -87,7 +92,7 @@ class Place:
     def figure_name(self) -> str:
         """Name of the place's figure file: "witness_COVARIATE.svg" or "witness_COVARIATE_SCAN.svg"."""
         where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
-        return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
+        return figure_name_of(f"witness_{where}")
 
     def rows_among(self, plan: Plan, usable: IntArray) -> BoolArray:
         """Return the mask of the usable readings, of a plan's rows `usable` (n_usable,), that lie in it."""

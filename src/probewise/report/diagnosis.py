@@ -23,6 +23,7 @@ from probewise.diagnosis import (
     notes_on_calls,
     p_in_words,
 )
+from probewise.diagnosis.locate import figure_name_of
 from probewise.diagnosis.prepared import rows_to_diagnose
 from probewise.diagnosis.words import (
     effect_has_words,
@@ -363,6 +364,11 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
         figure(
             drawn["residuals.svg"],
             f"All residuals against time and against predicted reading, with running means.{_walk_note(diagnosis)}",
+        ),
+        *(
+            figure(drawn[figure_name_of(e.name)], _as_sentence(diagnosis, f"With the 95 % band: {e.sentence}"))
+            for e in diagnosis.effects
+            if figure_name_of(e.name) in drawn
         ),
     )
 

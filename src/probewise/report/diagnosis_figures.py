@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
+from typing import cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +12,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, IntArray
 from probewise._words import unit_after_number
 from probewise.diagnosis import Diagnosis, Place
+from probewise.diagnosis.locate import figure_name_of
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.recordings import Plan
 from probewise.report.covariates import (
@@ -22,7 +24,7 @@ from probewise.report.covariates import (
     view_along_scan,
     views_of_place,
 )
-from probewise.report.plots.canvas import stack_of_axes, svg
+from probewise.report.plots.canvas import BLUE, stack_of_axes, svg
 from probewise.report.plots.noise import (
     lost_readings_against_predicted,
     readings_modulo_step,
@@ -40,6 +42,7 @@ from probewise.report.plots.residuals import (
     scan_with_residuals,
 )
 from probewise.systems import RunTable
+from probewise.systems.forms import Form
 
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
@@ -69,6 +72,9 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
                 part=noun_of_held_out_part(diagnosis),
             )
         )
+    for effect in cast(Sequence[Form], diagnosis.repaired.chain.effects):
+        if effect.name.startswith("curve:"):
+            drawers[figure_name_of(effect.name)] = partial(_curve_svg, diagnosis, effect)
     return drawers | {place.figure_name: partial(_place_svg, diagnosis, chance, place) for place in diagnosis.where}
 
 
@@ -123,6 +129,22 @@ def _place_svg(diagnosis: Diagnosis, noise: Callable[[], ResidualNoise], place: 
     for ax, view in zip(axes, views, strict=True):
         _draw_means_along(diagnosis, noise(), view, after=False, each=True, ax=ax)
     return svg(axes)
+
+
+def _curve_svg(diagnosis: Diagnosis, curve: Form) -> bytes:
+    """Draw a curve of a column, about its mean over the rows: its median, and the band of 95 % of the samples."""
+    plan, reading = cast(RunTable, diagnosis.recording.plan), diagnosis.recording.plan.instrumentation
+    (name, column), samples = curve.name.split(":", 1), diagnosis.repaired.effect_samples(curve.name)
+    at = plan.covariates[column]
+    rows = np.argsort(at)[: np.count_nonzero(np.isfinite(at))]
+    change = curve.apply(np.zeros((len(samples), len(plan))), samples, plan)[:, rows]
+    low, middle, high = np.quantile(change - change.mean(axis=1, keepdims=True), [0.025, 0.5, 0.975], axis=0)
+    (ax,) = stack_of_axes([2.6])
+    ax.fill_between(at[rows], low, high, color=BLUE, alpha=0.25, linewidth=0, label="95 %")
+    ax.plot(at[rows], middle, color=BLUE, label=f"{name} of {column}")
+    ax.set(xlabel=axis_label(diagnosis, curve.covariates[0]), ylabel=f"added {reading.unit_after_number}".rstrip())
+    ax.legend()
+    return svg(ax)
 
 
 def _draw_means_along(

@@ -4,12 +4,14 @@
 
 Runs `probewise demo` with its default seed, takes four of its figures into `docs/_static`, and its first answers;
 runs the investigation of docs/howto/investigate.md, and takes its bars; diagnoses the pendulum of
-examples/plot_pendulum.py, and takes a figure and the sentence; draws the arm of the shipped geometry.
+examples/plot_pendulum.py, and draws a release under the verdict; draws the arm of the shipped geometry, and the
+figure of examples/plot_resonance.py.
 """
 
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 import subprocess
 import sys
@@ -17,8 +19,15 @@ import tempfile
 from pathlib import Path
 
 from probewise.arm import read_geometry, shipped_geometry_path
+from probewise.cli._common import DEFAULT_SEED
+from probewise.cli.diagnose import generators_of_diagnosis
+from probewise.diagnosis import diagnose_system
+from probewise.report.diagnosis_figures import before_and_after
 from probewise.report.plots import png
 from probewise.report.plots.apparatus import draw_arm_lengths
+from probewise.report.plots.canvas import figure_of
+from probewise.report.words import typeset_numbers
+from probewise.systems import read_simulator, read_table_for
 
 STATIC = Path(__file__).parent / "_static"
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -44,17 +53,23 @@ def main() -> None:
         shutil.copyfile(out / "by_round.png", STATIC / "by_round.png")
         diagnose_pendulum(Path(folder))
     draw_arm()
+    resonance = runpy.run_path(str(EXAMPLES / "plot_resonance.py"))
+    (STATIC / "resonance.png").write_bytes(png(resonance["fig"], dpi=70))
 
 
 def diagnose_pendulum(folder: Path) -> None:
-    """Diagnose the pendulum as the README does; keep the figure of one release, and the sentence."""
-    swings, out = folder / "swings.csv", folder / "pendulum"
+    """Diagnose the pendulum as the README does; keep the figure of one release under the verdict, and the sentence."""
+    swings, law = folder / "swings.csv", EXAMPLES / "simulators" / "pendulum.py"
     subprocess.run([sys.executable, str(EXAMPLES / "plot_pendulum.py"), "--out", str(swings)], check=True)
-    by = ["--simulator", str(EXAMPLES / "simulators" / "pendulum.py"), "--out", str(out)]
-    subprocess.run([sys.executable, "-m", "probewise", "diagnose", str(swings), *by], check=True)
-    shutil.copyfile(out / "before_after.svg", STATIC / "pendulum.svg")
-    found = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
-    kept = {name: found[name] for name in ("verdict", "combination", "reason")}
+    rng, *_ = generators_of_diagnosis(DEFAULT_SEED)
+    simulator = read_simulator(law)
+    found = diagnose_system(simulator, read_table_for(simulator, swings), rng=rng)
+    axes = before_and_after(found)
+    said = typeset_numbers(found.reason.partition(" (p =")[0])
+    figure_of(axes).suptitle(f"Verdict: {said}", x=0.02, ha="left", fontweight="bold", fontsize=9)
+    figure_of(axes).tight_layout(pad=0.4, h_pad=0.9)
+    (STATIC / "pendulum.png").write_bytes(png(axes, dpi=130))
+    kept = {"verdict": found.verdict, "combination": list(found.combination), "reason": found.reason}
     (STATIC / "pendulum.json").write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

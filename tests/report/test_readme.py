@@ -29,15 +29,16 @@ def plain(text):
 
 
 @pytest.mark.slow
-def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
+def test_the_printed_loop_is_the_one_that_the_robot_runs(monkeypatch):
     """The printed lines and `explore`, given the same randomness, take the same readings to the last bit."""
-    law, code = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert law == LAW
+    page = (ROOT / "docs" / "howto" / "python.md").read_text(encoding="utf-8")
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "experiment.begin" in block)
+    code = "import numpy as np\n" + code  # of the page's first block
     setup, rest = code.split("\nrng = ")
     printed = {}
-    exec(compile(code, "README.md", "exec"), printed)
+    exec(compile(code, "python.md", "exec"), printed)
     again = {}
-    exec(compile(setup, "README.md", "exec"), again)
+    exec(compile(setup, "python.md", "exec"), again)
     rng = eval(rest.splitlines()[0], again)
     monkeypatch.setattr(loop, "_rng_of_reading", lambda seed, number: rng)
     steps = list(experiment.explore(again["robot"], printed["asked"], rng=rng, max_readings=4))
@@ -48,16 +49,19 @@ def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
     assert abs((last.mean - [600.0, 260.0, 90.0]) / last.sd).max() < 4
 
 
-def test_the_readme_quotes_what_the_demo_said_when_its_pictures_were_made():
-    for sentence in (QUOTED["equal_readings"], QUOTED["diagnosis"], QUOTED["reason"], f'("{QUOTED["concealed"]}")'):
-        assert plain(sentence) in plain(README)
+def test_the_law_of_the_readme_is_in_the_file_that_it_names():
+    (law,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert law in LAW
+
+
+def test_the_front_page_quotes_what_the_demo_said_when_its_pictures_were_made():
     assert plain(QUOTED["equal_readings"]) in plain(INDEX)
     assert QUOTED["combination"] == QUOTED["concealed"]
     assert QUOTED["verdict"] == "named"
 
 
 @pytest.mark.slow
-def test_the_readme_quotes_what_the_command_says_of_the_shipped_recording():
+def test_the_demo_and_the_command_say_the_same_of_the_shipped_recording():
     rng, *_ = generators_of_diagnosis(QUOTED["seed"])
     found = diagnose(read_recording(shipped("concealed")), rng=rng)
     assert typeset_numbers(found.reason) == QUOTED["reason"]
@@ -83,10 +87,10 @@ def test_the_readme_quotes_what_the_command_says_of_the_pendulum(tmp_path):
     assert found["p_value"] < 1e-100
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
-def test_pictures_that_the_front_pages_show_are_there(page):
+@pytest.mark.parametrize(("page", "n_pictures"), [("README.md", 4), ("docs/index.md", 3)])
+def test_pictures_that_the_front_pages_show_are_there(page, n_pictures):
     shown = re.findall(r"(?:!\[.*?\]\(|```\{figure\} )([^)\s]+)", (ROOT / page).read_text(encoding="utf-8"))
-    assert len(shown) == 3
+    assert len(shown) == n_pictures
     assert all(((ROOT / page).parent / name).is_file() for name in shown)
 
 
@@ -104,8 +108,8 @@ def test_pictures_that_the_front_pages_show_are_there(page):
 def test_a_word_of_the_trade_is_explained_where_it_first_stands(page, word, meaning):
     prose = plain(re.sub(r"```\w+\n.*?```|!\[.*?\]|:alt: [^\n]*", "", page, flags=re.DOTALL))
     first = re.search(word, prose)
-    assert first is not None
-    assert meaning in prose[max(first.start() - 120, 0) : first.end() + 330]
+    assert first is not None or page is README
+    assert first is None or meaning in prose[max(first.start() - 120, 0) : first.end() + 330]
 
 
 def test_no_notebook_shows_evidences_that_do_not_decide():

@@ -24,7 +24,7 @@ from probewise.report.covariates import (
     view_along_scan,
     views_of_place,
 )
-from probewise.report.plots.canvas import BLUE, stack_of_axes, svg
+from probewise.report.plots.canvas import BLUE, AxesGrid, stack_of_axes, svg
 from probewise.report.plots.noise import (
     lost_readings_against_predicted,
     readings_modulo_step,
@@ -58,7 +58,7 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     chance = cache(partial(ResidualNoise.of_diagnosis, diagnosis))
     drawers: dict[str, Callable[[], bytes]] = {
         "first.svg": lambda: _first_figure_svg(diagnosis, chance()),
-        "before_after.svg": lambda: _before_and_after_svg(diagnosis),
+        "before_after.svg": lambda: svg(before_and_after(diagnosis)),
         "residuals.svg": lambda: _all_residuals_svg(diagnosis),
         "noise.svg": lambda: _noise_tests_svg(diagnosis, chance()),
     }
@@ -173,7 +173,7 @@ def _spread_within_categories(at: FloatArray) -> FloatArray:
     return out
 
 
-def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
+def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
     """Draw the scan that the repair changes most (else the longest): readings, one or both models, residuals below.
 
     A random walk of the noise, as all readings show it, is part of both models' lines.
@@ -189,10 +189,8 @@ def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = plan.instrumentation.unit_after_number
     models = models if diagnosis.repair.changes_predictions else models[:1]
-    return svg(
-        scan_with_residuals(
-            shown.at[rows], readings, models, joined=is_scan_along_line(plan, rows), label=shown.label, unit=unit
-        )
+    return scan_with_residuals(
+        shown.at[rows], readings, models, joined=is_scan_along_line(plan, rows), label=shown.label, unit=unit
     )
 
 

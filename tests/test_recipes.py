@@ -49,7 +49,7 @@ def test_a_shape():
 
 
 def test_a_region_with_its_closed_form():
-    ring = example("RingRegion", "probewise.scene.regions.ellipse", "probewise.sensor.gaussian")
+    ring = example("RingRegion", "probewise.scene.regions", "probewise.sensor.gaussian")
     region = ring(np.array([[2.0, 1.0]]), np.array([[5.0, 12.0]]))
     grid = np.arange(-25.0, 25.125, 0.25)
     ssf = FixedMixture([1.0], [[0.0, 0.0]], [np.array([[16.0, 3.0], [3.0, 9.0]])])

@@ -8,7 +8,7 @@ from math import log2
 import numpy as np
 import pytest
 
-from probewise.errors import ParameterError, ReachError, ShapeError
+from probewise.errors import ParameterError, ReachError
 from probewise.inquiry import Grid, ReadingEntropy, choose, entropy_map, label_entropy
 
 
@@ -60,9 +60,7 @@ def test_hypotheses_that_all_differ_promise_log2_of_their_number():
 def test_the_naive_map_is_the_partition_by_the_number_of_circles_that_hold_the_place():
     """Paper, conclusion: the entropy depends on the number of circles that contain the place alone."""
     theta, grid = circles(50), Grid()
-    result = entropy_map(
-        PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool), noise_sd=1.0
-    )
+    result = entropy_map(PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool))
     x, y = grid.places_mm.T
     holds = np.zeros(grid.n_places, int)
     for cx, cy, r in theta:
@@ -77,9 +75,7 @@ def test_the_naive_map_is_the_partition_by_the_number_of_circles_that_hold_the_p
 def test_half_of_the_circles_make_the_best_place_worth_one_bit():
     theta = np.array([[300.0, 200.0, 50.0]] * 25 + [[700.0, 200.0, 50.0]] * 25)
     grid = Grid()
-    result = entropy_map(
-        PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool), noise_sd=1.0
-    )
+    result = entropy_map(PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool))
     assert result.highest_utility == pytest.approx(1.0, abs=1e-12)
     best = grid.places_mm[result.best_mask]
     inside = (np.hypot(*(best - [300, 200]).T) <= 50) | (np.hypot(*(best - [700, 200]).T) <= 50)
@@ -108,7 +104,7 @@ def test_only_places_within_reach_are_chosen_or_asked():
             seen.append(plan.x_mm.min())
             return super().predict(theta, plan)
 
-    result = entropy_map(Watched(), circles(50), grid, grid.plan("field"), reachable=reachable, noise_sd=1.0)
+    result = entropy_map(Watched(), circles(50), grid, grid.plan("field"), reachable=reachable)
     assert min(seen) > 900.0
     assert grid.places_mm[choose(result.values, result.reachable, rng=np.random.default_rng(4)), 0] > 900.0
     assert (result.values[~reachable] == 0).all()
@@ -118,7 +114,7 @@ def test_only_places_within_reach_are_chosen_or_asked():
 def test_a_field_out_of_reach_is_an_error_that_says_so():
     grid = Grid(n_x=5, n_y=4)
     with pytest.raises(ReachError, match=r"reachable places is 0; allowed: at least one of the 20 places"):
-        entropy_map(PointSensor(), circles(5), grid, grid.plan("f"), reachable=np.zeros(20, bool), noise_sd=1.0)
+        entropy_map(PointSensor(), circles(5), grid, grid.plan("f"), reachable=np.zeros(20, bool))
 
 
 def test_predictions_that_are_not_finite_are_refused(made):
@@ -132,28 +128,3 @@ def test_the_map_of_50_circles_over_8515_places_is_fast():
     start = time.perf_counter()
     label_entropy(labels)
     assert time.perf_counter() - start < 0.3
-
-
-def test_the_grid_is_the_papers_field_row_by_row():
-    grid = Grid()
-    assert grid.n_places == 131 * 65
-    np.testing.assert_allclose(grid.x_mm, np.linspace(0, 1048, 131))
-    np.testing.assert_allclose(grid.y_mm, np.linspace(0, 520, 65))
-    assert grid.image(grid.places_mm[:, 0])[3, 7] == pytest.approx(grid.x_mm[7])
-    assert grid.image(grid.places_mm[:, 1])[3, 7] == pytest.approx(grid.y_mm[3])
-
-
-def test_the_places_of_a_plan_are_alternatives_without_a_direction():
-    """A lag or a backlash must not carry from one possible reading to the next."""
-    assert (Grid(n_x=3, n_y=3).plan("field").direction_of_motion == 0).all()
-
-
-@pytest.mark.parametrize("change", [{"width_mm": 0.0}, {"n_x": 1}, {"height_mm": float("nan")}])
-def test_a_grid_without_extent_is_refused(change):
-    with pytest.raises(ParameterError):
-        Grid(**change)
-
-
-def test_values_of_another_grid_are_refused():
-    with pytest.raises(ShapeError):
-        Grid().image(np.zeros(5))

@@ -23,7 +23,7 @@ from probewise.inquiry import (
     utility_map,
     utility_named,
 )
-from probewise.inquiry.finishing import _probability_of_ending
+from probewise.inquiry.utilities import _probability_of_ending
 
 APART = [[0.0, 0.0, 0.0], [0.0, 40.0, 40.0], [0.0, 0.0, 80.0], [0.0, 40.0, 120.0]]
 """Four hypotheses: the first place tells nothing, the second one bit, the third all two."""

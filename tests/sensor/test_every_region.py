@@ -39,7 +39,9 @@ def registered(function):
 
 
 def test_every_kind_of_region_is_here():
-    assert {name for name in regions.__all__ if name.endswith("Region") or name.startswith("RegionsOf")} == set(KINDS)
+    assert {name for name in vars(regions) if name.endswith("Region") or name.startswith("RegionsOf")} - {
+        "Region"
+    } == set(KINDS)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -27,8 +27,7 @@ from probewise.effects.reference import (
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Ramp, Stripes
 from probewise.recordings.plan import Plan
-from probewise.scene.albedo import Region
-from probewise.scene.regions import edge_distance
+from probewise.scene.regions import Region, edge_distance
 from probewise.sensor.commanded import footprint_at_added_height, height_ratio
 from probewise.sensor.gaussian import LabGaussian, mean_albedo_under_one_gaussian
 from probewise.sensor.stages import Footprint, SceneView, Stage, View

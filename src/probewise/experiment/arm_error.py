@@ -24,8 +24,7 @@ from probewise.experiment.kinds import HypothesisKind, Posterior
 from probewise.experiment.setup import Experiment
 from probewise.inference.problem import checked_log_prob
 from probewise.recordings.plan import Recording
-from probewise.scene.any_of import AnyOf, shape_and_columns
-from probewise.scene.symmetry import with_angles_near
+from probewise.scene.shapes import AnyOf, shape_and_columns, with_angles_near
 
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
 _STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are

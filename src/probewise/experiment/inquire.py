@@ -41,12 +41,11 @@ from probewise.inquiry import (
     utility_map,
 )
 from probewise.inquiry.forecast import resampled_rows_and_weights
-from probewise.inquiry.given_reading import WeightsGivenReading
+from probewise.inquiry.utilities import WeightsGivenReading
 from probewise.nested import Weighted
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
-from probewise.scene.albedo import Region
-from probewise.scene.regions import EllipseRegion, PolygonRegion
+from probewise.scene.regions import EllipseRegion, PolygonRegion, Region
 
 ENOUGH_BITS = 0.05
 """Expected information about the name of what is left out for which a reading is taken after the shape is known."""

@@ -24,8 +24,7 @@ from probewise.inquiry import TabulatedChain
 from probewise.nested import Weighted
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Plan, Recording
-from probewise.scene.albedo import Shape
-from probewise.scene.any_of import AnyOf
+from probewise.scene.shapes import AnyOf, Shape
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
 

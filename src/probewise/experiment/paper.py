@@ -19,9 +19,9 @@ from probewise.errors import NotConvergedError, ParameterError
 from probewise.experiment.journal import PATTERN, recording_of
 from probewise.experiment.kinds import HypothesisKind, Posterior
 from probewise.experiment.smc import Particles
+from probewise.inference.likelihoods import StudentT
 from probewise.inference.problem import Likelihood, SensorProblem
-from probewise.inference.student_t import StudentT
-from probewise.inquiry import Grid, ReadingEntropy, choose, entropy_map
+from probewise.inquiry import Grid, choose, entropy_map
 from probewise.nested import EvidenceChange, KernelMove, Move, NestedResult, StopRule, Weighted, diversify, run
 from probewise.nested.weights import resampled_rows
 from probewise.recordings import Recording
@@ -75,10 +75,8 @@ def find_shape(
     shapes = shape.prior.from_unit_cube(rng.random((N_SAMPLES, len(shape.prior.names))))
     known = False
     while not known:
-        utility = entropy_map(
-            model, shapes, grid, plan, reachable=reachable, noise_sd=bin_width, utility=ReadingEntropy(bin_width)
-        )
-        place = choose(utility.values, reachable, rng=rng)
+        entropy = entropy_map(model, shapes, grid, plan, reachable=reachable, bin_width=bin_width)
+        place = choose(entropy.values, reachable, rng=rng)
         x_mm, y_mm = places_mm[place].tolist()
         readings = (*readings, arm.measure(Pose(x_mm, y_mm, float(orientation_rad[place]))))
         problem = SensorProblem(shape.prior, model, likelihood, recording_of(readings))

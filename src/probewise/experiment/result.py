@@ -30,8 +30,7 @@ from probewise.nested import Weighted
 from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.plan import Instrumentation, Recording
 from probewise.recordings.table import csv_text_of_rows
-from probewise.scene.any_of import AnyOf
-from probewise.scene.shapes import RegularPolygon
+from probewise.scene.shapes import AnyOf, RegularPolygon
 
 PAPER_BITS = 25.0
 """Bits in the paper's count for a circle known to 4 mm: one per reading of the naive model."""

@@ -37,8 +37,7 @@ from probewise.inquiry import (
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Instrumentation
 from probewise.scene import Card
-from probewise.scene.albedo import Shape, require_shape
-from probewise.scene.any_of import AnyOf
+from probewise.scene.shapes import AnyOf, Shape, require_shape
 from probewise.sensor.stages import SensorModel
 
 

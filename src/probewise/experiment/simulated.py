@@ -29,7 +29,7 @@ from probewise.scene import (
     Shape,
     outlines,
 )
-from probewise.scene.albedo import require_shape
+from probewise.scene.shapes import require_shape
 from probewise.world import CoveredSurface, Oval, Spot, Surface, World
 
 Model: TypeAlias = Literal["ssf", "naive"]

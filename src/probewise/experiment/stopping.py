@@ -20,8 +20,7 @@ from probewise.inference.problem import SensorProblem
 from probewise.inference.rounded import ScaleEnds
 from probewise.inquiry import Bound, UtilityMap, capacity_bits, fewest_readings, prior_entropy, target_entropy
 from probewise.nested import Weighted
-from probewise.scene.any_of import AnyOf
-from probewise.scene.symmetry import mean_angles, with_angles_near
+from probewise.scene.shapes import AnyOf, mean_angles, with_angles_near
 
 OFF_SDS = 3.0
 """Error, in units of the stopping rule's sd, above which a length counts as wrong: 12 mm for 4 mm."""

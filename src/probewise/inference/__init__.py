@@ -4,12 +4,17 @@ The likelihoods are the paper's naive one, its Student-t (the noise sd of each d
 of known sd, and one of rounded readings; any sensor model works with any of them.
 """
 
-from probewise.inference.gaussian import GaussianKnown
-from probewise.inference.naive import Naive
-from probewise.inference.noise_bounds import reading_span, sd_ceiling, sd_floor, student_t_of
-from probewise.inference.problem import Likelihood, Problem, SensorProblem
+from probewise.inference.likelihoods import GaussianKnown, Naive, StudentT, log_sigma_integral
+from probewise.inference.problem import (
+    Likelihood,
+    Problem,
+    SensorProblem,
+    reading_span,
+    sd_ceiling,
+    sd_floor,
+    student_t_of,
+)
 from probewise.inference.rounded import Rounded
-from probewise.inference.student_t import StudentT, log_sigma_integral
 
 __all__ = [
     "GaussianKnown",

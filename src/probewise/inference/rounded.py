@@ -14,7 +14,7 @@ from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import checked_number
 from probewise.effects.noise_distribution import log_gaussian_mass_between
 from probewise.errors import ParameterError
-from probewise.inference._residuals import residuals
+from probewise.inference.likelihoods import residuals
 
 _FAR = 200.0  # sds from the prediction that the table covers
 _PER_SD = 50.0  # table entries per sd: linear interpolation errs by less than 1e-4

@@ -1,49 +1,48 @@
-"""Predictive distributions at every design, as weights of levels, by direct predictions if there is no table."""
+"""Predictions for many hypotheses at many designs: directly, and with known cards over another forecast."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.inquiry.culling import CullingBounds
-from probewise.inquiry.designs import Designs
+from probewise.errors import ParameterError
+from probewise.inquiry.grid import Designs
+from probewise.inquiry.readout import evenly_spaced_levels
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import SensorModel
+from probewise.scene import Card, CardedScene, HypothesisScene, outlines
+from probewise.scene.scenes import mean_albedo_with_cards
+from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor.chain import RegionsAndPoses, response
+from probewise.sensor.commanded import has_commanded_height_or_led, led_state, with_led_on
+from probewise.sensor.stages import Poses, SensorModel
 
 MOST_LEVELS = 1000
 """Largest number of levels and of cells of a reading, more than the hypotheses can fill."""
 
-
 _BLOCK = 2048  # designs predicted at a time: a closed form with 20 nodes stays within 20 MB for 50 hypotheses
 _MOST_ASKED = 400  # hypotheses predicted directly
 _PER_SD = 8.0  # levels per noise sd: fine, since each of a few hundred hypotheses matters
+_REACH = 6.0  # sds of the footprint beyond which it is negligible: 1e-9 of the levels' difference
+_SHOWS = 1e-4  # share of the footprint on a card from which the card counts
+_TILE_MM = 110.0
+_FAR_MM = 1e5
 
 
-class PredictiveDistributions(Protocol):
-    """Predictive distribution of the noise-free reading at some designs, as weights of levels."""
+@dataclass(frozen=True, eq=False)
+class PredictiveDistributions:
+    """Predictive distribution of the noise-free reading at some designs, as weights of levels.
 
-    @property
-    def levels(self) -> FloatArray:
-        """Evenly spaced noise-free readings, (n_levels,); a prediction counts for the nearest."""
-        ...
+    `levels` are evenly spaced noise-free readings, (n_levels,); a prediction counts for the nearest. `level_weights`
+    takes the weights of the hypotheses, (n_samples,), and yields, for one combination of settings after another,
+    indices into the designs, (n,), and the weight of each level there, (n, n_levels).
+    """
 
-    def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level at all places of one combination of settings, one combination after another.
-
-        Parameters
-        ----------
-        weight
-            Of the hypotheses, (n_samples,).
-
-        Yields
-        ------
-        Indices into the designs, (n,), and the weight of each level there, (n, n_levels).
-        """
-        ...
+    levels: FloatArray
+    level_weights: Callable[[FloatArray], Iterator[tuple[IntArray, FloatArray]]]
 
 
 class Forecast(Protocol):
@@ -79,9 +78,14 @@ class Forecast(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class DirectForecast:
-    """A forecast for any model: direct predictions of at most 400 hypotheses, resampled systematically."""
+    """A forecast for any model: direct predictions of at most `n_asked` hypotheses, resampled systematically.
+
+    `levels_per_sd`: number of levels per sd of the noise.
+    """
 
     model: SensorModel
+    n_asked: int = _MOST_ASKED
+    levels_per_sd: float = _PER_SD
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
@@ -90,34 +94,19 @@ class DirectForecast:
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """Return the predictive distribution at `rows`, by predictions of at most 400 resampled hypotheses."""
-        chosen, share = resampled_rows_and_weights(weight, _MOST_ASKED)
+        """Return the predictive distribution at `rows`, by predictions of the resampled hypotheses."""
+        chosen, share = resampled_rows_and_weights(weight, self.n_asked)
         answers = predict_where_visible(self.model, theta[chosen], plan.take(rows))
-        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD, most=MOST_LEVELS)
-        per_level = 1.0 / (levels[1] - levels[0])
-        index = np.rint((answers - levels[0]) * per_level).astype(np.int32)
-        return _DirectPredictive(chosen, share / weight[chosen], index, levels, rows, designs.grid.n_places)
+        low, high = float(answers.min()), float(answers.max())
+        levels = evenly_spaced_levels(low, high, noise_sd / self.levels_per_sd, most=MOST_LEVELS)
+        index = np.rint((answers - levels[0]) * (1.0 / (levels[1] - levels[0]))).astype(np.int32)
+        stands_for = share / weight[chosen]
 
+        def level_weights(weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+            for _, at, _ in rows_by_combination(rows, designs.grid.n_places):
+                yield at, weight_by_level(index[:, at], weight[chosen] * stands_for, len(levels))
 
-@dataclass(frozen=True, eq=False)
-class _DirectPredictive:
-    """Predictions of the hypotheses `chosen` as the `index` of the nearest level, (n_asked, n_designs).
-
-    `stands_for`, (n_asked,): factor from the weight of each to that of all hypotheses for which it stands.
-    """
-
-    chosen: IntArray
-    stands_for: FloatArray
-    index: IntArray
-    levels: FloatArray
-    rows: IntArray
-    n_places: int
-
-    def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield the weight of each level at all places of one combination of settings; then of the next."""
-        own, n_levels = weight[self.chosen] * self.stands_for, len(self.levels)
-        for _, at, _ in rows_by_combination(self.rows, self.n_places):
-            yield at, weight_by_level(self.index[:, at], own, n_levels)
+        return PredictiveDistributions(levels, level_weights)
 
 
 def nearest_level_index(answers: FloatArray, levels: FloatArray) -> IntArray:
@@ -144,35 +133,6 @@ def rows_by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, In
         yield number, at, place[at]
 
 
-def predict_where_visible(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
-    """Predict every hypothesis at every row of a long plan: (n_samples, n_points).
-
-    The model is called only for hypotheses visible from a row; elsewhere the reading is the one outside the shape.
-    """
-    bounds = CullingBounds.of(model, theta, plan)
-    if bounds is not None:
-        out = np.full((len(theta), len(plan)), bounds.outside)
-        for rows, shown in bounds.visible_hypotheses_by_tile(plan):
-            if shown.size:
-                out[np.ix_(shown, rows)] = model.predict(theta[shown], plan.take(rows))
-        return out
-    out = np.empty((len(theta), len(plan)))
-    for start in range(0, len(plan), _BLOCK):
-        block = np.arange(start, min(start + _BLOCK, len(plan)))
-        out[:, block] = model.predict(theta, plan.take(block))
-    return out
-
-
-def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
-    """Return evenly spaced levels between two readings, two or more, at most `spacing` apart.
-
-    `most`: largest number of levels, even if they are then further apart.
-    """
-    low, high = min(low, high), max(low, high)
-    n = max(2, int(np.ceil((high - low) / spacing)) + 1)
-    return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
-
-
 def resampled_rows_and_weights(weight: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
     """Resample at most `n` hypotheses systematically, with a fixed start; return their indices and new weights.
 
@@ -185,3 +145,160 @@ def resampled_rows_and_weights(weight: FloatArray, n: int) -> tuple[IntArray, Fl
     rows = np.searchsorted(ladder, (np.arange(n) + 0.5) / n * ladder[-1])
     rows, count = np.unique(np.minimum(rows, len(weight) - 1), return_counts=True)
     return rows, count * (ladder[-1] / n)
+
+
+def predict_where_visible(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
+    """Predict every hypothesis at every row of a long plan: (n_samples, n_points).
+
+    The model is called only for hypotheses visible from a row; elsewhere the reading is the one outside the shape.
+    """
+    out = np.empty((len(theta), len(plan)))
+    boxes = _bounding_boxes(model, theta, plan)
+    if boxes is None:
+        for start in range(0, len(plan), _BLOCK):
+            block = np.arange(start, min(start + _BLOCK, len(plan)))
+            out[:, block] = model.predict(theta, plan.take(block))
+        return out
+    low, high, out[:] = boxes
+    column, row = (np.floor(place / _TILE_MM).astype(np.int64) for place in (plan.x_mm, plan.y_mm))
+    tiles = np.unique(np.stack([column, row]), axis=1, return_inverse=True)[1].ravel()
+    order = np.argsort(tiles, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(tiles[order])) + 1):
+        place = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
+        shown = np.flatnonzero((low <= place.max(axis=0)).all(axis=1) & (high >= place.min(axis=0)).all(axis=1))
+        if shown.size:
+            out[np.ix_(shown, rows)] = model.predict(theta[shown], plan.take(rows))
+    return out
+
+
+def _bounding_boxes(model: SensorModel, theta: FloatArray, plan: Plan) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return corners of the boxes, (n_samples, 2) each, outside which a hypothesis is invisible, and the reading there.
+
+    None if readings depend on more than the shape: only for a known mixture and known levels without effects they do
+    not. None also for a shape without closed edge.
+    """
+    if not isinstance(model, Chain) or model.effects or has_commanded_height_or_led(plan) or len(plan) == 0:
+        return None
+    if not isinstance(model.ssf, FixedMixture) or not isinstance(model.levels, FixedLevels):
+        return None
+    if not isinstance(model.scene, HypothesisScene) or isinstance(model.scene, CardedScene):
+        return None
+    try:
+        edges = outlines(model.scene.shape.region(theta))
+    except ParameterError:  # no closed edge: it may be visible anywhere
+        return None
+    reach = _footprint_reach_mm(model.ssf)
+    low, high = (np.array([f(edge, axis=0) for edge in edges]) for f in (np.nanmin, np.nanmax))
+    one = plan.take(np.array([0]))
+    outside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
+    return low - reach, high + reach, float(outside)
+
+
+def _footprint_reach_mm(mixture: FixedMixture) -> float:
+    """Return the distance from the sensor beyond which its footprint is negligible."""
+    sds = np.sqrt(np.linalg.eigvalsh(mixture.covs_mm2)[:, -1])
+    return float((np.linalg.norm(mixture.means_mm, axis=1) + _REACH * sds).max())
+
+
+def cards_of(model: SensorModel) -> tuple[Card, ...]:
+    """Return the known cards on a model's field; empty if its scene has none."""
+    scene = getattr(model, "scene", None)
+    return scene.cards if isinstance(scene, CardedScene) else ()
+
+
+@dataclass(frozen=True, eq=False)
+class CardedModel:
+    """A sensor model without effects, for a shape and known cards on the field.
+
+    `plain` predicts the shape alone; `chain` gives the share of the footprint on each card in closed form.
+    """
+
+    chain: Chain
+    plain: SensorModel
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The shape's parameters."""
+        return self.plain.names
+
+    @property
+    def cards(self) -> tuple[Card, ...]:
+        """The known cards on the field."""
+        return cards_of(self.chain)
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
+        levels = self.chain.levels
+        assert isinstance(levels, FixedLevels)
+        dark, bright = levels.i_min, levels.i_max
+        seen = (self.plain.predict(theta, with_led_on(plan)) - dark) / (bright - dark)
+        mean = mean_albedo_with_cards(seen, self.cards, self.footprint_share_by_card(_poses_of(plan), plan))
+        return np.asarray(dark + (bright - dark) * led_state(plan) * mean)
+
+    def footprint_share_by_card(self, poses: Poses, plan: Plan) -> list[FloatArray]:
+        """Return for each card the share of the footprint on the card, (n_samples or 1, n_points)."""
+        mixture = self.chain.ssf
+        assert isinstance(mixture, FixedMixture)
+        reach, footprint = _footprint_reach_mm(mixture), mixture.footprint(np.empty((1, 0)))
+        found = []
+        for card in self.cards:
+            out = np.zeros(np.broadcast_shapes(poses.x_mm.shape, poses.y_mm.shape))
+            within = (np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach) & (
+                np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach
+            )
+            rows = np.flatnonzero(within.any(axis=0))
+            if rows.size:
+                there = Poses(*(a[:, rows] for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+                part = plan.take(rows)
+                regions = dict.fromkeys(part.pattern_names, card.region)
+                out[:, rows] = response(RegionsAndPoses(regions, there, part), footprint, n_nodes=self.chain.n_nodes)
+            found.append(out)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class CardedForecast:
+    """A forecast by tables of the shape for all hypotheses; near cards, by direct predictions of at most 400."""
+
+    base: Forecast
+    chain: Chain
+
+    @property
+    def model(self) -> CardedModel:
+        """The sensor model, with the cards."""
+        return CardedModel(self.chain, self.base.model)
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Predict noise-free readings, with cards: (n_samples, n_params) -> (n_samples, n_points)."""
+        return self.model.predict(theta, plan)
+
+    def predictive(
+        self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
+    ) -> PredictiveDistributions:
+        """Return the predictive distribution at `rows`; see `Forecast.predictive`."""
+        base = self.base.predictive(theta, weight, designs, plan, rows, noise_sd)
+        there, model, levels = plan.take(rows), self.model, base.levels
+        covered = model.footprint_share_by_card(_poses_of(there), there)
+        near = np.flatnonzero(sum(share[0] for share in covered) > _SHOWS)
+        if not near.size:
+            return base
+        chosen, share = resampled_rows_and_weights(weight, _MOST_ASKED)
+        index = nearest_level_index(model.predict(theta[chosen], there.take(near)), levels).clip(0, len(levels) - 1)
+        stands_for = share / weight[chosen]
+        number = np.full(len(rows), -1)
+        number[near] = np.arange(len(near))
+
+        def level_weights(weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+            mass_there = weight_by_level(index, weight[chosen] * stands_for, len(levels))
+            for at, mass in base.level_weights(weight):
+                sees = np.flatnonzero(number[at] >= 0)
+                if sees.size:
+                    mass = mass.copy()
+                    mass[sees] = mass_there[number[at[sees]]]
+                yield at, mass
+
+        return PredictiveDistributions(levels, level_weights)
+
+
+def _poses_of(plan: Plan) -> Poses:
+    return Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])

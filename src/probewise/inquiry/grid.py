@@ -1,15 +1,18 @@
-"""The fine grid of possible places over the field."""
+"""The possible next readings: the places of a fine grid over the field, with orientations, repeats and settings."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.plan import Plan
+
+_MOST_REPEATS = 1000
 
 
 @dataclass(frozen=True)
@@ -23,9 +26,8 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm"):
-            value = getattr(self, name)
-            if not (0 < value < np.inf):
-                raise ParameterError(name, value, "finite, greater than 0")
+            if not 0 < getattr(self, name) < np.inf:
+                raise ParameterError(name, getattr(self, name), "finite, greater than 0")
         for name in ("n_x", "n_y"):
             if getattr(self, name) < 2:
                 raise ParameterError(name, getattr(self, name), "2 or more")
@@ -38,18 +40,18 @@ class Grid:
     @cached_property
     def x_mm(self) -> FloatArray:
         """X of each column, (n_x,)."""
-        return _read_only(np.linspace(0.0, self.width_mm, self.n_x))
+        return read_only_floats(np.linspace(0.0, self.width_mm, self.n_x))
 
     @cached_property
     def y_mm(self) -> FloatArray:
         """Y of each row, the lowest first, (n_y,)."""
-        return _read_only(np.linspace(0.0, self.height_mm, self.n_y))
+        return read_only_floats(np.linspace(0.0, self.height_mm, self.n_y))
 
     @cached_property
     def places_mm(self) -> FloatArray:
         """All places, shape (n_places, 2), lab frame: x runs fastest, so that `image` needs no transpose."""
         x, y = np.meshgrid(self.x_mm, self.y_mm)
-        return _read_only(np.stack([x.ravel(), y.ravel()], axis=-1))
+        return read_only_floats(np.stack([x.ravel(), y.ravel()], axis=-1))
 
     def image(self, values: FloatArray) -> FloatArray:
         """Arrange one value per place as an image, (n_places,) -> (n_y, n_x), lower row first."""
@@ -76,6 +78,97 @@ class Grid:
         )
 
 
-def _read_only(values: FloatArray) -> FloatArray:
-    values.flags.writeable = False
-    return values
+@dataclass(frozen=True)
+class Design:
+    """One possible reading: place, orientation, repeats and other settings."""
+
+    x_mm: float
+    y_mm: float
+    orientation_rad: float = 0.0
+    repeats: int = 1
+    settings: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Designs:
+    """The possible readings: every place of a grid with every orientation, number of repeats and other setting.
+
+    Rows run over all places for the first combination, then for the next, so that values reshape to
+    (n_combinations, n_places).
+
+    Parameters
+    ----------
+    grid
+        The places.
+    orientations_rad
+        Possible orientations of the sensor.
+    repeats
+        Possible numbers of repeated readings, which are averaged.
+    settings
+        Other quantities by name with their possible values, which become covariates of the plan, such as
+        ("height_mm", (8.0, 14.0)).
+    """
+
+    grid: Grid = field(default_factory=Grid)
+    orientations_rad: tuple[float, ...] = (0.0,)
+    repeats: tuple[int, ...] = (1,)
+    settings: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.orientations_rad or not np.isfinite(self.orientations_rad).all():
+            raise ParameterError("orientations_rad", self.orientations_rad, "one finite angle or more")
+        if not self.repeats or min(self.repeats) < 1 or max(self.repeats) > _MOST_REPEATS:
+            raise ParameterError("repeats", self.repeats, f"one number or more, each from 1 to {_MOST_REPEATS}")
+        for name, values in self.settings:
+            if not values or not np.isfinite(values).all():
+                raise ParameterError(f"settings {name}", values, "one finite value or more")
+
+    def __len__(self) -> int:
+        return self.grid.n_places * len(self.setting_combinations)
+
+    @cached_property
+    def setting_combinations(self) -> tuple[Design, ...]:
+        """The combinations of orientation, settings and repeats, as designs at (0, 0); repeats vary fastest."""
+        names = [name for name, _ in self.settings]
+        return tuple(
+            Design(0.0, 0.0, turn, n, tuple(zip(names, values, strict=True)))
+            for turn in self.orientations_rad
+            for values in product(*(values for _, values in self.settings))
+            for n in self.repeats
+        )
+
+    def __getitem__(self, row: int) -> Design:
+        """Return one design by its row."""
+        which, place = divmod(row, self.grid.n_places)
+        x_mm, y_mm = self.grid.places_mm[place].tolist()
+        return replace(self.setting_combinations[which], x_mm=x_mm, y_mm=y_mm)
+
+    @cached_property
+    def n_repeats(self) -> IntArray:
+        """Number of readings of each design, (n_designs,)."""
+        return np.repeat([combination.repeats for combination in self.setting_combinations], self.grid.n_places)
+
+    def plan(self, pattern_name: str, *, time_s: float = 0.0) -> Plan:
+        """Return a plan with one row per design, in order, each a scan of its own (see `Grid.plan`)."""
+        return replace(self._plan_without_time, pattern_names=(pattern_name,), time_s=np.full(len(self), time_s))
+
+    @cached_property
+    def _plan_without_time(self) -> Plan:
+        """The plan of all designs with time 0 and pattern name "", cached because it has thousands of scan names."""
+        n_places, n_designs, combinations = self.grid.n_places, len(self), self.setting_combinations
+        return replace(
+            self.grid.plan("").take(np.tile(np.arange(n_places), len(combinations))),
+            orientation_rad=np.repeat([c.orientation_rad for c in combinations], n_places),
+            scan=np.arange(n_designs),
+            scan_names=tuple(str(k) for k in range(n_designs)),
+            covariates={
+                name: np.repeat([dict(c.settings)[name] for c in combinations], n_places) for name, _ in self.settings
+            },
+        )
+
+    def cost_s(self, travel_s: FloatArray, read_s: float) -> FloatArray:
+        """Return the duration of each design in seconds, (n_designs,).
+
+        `travel_s`: seconds to move to each place and read there once, (n_places,). `read_s`: of each repeated reading.
+        """
+        return np.tile(travel_s, len(self.setting_combinations)) + read_s * (self.n_repeats - 1)

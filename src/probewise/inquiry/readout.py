@@ -1,4 +1,4 @@
-"""From a noise-free level to the recorded reading: noise, rounding, range."""
+"""What a reading can tell: noise, rounding and range of a reading, entropies, and bounds on the number of readings."""
 
 from __future__ import annotations
 
@@ -7,16 +7,31 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.special import ndtr
+from scipy.spatial import cKDTree
+from scipy.special import digamma, gammaln, ndtr
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
+from probewise.priors import Prior
 
 _REACH = 5.0  # noise sds beyond the levels that the cells cover
 _FINE = 0.25  # width of a cell in noise sds, for unrounded readings: loses 0.3 % of a nat
 _WIDE = 2.0  # steps: of wider noise, a mean hardly depends on the rounding of each reading
 _MOST_SUMS = 3000  # values of a sum of readings
 _LEAST = np.float32(1e-30)
+_PER_SD = 4.0  # levels per noise sd, for the capacity
+_MOST_ROUNDS = 2000
+_CLOSE_BITS = 1e-4
+
+
+def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
+    """Return evenly spaced levels between two readings, two or more, at most `spacing` apart.
+
+    `most`: largest number of levels, even if they are then further apart.
+    """
+    low, high = min(low, high), max(low, high)
+    n = max(2, int(np.ceil((high - low) / spacing)) + 1)
+    return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
 
 
 @dataclass(frozen=True)
@@ -115,3 +130,141 @@ def entropy_bits(probability: FloatArray) -> FloatArray:
     log = np.log2(np.maximum(probability, _LEAST))
     log *= probability
     return np.asarray(-log.sum(axis=-1))
+
+
+def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, prior_entropy_bits: float) -> float:
+    """Convert nested sampling's information to prior minus posterior differential entropy.
+
+    With p the prior and P the posterior, h(P) = -H - E_P[ln p], so h(p) - h(P) = H + E_P[ln p] + h(p).
+    For a uniform prior the last two cancel and the bits are H / ln 2.
+
+    Parameters
+    ----------
+    information
+        H, relative entropy of posterior to prior, nats.
+    log_prior
+        Natural log of the prior density of posterior samples, shape (n_samples,).
+    weight
+        Their weights, shape (n_samples,), summing to one.
+    prior_entropy_bits
+        h(p) in bits, see `prior_entropy`.
+    """
+    return (information + float(weight @ log_prior)) / math.log(2) + prior_entropy_bits
+
+
+def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20_000) -> float:
+    """Return the differential entropy of a prior in bits: minus the mean log2 density of `n_samples` draws."""
+    theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
+    return -float(np.mean(prior.log_prob(theta))) / math.log(2)
+
+
+def neighbour_entropy(theta: FloatArray, *, neighbour: int = 4) -> float:
+    """Return the differential entropy in bits from distances to the k-th neighbour, theta (n_samples, n_params).
+
+    Kozachenko and Leonenko's estimate (k, `neighbour`, as in Kraskov et al. 2004): psi(n) - psi(k) + ln V_d + d mean(ln
+    r_k). The columns are scaled to unit sd first, and the scale is added back, since the estimate assumes a density
+    that is even over the distance r_k. ParameterError if more than k samples coincide, for a constant
+    column, or for a k that is not below the number of samples.
+    """
+    n_samples, n_params = theta.shape
+    if not 1 <= neighbour < n_samples:
+        raise ParameterError("neighbour", neighbour, f"1 to {n_samples - 1}, fewer than the samples")
+    scale = theta.std(axis=0)
+    if np.any(scale <= 0):
+        raise ParameterError("theta", "a constant column", "samples that vary in every parameter")
+    distance = np.asarray(cKDTree(theta / scale).query(theta / scale, k=[neighbour + 1])[0])
+    if np.any(distance <= 0):
+        raise ParameterError("theta", "repeated samples", f"samples of which no {neighbour + 1} coincide")
+    log_ball = 0.5 * n_params * math.log(math.pi) - float(gammaln(0.5 * n_params + 1))
+    nats = float(digamma(n_samples)) - float(digamma(neighbour)) + log_ball + n_params * float(np.log(distance).mean())
+    return float(nats + np.log(scale).sum()) / math.log(2)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Lower bound on the mean number of readings, for search and refinement separately.
+
+    Attributes
+    ----------
+    search_bits, refinement_bits
+        Bits needed until the first reading on the shape, and from there to the target.
+    search_capacity_bits, capacity_bits
+        Capacity of one reading: before the shape is found, that of a yes or no with the largest possible probability of
+        yes; afterwards, that of the sensor.
+    """
+
+    search_bits: float
+    refinement_bits: float
+    search_capacity_bits: float
+    capacity_bits: float
+
+    @property
+    def readings_of_search(self) -> float:
+        """Number of readings until the shape is found."""
+        return self.search_bits / self.search_capacity_bits
+
+    @property
+    def readings_of_refinement(self) -> float:
+        """Number of readings from there until the target precision."""
+        return self.refinement_bits / self.capacity_bits
+
+    @property
+    def readings(self) -> float:
+        """Total number of readings."""
+        return self.readings_of_search + self.readings_of_refinement
+
+
+def fewest_readings(
+    prior_bits: float, met_bits: float, target_bits: float, *, most_covered: float, capacity: float
+) -> Bound:
+    """Bound the mean number of readings of any strategy.
+
+    Parameters
+    ----------
+    prior_bits, met_bits, target_bits
+        Differential entropy of the parameters: under the prior, at the first reading on the shape (on average), and at
+        the target (`target_entropy`), in descending order; else ParameterError.
+    most_covered
+        Probability that the best first place lies on the shape, above 0 and below 1, else ParameterError. A search
+        reading answers yes or no, with at most this probability of yes as long as no better place arises.
+    capacity
+        Capacity of the sensor, bits per reading (`capacity_bits`).
+    """
+    if not 0 < most_covered < 1:
+        raise ParameterError("most_covered", most_covered, "greater than 0, less than 1")
+    if not prior_bits >= met_bits >= target_bits:
+        raise ParameterError(
+            "(prior_bits, met_bits, target_bits)", (prior_bits, met_bits, target_bits), "in descending order"
+        )
+    yes = min(most_covered, 0.5)
+    chance = np.array([yes, 1.0 - yes])
+    return Bound(prior_bits - met_bits, met_bits - target_bits, float(entropy_bits(chance)), capacity)
+
+
+def target_entropy(n_params: int, sd: float) -> float:
+    """Return the largest differential entropy in bits of parameters with a given sd: that of independent Gaussians."""
+    return n_params * 0.5 * math.log2(2 * math.pi * math.e * sd**2)
+
+
+def capacity_bits(low: float, high: float, readout: Readout) -> float:
+    """Return the capacity of the sensor in bits per reading, for levels from `low` to `high`, in this order.
+
+    The capacity-achieving distribution of levels is found by the Blahut-Arimoto iteration (1972), until the bounds are
+    within 1e-4 bits. ParameterError unless `low` is below `high`.
+    """
+    if not low < high:
+        raise ParameterError("(low, high)", (low, high), "low < high")
+    levels = evenly_spaced_levels(low, high, readout.noise_sd / _PER_SD)
+    chance = readout.cell_probability(levels)
+    given = -entropy_bits(chance)
+    share: FloatArray = np.full(len(levels), 1.0 / len(levels))
+    lower = 0.0
+    for _ in range(_MOST_ROUNDS):
+        surprise = -np.log2(np.maximum(share @ chance, 1e-300))
+        divergence = given + chance @ surprise
+        lower, upper = float(share @ divergence), float(divergence.max())
+        if upper - lower < _CLOSE_BITS:
+            break
+        share = share * np.exp2(divergence - divergence.max())
+        share /= share.sum()
+    return lower

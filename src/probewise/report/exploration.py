@@ -28,7 +28,7 @@ from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
 from probewise.report.words import interval_text, number_text, probability_text, value_with_error, words_without_unit
 from probewise.scene import outlines, with_angles_near
-from probewise.scene.any_of import shape_and_columns
+from probewise.scene.shapes import shape_and_columns
 
 MODEL_NAMES = {"ssf": "SSF"}
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table

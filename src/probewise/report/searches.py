@@ -181,8 +181,7 @@ def fine_entropy_map(run: Exploration, number: int) -> UtilityMap:
     step, coarse = run.steps[number - 1], run.experiment.grid
     grid = Grid(coarse.width_mm, coarse.height_mm, _FINER * coarse.n_x - 1, _FINER * coarse.n_y - 1)
     within = _reachable_on_fine_grid(coarse, grid, step.map.reachable[: coarse.n_places])
-    model, noise_sd = run.experiment.model, run.experiment.noise_sd
-    return entropy_map(model, step.samples, grid, grid.plan("field"), reachable=within, noise_sd=noise_sd)
+    return entropy_map(run.experiment.model, step.samples, grid, grid.plan("field"), reachable=within)
 
 
 def _reachable_on_fine_grid(coarse: Grid, fine: Grid, reachable: BoolArray) -> BoolArray:

@@ -4,10 +4,6 @@ Paper, section "Robotic Arm Test Bed" (the circle's albedo, eq. 1 to 3) and sect
 Collection for SSF Estimation" (the patterns S_BW and S_a to S_d).
 """
 
-from probewise.scene.albedo import Region, Scene, Shape
-from probewise.scene.any_of import AnyOf
-from probewise.scene.cards import Card, CardedRegion, CardedScene
-from probewise.scene.patterns import region_of
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -15,16 +11,29 @@ from probewise.scene.regions import (
     PolygonRegion,
     QuadrantRegion,
     RampRegion,
+    Region,
     RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
     disc_region,
     edge_distance,
     outlines,
+    region_of,
 )
-from probewise.scene.scenes import HypothesisScene, KnownScene
-from probewise.scene.shapes import SHAPES, Circle, Ellipse, Field, PlacedPrior, Rectangle, RegularPolygon
-from probewise.scene.symmetry import mean_angles, with_angles_near
+from probewise.scene.scenes import Card, CardedRegion, CardedScene, HypothesisScene, KnownScene, Scene
+from probewise.scene.shapes import (
+    SHAPES,
+    AnyOf,
+    Circle,
+    Ellipse,
+    Field,
+    PlacedPrior,
+    Rectangle,
+    RegularPolygon,
+    Shape,
+    mean_angles,
+    with_angles_near,
+)
 
 __all__ = [
     "SHAPES",

@@ -1,24 +1,50 @@
-"""Shapes that may lie on the field: each a prior over named parameters and the region they define.
+"""Shapes that may lie on the field (paper, section "Robotic Arm Test Bed", eq. 1 to 3: a circle).
 
-A new shape is one short class: a frozen dataclass with `prior` and `region`.
+Each is a prior over named parameters and the region they define; `AnyOf` is the paper's set of shapes. A new shape is
+one short class: a frozen dataclass with `prior` and `region`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from probewise._arrays import FloatArray
-from probewise._kinds import checked_number, checked_pair, checked_whole, require_kind
+from probewise._arrays import FloatArray, IntArray
+from probewise._kinds import checked_number, checked_pair, checked_whole, require_kind, require_like
 from probewise.errors import ParameterError
 from probewise.priors import Prior, Product, Uniform, checked_columns
-from probewise.scene.albedo import Shape
-from probewise.scene.regions import EllipseRegion, PolygonRegion, disc_region
+from probewise.scene.regions import (
+    EllipseRegion,
+    PolygonRegion,
+    Region,
+    RegionsOfMixedKinds,
+    UniformRegion,
+    disc_region,
+)
+
+
+class Shape(Protocol):
+    """A hypothesis about what lies on the field: named parameters, their prior, and the region they define."""
+
+    @property
+    def prior(self) -> Prior:
+        """Prior of the shape's parameters, with their names."""
+        ...
+
+    def region(self, theta: FloatArray) -> Region:
+        """Build the regions of the hypotheses, one per row of theta (n_samples, n_params)."""
+        ...
+
+
+def require_shape(shape: object, name: str = "shape") -> None:
+    """Raise ParameterError unless `shape` has `prior` and `region`."""
+    require_like(name, shape, ("prior", "region"), "a shape such as Circle() or Rectangle(), of probewise.scene")
+
 
 Bounds = tuple[float, float]
 
@@ -317,3 +343,182 @@ SHAPES: Mapping[str, Callable[[Field], Shape]] = {
     "hexagon": lambda field: RegularPolygon(6, field),
 }
 """Shapes by name, as the command line offers them; each takes the field it lies on."""
+
+
+@dataclass(frozen=True)
+class _AnyOfPrior:
+    """Product-space prior: the shape's index, the shared centre, then the own parameters of every shape.
+
+    The parameters of the shapes not selected follow their own priors, so evidences and the
+    posterior probability of each shape are correct.
+    """
+
+    shapes: Mapping[str, Shape]
+    weights: tuple[float, ...]
+    shared: tuple[str, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        own = (f"{key}.{n}" for key, shape in self.shapes.items() for n in shape.prior.names if n not in self.shared)
+        return ("shape", *self.shared, *own)
+
+    @cached_property
+    def columns_by_shape(self) -> list[IntArray]:
+        """Column numbers of theta with the parameters of each shape, in the shape's order, an array per shape."""
+        return [
+            np.array([self.names.index(n if n in self.shared else f"{key}.{n}") for n in shape.prior.names], dtype=int)
+            for key, shape in self.shapes.items()
+        ]
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        u = checked_columns(u, self.names)
+        ends = np.concatenate([[0.0], np.cumsum(self.weights)])
+        theta = np.empty_like(u)
+        theta[:, 0] = np.interp(u[:, 0], ends, np.arange(len(ends)))
+        which = self.shape_index(theta)
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
+            values = shape.prior.from_unit_cube(u[:, columns])
+            # Every shape fills its own columns; the selected shape fills the shared ones.
+            own = columns > len(self.shared)
+            theta[:, columns[own]] = values[:, own]
+            taken = which == k
+            theta[np.ix_(taken, columns[~own])] = values[np.ix_(taken, ~own)]
+        return theta
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        ends = np.concatenate([[0.0], np.cumsum(self.weights)])
+        u = np.empty_like(theta)
+        u[:, 0] = np.interp(theta[:, 0], np.arange(len(ends)), ends)
+        which = self.shape_index(theta)
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
+            values = shape.prior.to_unit_cube(theta[:, columns])
+            own = columns > len(self.shared)
+            u[:, columns[own]] = values[:, own]
+            taken = which == k
+            u[np.ix_(taken, columns[~own])] = values[np.ix_(taken, ~own)]
+        return u
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        which = self.shape_index(theta)
+        inside = (theta[:, 0] >= 0) & (theta[:, 0] <= len(self.shapes))
+        total = np.where(inside, np.log(np.asarray(self.weights))[which], -np.inf)
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
+            values = theta[:, columns]
+            prior = shape.prior
+            taken = prior.log_prob(values)
+            idle = prior.own.log_prob(values[:, 2:]) if self.shared and isinstance(prior, PlacedPrior) else taken
+            total = total + np.where(which == k, taken, idle)
+        return total
+
+    def shape_index(self, theta: FloatArray) -> IntArray:
+        """Return the index of each hypothesis' shape, (n_samples,)."""
+        return np.clip(np.floor(theta[:, 0]), 0, len(self.shapes) - 1).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class AnyOf:
+    """One of several shapes, unknown which and where (the paper's "set of shapes").
+
+    Parameters: `shape`, whose floor is the index of the shape (continuous, so that a sampler can treat
+    it like any other: uniform over [k, k + 1) for shape k, which has prior probability `weights[k]`);
+    x_mm, y_mm of the centre, shared where every shape has a `PlacedPrior` prior; then each shape's own
+    parameters, as "rectangle.width_mm".
+
+    `weights` are relative prior probabilities, one per shape, normalised on construction; by default equal.
+    ParameterError if there is no shape, or the weights are not one positive number per shape.
+    """
+
+    shapes: Mapping[str, Shape]
+    weights: tuple[float, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        require_kind("shapes", self.shapes, Mapping, "shapes by name: {'circle': Circle(), 'rectangle': Rectangle()}")
+        for name, shape in self.shapes.items():
+            require_shape(shape, f"shapes[{name!r}]")
+        if not self.shapes:
+            raise ParameterError("shapes", dict(self.shapes), "one shape or more, by name")
+        weights = tuple(self.weights) or (1.0,) * len(self.shapes)
+        if len(weights) != len(self.shapes) or not all(0 < w < math.inf for w in weights):
+            raise ParameterError("weights", self.weights, f"{len(self.shapes)} numbers greater than 0")
+        object.__setattr__(self, "weights", tuple(w / sum(weights) for w in weights))
+
+    @cached_property
+    def prior(self) -> _AnyOfPrior:
+        """Prior of index, centre, and the parameters of every shape."""
+        placed = all(isinstance(shape.prior, PlacedPrior) for shape in self.shapes.values())
+        return _AnyOfPrior(self.shapes, self.weights, ("x_mm", "y_mm") if placed else ())
+
+    @property
+    def shape_names(self) -> tuple[str, ...]:
+        """Names of the shapes, by index."""
+        return tuple(self.shapes)
+
+    def shape_index(self, theta: FloatArray) -> IntArray:
+        """Return the index of each hypothesis' shape, (n_samples,)."""
+        return self.prior.shape_index(theta)
+
+    def region(self, theta: FloatArray) -> RegionsOfMixedKinds:
+        """Build the regions of the hypotheses, each of its own shape."""
+        which = self.shape_index(theta)
+        parts: list[Region] = []
+        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.prior.columns_by_shape, strict=True)):
+            rows = np.flatnonzero(which == k)
+            # An empty field stands in for a shape that no hypothesis selects.
+            parts.append(shape.region(theta[np.ix_(rows, columns)]) if rows.size else UniformRegion(np.zeros(1)))
+        return RegionsOfMixedKinds(which, tuple(parts))
+
+
+def shape_and_columns(shape: Shape, name: str) -> tuple[Shape, IntArray]:
+    """Return a set's shape of this name and its column numbers of theta; for a single shape, itself and all columns."""
+    if isinstance(shape, AnyOf):
+        return shape.shapes[name], shape.prior.columns_by_shape[shape.shape_names.index(name)]
+    return shape, np.arange(len(shape.prior.names))
+
+
+def mean_angles(shape: Shape, theta: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the circular mean of each angle of a shape, modulo its symmetry, (n_params,); NaN for other parameters.
+
+    `theta` (n_samples, n_params) are weighted samples, `weight` (n_samples,). For a set of shapes, each angle's mean is
+    taken over the samples of its own shape.
+    """
+    out = np.full(theta.shape[1], np.nan)
+    for rows, columns, turn in _rows_columns_and_turns(shape, theta):
+        phase = np.exp(2j * math.pi * theta[rows, columns[turn.angle]] / turn.by_rad)
+        out[columns[turn.angle]] = float(np.angle(weight[rows] @ phase)) % (2 * math.pi) * turn.by_rad / (2 * math.pi)
+    return out
+
+
+def with_angles_near(shape: Shape, theta: FloatArray, angles_rad: FloatArray) -> FloatArray:
+    """Return samples of the same shapes, (n_samples, n_params), each angle within half a symmetry turn of a given one.
+
+    `angles_rad` is (n_params,); NaN leaves a column as it is. Sides are swapped where the symmetry says so. Mean and sd
+    of the result are meaningful, while angles of 0.01 and pi - 0.01 may be of nearly the same ellipse.
+    """
+    out = theta
+    for rows, columns, turn in _rows_columns_and_turns(shape, theta):
+        near = angles_rad[columns[turn.angle]]
+        turns = np.round((theta[rows, columns[turn.angle]] - near) / turn.by_rad) if np.isfinite(near) else np.zeros(1)
+        if not turns.any():
+            continue
+        out = theta.copy() if out is theta else out
+        out[rows, columns[turn.angle]] -= turns * turn.by_rad
+        if turn.swapped is not None:
+            odd = rows[turns % 2 == 1]
+            sides = columns[list(turn.swapped)]
+            out[np.ix_(odd, sides)] = out[np.ix_(odd, sides[::-1])]
+    return out
+
+
+def _rows_columns_and_turns(shape: Shape, theta: FloatArray) -> list[tuple[IntArray, IntArray, SymmetryTurn]]:
+    """List (row numbers, column numbers, symmetry) of each shape among the samples that has an angle."""
+    if isinstance(shape, AnyOf):
+        which = shape.shape_index(theta)
+        parts = zip(shape.shapes.values(), shape.prior.columns_by_shape, strict=True)
+        found = [(np.flatnonzero(which == k), columns, part) for k, (part, columns) in enumerate(parts)]
+    else:
+        found = [(np.arange(len(theta)), np.arange(theta.shape[1]), shape)]
+    return [
+        (rows, columns, part.symmetry_turn)
+        for rows, columns, part in found
+        if rows.size and isinstance(part, HasSymmetryTurn)
+    ]

@@ -14,8 +14,8 @@ from probewise._kinds import checked_number, require_like
 from probewise.errors import ParameterError
 from probewise.recordings.columns import how_to_describe_pattern
 from probewise.recordings.plan import Plan
-from probewise.scene.albedo import Region, Scene
-from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
+from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, Region, UniformRegion
+from probewise.scene.scenes import Scene
 from probewise.sensor.commanded import (
     footprint_at_commanded_height,
     has_commanded_height_or_led,

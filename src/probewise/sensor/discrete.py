@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ShapeError
-from probewise.scene.albedo import Region
+from probewise.scene.regions import Region
 from probewise.sensor.ssf import SSFField
 from probewise.sensor.stages import Poses
 

@@ -18,8 +18,6 @@ from scipy.special import ndtr, owens_t
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, SlowWarning
-from probewise.scene.albedo import Region
-from probewise.scene.cards import CardedRegion, mean_albedo_with_cards
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -27,10 +25,12 @@ from probewise.scene.regions import (
     PolygonRegion,
     QuadrantRegion,
     RampRegion,
+    Region,
     RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
 )
+from probewise.scene.scenes import CardedRegion, mean_albedo_with_cards
 from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_of_cells_in_place
 
 ACCURATE_NODES = 64

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
-from probewise.scene.albedo import Scene
+from probewise.scene.scenes import Scene
 from probewise.sensor.chain import Levels, region_named, require_levels, require_scene
 from probewise.sensor.stages import require_theta_columns
 

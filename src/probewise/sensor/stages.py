@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray
 from probewise.errors import ShapeError
 from probewise.priors import Prior
 from probewise.recordings.plan import Plan
-from probewise.scene.albedo import Region
+from probewise.scene.regions import Region
 
 
 class Stage(IntEnum):

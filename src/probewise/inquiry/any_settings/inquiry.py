@@ -15,7 +15,7 @@ from probewise.inquiry.any_settings.acquisition import Predictive
 from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
 from probewise.inquiry.any_settings.posterior import InstrumentModel, ReadingsProblem, prior_samples, updated_posterior
 from probewise.inquiry.any_settings.settings import Settings
-from probewise.inquiry.choice import choose
+from probewise.inquiry.entropy import choose
 from probewise.nested import Weighted, make_problem
 from probewise.nested.problem import AnyPrior
 from probewise.nested.weights import resampled_rows

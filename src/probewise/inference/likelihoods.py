@@ -1,8 +1,11 @@
-"""The paper's Student-t likelihood of readings with unknown noise sd, made proper.
+"""Likelihoods of readings (paper, sections "The Naive Likelihood" and "SSF Likelihood", eq. studentT and product).
 
-The paper integrates a Gaussian over its unknown sd, sigma, and keeps [sum of squares]^(-(N-1)/2). With an unbounded
-prior of sigma this diverges where a hypothesis fits the few readings of a small data set exactly, and is flat after one
-reading. So here sigma's prior is 1/sigma between a floor and a ceiling, and all constants are kept.
+`Naive` is the paper's sensor of two levels. The paper prints (2 pi sigma)^(-1/2) and a positive exponent; a normal
+density has (2 pi sigma^2)^(-1/2) and a negative one.
+
+`StudentT` integrates a Gaussian over its unknown sd, sigma. The paper keeps [sum of squares]^(-(N-1)/2), which with an
+unbounded prior of sigma diverges where a hypothesis fits the few readings of a small data set exactly, and is flat
+after one reading. So here sigma's prior is 1/sigma between a floor and a ceiling, and all constants are kept.
 """
 
 from __future__ import annotations
@@ -15,9 +18,118 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import gammainc, gammaincc, gammaln
 
-from probewise._arrays import FloatArray, IntArray, frozen_int
+from probewise._arrays import FloatArray, IntArray, floats, frozen_int, read_only_floats
+from probewise._kinds import checked_number
+from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import ParameterError, ShapeError
-from probewise.inference._residuals import residuals
+
+
+def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Return readings, (n_points,), minus predictions, (n_samples, n_points): (n_samples, n_points).
+
+    ShapeError if the shapes do not match.
+    """
+    readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
+    if readings.ndim != 1 or predicted.ndim != 2 or predicted.shape[1] != readings.size:
+        raise ShapeError(
+            f"readings have shape {readings.shape}, predictions {predicted.shape}; "
+            "allowed: (n_points,) and (n_samples, n_points)"
+        )
+    return readings - predicted
+
+
+@dataclass(frozen=True)
+class Naive:
+    """Likelihood of a sensor with two levels, each with Gaussian noise of its own sd (paper, "The Naive Likelihood").
+
+    Parameters
+    ----------
+    mu_black, sd_black, mu_white, sd_white
+        Mean and sd of readings over black and over white, in units of the reading; the means differ, else
+        ParameterError.
+    """
+
+    mu_black: float
+    sd_black: float
+    mu_white: float
+    sd_white: float
+
+    def __post_init__(self) -> None:
+        for name in ("mu_black", "sd_black", "mu_white", "sd_white"):
+            checked_number(name, getattr(self, name))
+        for name in ("sd_black", "sd_white"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ParameterError(name, getattr(self, name), "greater than 0, finite")
+        if not (math.isfinite(self.mu_black) and math.isfinite(self.mu_white)) or self.mu_black == self.mu_white:
+            raise ParameterError("(mu_black, mu_white)", (self.mu_black, self.mu_white), "finite and different")
+
+    @classmethod
+    def estimated(cls, black: ArrayLike, white: ArrayLike, *, sd_floor: float) -> Naive:
+        """Build from readings over known black and known white, two or more of each: their means and sds.
+
+        `sd_floor`, for instance `step / sqrt(12)`, is the least sd, for readings that are all equal. ParameterError if
+        readings are too few or not finite.
+        """
+        values: list[float] = []
+        for name, readings in (("black", black), ("white", white)):
+            array = np.asarray(readings, dtype=np.float64).ravel()
+            if array.size < 2 or not np.isfinite(array).all():
+                raise ParameterError(name, array.tolist(), "two or more finite readings")
+            values += [float(array.mean()), max(float(array.std(ddof=1)), sd_floor)]
+        return cls(*values)
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
+
+        A prediction counts as white where it is nearer to `mu_white` than to `mu_black`.
+        """
+        readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
+        residuals(readings, predicted)
+        middle, sign = 0.5 * (self.mu_black + self.mu_white), 1.0 if self.mu_white > self.mu_black else -1.0
+        black = log_gaussian_density(readings, self.mu_black, self.sd_black)
+        white = log_gaussian_density(readings, self.mu_white, self.sd_white)
+        over_white = (predicted - middle) * sign > 0
+        return np.asarray(over_white @ (white - black) + black.sum())
+
+
+_LOG_2PI = math.log(2 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianKnown:
+    """Likelihood of independent Gaussian noise of known sd.
+
+    Parameters
+    ----------
+    sd
+        In units of the reading: a number, or one for each reading, (n_points,); ParameterError if not above 0.
+    """
+
+    sd: ArrayLike
+
+    def __post_init__(self) -> None:
+        sd = read_only_floats(self.sd, "sd")
+        if sd.ndim > 1:
+            raise ShapeError(f"sd has shape {sd.shape}; allowed: a number or (n_points,)")
+        if not ((sd > 0) & np.isfinite(sd)).all():
+            raise ParameterError("sd", sd.tolist(), "greater than 0, finite")
+        object.__setattr__(self, "sd", sd)
+
+    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return the log likelihood of readings, (n_points,), given predictions, (n_samples, n_points): (n_samples,).
+
+        All constants are included.
+        """
+        readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
+        sd = np.asarray(self.sd)
+        if sd.ndim == 1 and sd.size != readings.size:
+            raise ShapeError(
+                f"sd has {sd.size} values for {readings.size} readings; allowed: one per reading, or one number"
+            )
+        z = residuals(readings, predicted) / sd
+        constant = 0.5 * readings.size * _LOG_2PI + float(np.broadcast_to(np.log(sd), readings.shape).sum())
+        return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - constant)
+
 
 _LOG_2PI = math.log(2 * math.pi)
 _TINY = 1e-250

@@ -7,26 +7,43 @@ needed only in the ring about each edge, at a few hundred of many thousand place
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Known
 from probewise.effects.optics import EdgeBlur, Halo
 from probewise.errors import ParameterError
-from probewise.inquiry.grid import Grid
-from probewise.inquiry.scanlines import ROWS, Interval, PlacesNearEdges, ScanlineIntervals, to_single_precision
+from probewise.inquiry.forecast import (
+    MOST_LEVELS,
+    CardedForecast,
+    CardedModel,
+    DirectForecast,
+    Forecast,
+    PredictiveDistributions,
+    cards_of,
+    predict_where_visible,
+    rows_by_combination,
+)
+from probewise.inquiry.grid import Designs, Grid
+from probewise.inquiry.readout import evenly_spaced_levels
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
+from probewise.scene.scenes import mean_albedo_with_cards
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
 from probewise.sensor.commanded import led_state
-from probewise.sensor.stages import AnyEffect, SensorModel, require_theta_columns
+from probewise.sensor.stages import AnyEffect, SensorModel, Stage, View, require_theta_columns
 
 NAMES = ("x_mm", "y_mm", "radius_mm")
 
+_ROWS = 3  # of a grid per batch, to fit the cache
+_PER_SD = 2.0  # levels per noise sd: rounding adds 2 % to its variance, which thousands of hypotheses average out
+_N_ASKED = 200  # hypotheses of other shapes, without effects: with twice as many a map is no better and takes longer
 _COARSE_MM = 0.5  # spacing of distances at which the model is evaluated, for a cubic spline
 _FINE_MM = 0.125  # spacing of entries
 _PROBE_MM = 80.0  # largest distance from the edge that is evaluated
@@ -159,24 +176,43 @@ class DiscTable:
         weights' sum. `levels`: evenly spaced, (n_levels,), from the darkest to the brightest; a prediction counts for
         the nearest. `turn_rad`: orientation of the sensor at each place, (n_places,).
         """
-        n_levels = len(levels)
+        n_levels, n_x = len(levels), grid.n_x
         per_level = 1.0 / (levels[1] - levels[0])
         dark, bright = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64).tolist()
         nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int16)
         margin = self._distance_to_constant_level_mm(nearest, (dark, bright))
-        discs = to_single_precision(theta)
+        x, y, radius = _in_single_precision(theta).T
         mass = np.empty((grid.n_places, n_levels))
-        turn = turn_rad.reshape(grid.n_y, grid.n_x)
-        for start in range(0, grid.n_y, ROWS):
-            y_mm = to_single_precision(grid.y_mm[start : start + ROWS])
-            intervals = _intervals_of_discs(discs, grid, y_mm, margin)
-            ring = intervals.places_near_edges()
-            level: IntArray = np.full(len(ring.place), bright)  # a place exactly on the edge is inside
+        turn = turn_rad.reshape(grid.n_y, n_x)
+        for start in range(0, grid.n_y, _ROWS):
+            y_mm = _in_single_precision(grid.y_mm[start : start + _ROWS])
+            every_up = y_mm[:, None] - y
+            row, disc = np.nonzero(np.abs(every_up) <= radius + np.float32(margin))
+            middle, up, size, own = x[disc], every_up[row, disc], radius[disc], weight[disc]
+            first, last = _columns_within(grid, middle, up, size + np.float32(margin))
+            inner_first, inner_last = _columns_within(grid, middle, up, np.maximum(size - np.float32(margin), 0.0))
+            none = np.flatnonzero(inner_first > inner_last)
+            inner_first[none], inner_last[none] = last[none] + 1, last[none]
+            crossing, column = _columns_near_edges(first, last, inner_first, inner_last)
+            place = column + _in_int32(row * n_x)[crossing]
+            level: IntArray = np.full(len(place), bright)  # a place exactly on the edge is inside
             if margin > 0.0:
-                away = _DiscPlacePairs.of(discs, intervals, ring, y_mm, turn[start : start + ROWS].ravel())
-                level = nearest.reshape(-1)[self._nearest_entry_index(away)]
-            rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
-            mass[rows] = intervals.level_histogram(weight, ring, level, (dark, bright), n_levels)
+                away_x = _in_single_precision(column)
+                away_x *= np.float32(grid.width_mm / (n_x - 1))
+                away_x -= middle[crossing]
+                turn_there = turn[start : start + _ROWS].ravel()
+                entry = self._nearest_entry_index(away_x, up[crossing], size[crossing], turn_there, place)
+                level = nearest.reshape(-1)[entry]
+            n_places, width = len(y_mm) * n_x, n_x + 1
+            near = np.bincount(place * n_levels + level, own[crossing], n_places * n_levels)
+            part = near.reshape(n_places, n_levels).astype(np.float64, copy=False)  # integers if there are no pairs
+            begins = np.bincount(row * width + inner_first, own, minlength=len(y_mm) * width)
+            ends = np.bincount(row * width + inner_last + 1, own, minlength=len(y_mm) * width)
+            inside = np.cumsum((begins - ends).reshape(len(y_mm), width), axis=1)[:, :-1].ravel()
+            outside = weight.sum() - inside - part.sum(axis=1)
+            part[:, bright] += inside
+            part[:, dark] += outside
+            mass[start * n_x : start * n_x + n_places] = part
         return mass
 
     def _distance_to_constant_level_mm(self, nearest: IntArray, ends: tuple[int, int]) -> float:
@@ -190,16 +226,25 @@ class DiscTable:
         off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
         return float(np.abs(distance[off]).max(initial=0.0))
 
-    def _nearest_entry_index(self, away: _DiscPlacePairs) -> IntArray:
-        """Return the index, in the flattened table, of the nearest entry for pairs of disc and place, (n_pairs,)."""
+    def _nearest_entry_index(
+        self, x: FloatArray, y: FloatArray, radius: FloatArray, turn_rad: FloatArray, place: IntArray
+    ) -> IntArray:
+        """Return the index, in the flattened table, of the nearest entry for pairs of disc and place, (n_pairs,).
+
+        `x`, `y`: the place relative to the disc's centre; `turn_rad`: orientation of the sensor at each place.
+        """
         _, n_directions, n_distances = self.levels.shape
-        step = away.distance_mm + np.float32(self.margin_mm)
+        step = np.sqrt(x * x + y * y) - radius
+        if turn_rad.any():
+            cosine, sine = (_in_single_precision(f(turn_rad))[place] for f in (np.cos, np.sin))
+            x, y = cosine * x + sine * y, cosine * y - sine * x
+        step += np.float32(self.margin_mm)
         step *= self._entries_per_mm
         step += 0.5
-        turn = _pseudo_angle(away.x_mm, away.y_mm)
+        turn = _pseudo_angle(x, y)
         turn *= (n_directions - 1) / 4.0
         turn += 0.5
-        bend = (1.0 / away.radius_mm - self.bend_per_mm[0]) * self._entries_per_curvature + 0.5
+        bend = (1.0 / radius - self.bend_per_mm[0]) * self._entries_per_curvature + 0.5
         entry = bend.astype(np.int32) * n_directions
         entry += turn.astype(np.int32)
         entry *= n_distances
@@ -221,56 +266,41 @@ def is_known_footprint_effect(effect: AnyEffect) -> bool:
     return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
 
 
-def _intervals_of_discs(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> ScanlineIntervals:
-    """Return the intervals in which discs, (n_samples, 3), cross rows of a grid, (n_rows,), in single precision."""
-    x, y, radius = discs.T
-    every_up = y_mm[:, None] - y
-    row, hypothesis = np.nonzero(np.abs(every_up) <= radius + np.float32(margin_mm))
-    x, radius, up = x[hypothesis], radius[hypothesis], every_up[row, hypothesis]
+def _columns_within(grid: Grid, middle: FloatArray, up: FloatArray, reach: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return the first and the last column within a distance of discs' centres; none if the first is the last + 1.
 
-    def interval_within(reach: FloatArray) -> Interval:
-        half = np.sqrt(np.maximum(reach * reach - up * up, 0.0))
-        return np.where(np.abs(up) < reach, x - half, np.inf), x + half
-
-    outer = radius + np.float32(margin_mm)
-    inner = np.maximum(radius - np.float32(margin_mm), 0.0)
-    return ScanlineIntervals.from_interval_ends(
-        grid, len(y_mm), row, hypothesis, interval_within(outer), interval_within(inner)
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _DiscPlacePairs:
-    """Pairs of a disc and a place near its edge, (n_pairs,) each.
-
-    `x_mm`, `y_mm`: the place relative to the disc's centre, in the sensor's frame. `radius_mm`: the disc's.
-    `distance_mm`: from the edge, positive outside.
+    `up`: height of a row above each centre. In single precision, which resolves a ten-thousandth of a millimetre.
     """
+    per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
+    half = np.sqrt(np.maximum(reach * reach - up * up, 0.0))
+    low, high = np.where(np.abs(up) < reach, middle - half, np.inf), middle + half
+    last = _in_int32(np.floor(np.clip(high * per_mm, -1.0, grid.n_x - 1.0)))
+    return np.minimum(_in_int32(np.ceil(np.clip(low * per_mm, 0.0, grid.n_x))), last + 1), last
 
-    x_mm: FloatArray
-    y_mm: FloatArray
-    radius_mm: FloatArray
-    distance_mm: FloatArray
 
-    @classmethod
-    def of(
-        cls,
-        discs: FloatArray,
-        intervals: ScanlineIntervals,
-        ring: PlacesNearEdges,
-        y_mm: FloatArray,
-        turn_rad: FloatArray,
-    ) -> Self:
-        own = discs[intervals.hypothesis]
-        up, radius = (y_mm[intervals.row] - own[:, 1])[ring.interval], own[:, 2][ring.interval]
-        x = to_single_precision(ring.column)
-        x *= np.float32(intervals.grid.width_mm / (intervals.grid.n_x - 1))
-        x -= own[:, 0][ring.interval]
-        distance = np.sqrt(x * x + up * up) - radius
-        if turn_rad.any():
-            cosine, sine = (to_single_precision(f(turn_rad))[ring.place] for f in (np.cos, np.sin))
-            return cls(cosine * x + sine * up, cosine * up - sine * x, radius, distance)
-        return cls(x, up, radius, distance)
+def _columns_near_edges(
+    first: IntArray, last: IntArray, inner_first: IntArray, inner_last: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Pair crossings of a disc and a row with the columns in the ring: left of the interior, then right of it."""
+    n = len(first)
+    count = np.concatenate([inner_first - first, last - inner_last])
+    begin = np.concatenate([first, inner_last + 1])
+    # Repeating is the slow step: it is done once, and everything else is indexed.
+    crossing = np.repeat(np.arange(2 * n), count)
+    column = _in_int32(begin - np.cumsum(count) + count)[crossing]
+    column += _in_int32(np.arange(len(crossing)))
+    crossing[int(count[:n].sum()) :] -= n
+    return crossing, column
+
+
+def _in_single_precision(values: NDArray[Any]) -> FloatArray:
+    """Round to single precision, which the type checker does not distinguish from double."""
+    return cast(FloatArray, np.asarray(values, dtype=np.float32))
+
+
+def _in_int32(values: NDArray[Any]) -> IntArray:
+    """Truncate to 32-bit integers, which the type checker does not distinguish from 64-bit ones."""
+    return cast(IntArray, values.astype(np.int32))
 
 
 def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -337,3 +367,100 @@ def _distance_to_constant_reading_mm(
         off = np.abs(asked - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
         margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
     return margin
+
+
+@dataclass(frozen=True, eq=False)
+class DiscForecast:
+    """A forecast for discs, by the table of the sensor's response."""
+
+    model: SensorModel
+    table: DiscTable
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points); see `predict_where_visible`."""
+        return predict_where_visible(self.model, theta, plan)
+
+    def predictive(
+        self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
+    ) -> PredictiveDistributions:
+        """Return the predictive distribution at `rows`, of all hypotheses by the table; see `Forecast.predictive`."""
+        table, grid = self.table, designs.grid
+        levels = evenly_spaced_levels(table.dark, table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
+        turns_rad = plan.orientation_rad.reshape(-1, grid.n_places)
+
+        def level_weights(weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+            some = weight > 0
+            stood, mass = None, np.empty(0)
+            for number, at, places in rows_by_combination(rows, grid.n_places):
+                turn = turns_rad[number]
+                if stood is None or not np.array_equal(stood, turn):  # combinations of one orientation share the work
+                    stood, mass = turn, table.level_histogram(theta[some], weight[some], grid, levels, turn)
+                yield at, mass if len(places) == len(mass) else mass[places]
+
+        return PredictiveDistributions(levels, level_weights)
+
+
+@dataclass(frozen=True, eq=False)
+class TabulatedChain:
+    """A chain over one disc that takes the seen white fraction from a table, and applies the other effects unchanged.
+
+    No effect may change the disc itself, and effects on the footprint must be those of the table. `cards`: the model
+    with known cards, if there are any.
+    """
+
+    chain: Chain
+    table: DiscTable
+    cards: CardedModel | None = None
+
+    @classmethod
+    def of(cls, chain: Chain, plain: SensorModel) -> Self | None:
+        """Make `chain` a chain over the table of `plain`, the same chain with fewer effects; None if impossible."""
+        if isinstance(plain, TabulatedChain):
+            plain = plain.table if plain.cards is None else plain.cards
+        cards = plain if isinstance(plain, CardedModel) else None
+        table = plain if cards is None else cards.plain
+        if not isinstance(table, DiscTable) or chain.names[:3] != table.names:
+            return None
+        seen = (effect for effect in chain.effects if effect.stage in (Stage.SCENE, Stage.FOOTPRINT))
+        if not all(map(is_known_footprint_effect, seen)):
+            return None
+        return cls(chain, table, cards)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the chain's parameters."""
+        return self.chain.names
+
+    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points), by the table and the effects."""
+        poses, disc, table = self.chain.poses(theta, plan), theta[:, :3], self.table
+        level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
+        seen = (level - table.dark) / (table.bright - table.dark)
+        if self.cards is not None:
+            seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.footprint_share_by_card(poses, plan))
+        return self.chain.readings_from_simulated_view(
+            View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan
+        )
+
+
+def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast:
+    """Choose the forecast for a model: by a table of discs if possible, else direct predictions.
+
+    `highest` is the largest height of the sensor over that of its calibration; None: always the calibrated height.
+    """
+    chain = model if isinstance(model, Chain) else None
+    if cards_of(model):
+        if chain is not None and not chain.effects and highest is None:
+            base = forecast_of(replace(chain, scene=HypothesisScene(chain.scene.shape)))  # type: ignore[attr-defined]
+            if isinstance(base, DiscForecast):
+                return CardedForecast(base, chain)
+        return DirectForecast(model)
+    table = DiscTable.of(model) if highest is None else None
+    if table is not None:
+        return DiscForecast(table if table.margin_mm else model, table)
+    if highest is None and chain is not None and chain.effects:
+        plain = DiscTable.of(replace(chain, effects=tuple(filter(is_known_footprint_effect, chain.effects))))
+        return DirectForecast((plain and TabulatedChain.of(chain, plain)) or model)
+    if chain is None or chain.effects:
+        return DirectForecast(model)
+    return DirectForecast(model, _N_ASKED, _PER_SD)

@@ -1,9 +1,9 @@
-"""The readings that may be taken: places, orientations, repeats, other settings, and what they cost."""
+"""The readings that may be taken: places of a grid, orientations, repeats, other settings, and what they cost."""
 
 import numpy as np
 import pytest
 
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, ShapeError
 from probewise.inquiry import Design, Designs, Grid
 
 SMALL = Grid(2.0, 1.0, 3, 2)
@@ -48,3 +48,28 @@ def test_repeats_cost_their_reading_time():
 def test_designs_that_are_none_are_refused(change, name):
     with pytest.raises(ParameterError, match=name):
         Designs(SMALL, **change)
+
+
+def test_the_grid_is_the_papers_field_row_by_row():
+    grid = Grid()
+    assert grid.n_places == 131 * 65
+    np.testing.assert_allclose(grid.x_mm, np.linspace(0, 1048, 131))
+    np.testing.assert_allclose(grid.y_mm, np.linspace(0, 520, 65))
+    assert grid.image(grid.places_mm[:, 0])[3, 7] == pytest.approx(grid.x_mm[7])
+    assert grid.image(grid.places_mm[:, 1])[3, 7] == pytest.approx(grid.y_mm[3])
+
+
+def test_the_places_of_a_plan_are_alternatives_without_a_direction():
+    """A lag or a backlash must not carry from one possible reading to the next."""
+    assert (Grid(n_x=3, n_y=3).plan("field").direction_of_motion == 0).all()
+
+
+@pytest.mark.parametrize("change", [{"width_mm": 0.0}, {"n_x": 1}, {"height_mm": float("nan")}])
+def test_a_grid_without_extent_is_refused(change):
+    with pytest.raises(ParameterError):
+        Grid(**change)
+
+
+def test_values_of_another_grid_are_refused():
+    with pytest.raises(ShapeError):
+        Grid().image(np.zeros(5))

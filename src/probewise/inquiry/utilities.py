@@ -1,0 +1,553 @@
+"""Utilities (acquisition functions) of readings: information, about all or some parameters, or to end a run.
+
+A `Utility` gives each available design a number from the whole posterior, the designs and the sensor (`UtilityInput`).
+`ReadingEntropy` is the paper's, of few hypotheses; `InformationGain` subtracts the entropy of the noise (Lindley 1956).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray, require_finite
+from probewise.errors import ParameterError, ShapeError, did_you_mean
+from probewise.inquiry.entropy import UtilityMap, choose, label_entropy, map_of_rows
+from probewise.inquiry.forecast import (
+    MOST_LEVELS,
+    Forecast,
+    PredictiveDistributions,
+    nearest_level_index,
+    resampled_rows_and_weights,
+    weight_by_level,
+)
+from probewise.inquiry.grid import Designs
+from probewise.inquiry.readout import Readout, entropy_bits, evenly_spaced_levels
+from probewise.recordings.plan import Plan
+
+_CELL = 0.75  # width of a cell in noise sds, for unrounded readings: loses 2 % of a nat, uniformly
+_SETTLED = 1.0 - 1e-7  # weight of one level from which it counts as certain
+_BLOCK = 512  # designs per batch, to fit the cache
+_PER_SD = 2.0  # levels of the predicted reading per noise sd, given a reading
+_LEAST = 1e-12
+_NEAR = 15.0  # times the target sd: beyond it, no single reading ends a run
+_MOST_ASKED = 800  # hypotheses for the probability of ending a run
+_MOST_DESIGNS = 250  # the best by the other utility
+_OUTCOMES = 16  # simulated outcomes of the readings of a batch chosen so far
+_FEW = 600  # hypotheses used to simulate them
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The stopping rule of a run: the posterior sds of the columns `columns` of theta are all below `sd`."""
+
+    columns: tuple[int, ...]
+    sd: float
+
+
+@dataclass(frozen=True, eq=False)
+class UtilityInput:
+    """Posterior, designs and sensor, with the quantities that utilities need; ShapeError if the arrays do not match.
+
+    Attributes
+    ----------
+    forecast
+        Predictions, with the sensor model.
+    readout
+        Noise, rounding and range of a reading.
+    theta, weight
+        The whole posterior, (n_samples, n_params), and its weights, (n_samples,), summing to one.
+    drawn
+        A few equally weighted posterior samples, (n_drawn, n_params); 50 in the paper.
+    designs, plan
+        The designs, and the same as rows of a plan.
+    rows
+        Indices of the available designs, (n,); all results are for these, in this order.
+    cost_s
+        Seconds that each available design takes, (n,).
+    goal
+        The stopping rule, if it is one of sds; else None.
+    """
+
+    forecast: Forecast
+    readout: Readout
+    theta: FloatArray
+    weight: FloatArray
+    drawn: FloatArray
+    designs: Designs
+    plan: Plan
+    rows: IntArray
+    cost_s: FloatArray
+    goal: Goal | None = None
+
+    def __post_init__(self) -> None:
+        if self.theta.ndim != 2 or self.weight.shape != (len(self.theta),) or 0 in self.theta.shape:
+            raise ShapeError(
+                f"theta has shape {self.theta.shape}, weight {self.weight.shape}; "
+                "allowed: (n_samples, n_params), (n_samples,)"
+            )
+        if len(self.plan) != len(self.designs) or self.cost_s.shape != self.rows.shape:
+            raise ShapeError(
+                f"{len(self.designs)} designs, {len(self.plan)} rows of a plan, {self.cost_s.size} costs of "
+                f"{self.rows.size}; allowed: as many rows as designs, a cost for each that can be taken"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, one per column of theta."""
+        return self.forecast.model.names
+
+    @cached_property
+    def predicted(self) -> FloatArray:
+        """Noise-free readings of the drawn samples at every available design, (n_drawn, n)."""
+        answers = self.forecast.predict(self.drawn, self.plan.take(self.rows))
+        require_finite("predicted", answers)
+        return answers
+
+    @cached_property
+    def predictive(self) -> PredictiveDistributions:
+        """Predictive distribution under the whole posterior, as weights of levels."""
+        noise_sd = self.readout.noise_sd / np.sqrt(max(self.designs.repeats))
+        return self.forecast.predictive(self.theta, self.weight, self.designs, self.plan, self.rows, noise_sd)
+
+    def information(self, weight: FloatArray) -> FloatArray:
+        """Return the expected information in bits of a reading at every available design, for weights (n_samples,)."""
+        out = np.empty(len(self.rows))
+        for at, mass in self.predictive.level_weights(weight):
+            chance = self._cell_probability(at)
+            out[at] = np.maximum(_entropy_of_readings(mass, chance) - _entropy_of_noise(mass, chance), 0.0)
+        return out
+
+    def reading_entropy(self, weight: FloatArray) -> FloatArray:
+        """Return the entropy in bits of the reading at every available design, including noise, rounding and range.
+
+        The weights, (n_samples,), need not sum to one, and may be 0 for some hypotheses.
+        """
+        out = np.empty(len(self.rows))
+        for at, mass in self.predictive.level_weights(weight):
+            out[at] = _entropy_of_readings(mass, self._cell_probability(at))
+        return out
+
+    def _cell_probability(self, at: IntArray) -> FloatArray:
+        """Return the probability of each cell given each level, (n_levels, n_cells), at designs of equal repeats."""
+        n = int(self.designs.n_repeats[self.rows[at[0]]])
+        chance = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
+        return np.asarray(chance.astype(np.float32))
+
+
+def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
+    """Return the entropy in bits of the reading's cell, for unnormalised weights of levels (n, n_levels): (n,)."""
+    level = mass.argmax(axis=1)
+    settled = mass[np.arange(len(mass)), level] >= _SETTLED * mass.sum(axis=1)
+    out = np.asarray(entropy_bits(chance)[level], dtype=np.float64)
+    rest = np.flatnonzero(~settled)
+    for start in range(0, len(rest), _BLOCK):
+        block = rest[start : start + _BLOCK]
+        part = mass[block].astype(np.float32)
+        part /= part.sum(axis=1, keepdims=True)
+        out[block] = entropy_bits(part @ chance)
+    return out
+
+
+def _entropy_of_noise(mass: FloatArray, chance: FloatArray) -> FloatArray:
+    """Return the mean entropy in bits of a reading given its level, for unnormalised weights (n, n_levels): (n,)."""
+    return np.asarray(mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1))
+
+
+class WeightsGivenReading:
+    """Weights of hypotheses times the probability of each cell of a reading, and sums over hypotheses.
+
+    A cell is a range of readings recorded as one. Hypotheses with nearly equal predictions are summed first, so that
+    the noise is applied to some hundred levels instead of every hypothesis.
+
+    Parameters
+    ----------
+    answers
+        Predicted readings, (n, n_designs).
+    weight
+        Weights of the hypotheses, (n,).
+    readout
+        The cells of a reading and its noise.
+    fine
+        Width of a cell in noise sds, if readings are not rounded.
+    repeats
+        Number of readings at each design, of which the mean counts.
+    """
+
+    def __init__(
+        self, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
+    ) -> None:
+        sd = readout.noise_sd / math.sqrt(repeats)
+        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), sd / _PER_SD, most=MOST_LEVELS)
+        self._index = nearest_level_index(answers, levels)
+        self._weight = weight
+        self._chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
+
+    @cached_property
+    def weight_by_cell(self) -> FloatArray:
+        """Total weight in each cell, (n_designs, n_cells); never 0."""
+        return np.maximum(self._weight_by_level @ self._chance, _LEAST)
+
+    @cached_property
+    def information_bits(self) -> FloatArray:
+        """Expected information about the hypotheses, whose weights sum to one, in bits, (n_designs,)."""
+        of_noise = self._weight_by_level @ entropy_bits(self._chance)
+        return np.asarray(np.maximum(entropy_bits(self.weight_by_cell) - of_noise, 0.0))
+
+    @cached_property
+    def _weight_by_level(self) -> FloatArray:
+        """Total weight of the hypotheses at each level, (n_designs, n_levels)."""
+        return weight_by_level(self._index, self._weight, len(self._chance))
+
+    def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:
+        """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""
+        return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
+
+    def weight_by_hypothesis_and_cell(self, design: int) -> FloatArray:
+        """Return weight times probability of each cell for each hypothesis at one design, (n, n_cells)."""
+        return np.asarray(self._weight[:, None] * self._chance[self._index[:, design]])
+
+
+class Utility(Protocol):
+    """Utility of a reading at each design; larger is better. A frozen dataclass, so that a journal can record it."""
+
+    @property
+    def label(self) -> str:
+        """Label with unit, for a colour bar."""
+        ...
+
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+        """Return the utility of every available design, (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class ReadingEntropy:
+    """Shannon entropy, in bits, of the readings that a few hypotheses predict (paper, the machine learning system).
+
+    The predictions are noise-free and fall into fixed bins, `bin_width` wide and centred on its multiples: one LEGO
+    unit rounds as the sensor does. For the naive model there are two readings, so the map is the paper's partition: at
+    most one bit, where half of the circles contain the place.
+    """
+
+    bin_width: float = 1.0
+
+    label: ClassVar[str] = "entropy (bits)"
+
+    def __post_init__(self) -> None:
+        if not (0 < self.bin_width < np.inf):
+            raise ParameterError("bin_width", self.bin_width, "finite, greater than 0")
+
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+        """Return the entropy in bits at every available design, (n,)."""
+        return label_entropy(np.rint(utility_input.predicted / self.bin_width))
+
+
+@dataclass(frozen=True)
+class InformationGain:
+    """Expected information, in bits, about all parameters together (Lindley 1956).
+
+    The entropy of the predictive distribution (parameters, noise, rounding and range) minus the expected entropy given
+    the parameters, which is due to noise.
+    """
+
+    label: ClassVar[str] = "expected information (bits)"
+
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+        """Return the bits at every available design, (n,)."""
+        return utility_input.information(utility_input.weight)
+
+
+@dataclass(frozen=True)
+class InformationAbout:
+    """Expected information, in bits, about a label: a function of the parameters, or the kind of shape.
+
+    The entropy of the predictive distribution minus its expected entropy given the label: differences among hypotheses
+    of the same label do not count.
+    """
+
+    of: Label
+
+    @property
+    def label(self) -> str:
+        """Label of the information and its target."""
+        return f"information about {self.of} (bits)"
+
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+        """Return the bits at every available design, (n,)."""
+        labels = self.of(utility_input.names, utility_input.theta, utility_input.weight)
+        bits = utility_input.reading_entropy(utility_input.weight)
+        for value in np.unique(labels):
+            weight = np.where(labels == value, utility_input.weight, 0.0)
+            if weight.sum() > 0:
+                bits -= weight.sum() * utility_input.reading_entropy(weight)
+        return np.maximum(bits, 0.0)
+
+
+@dataclass(frozen=True)
+class PerSecond:
+    """The utility `of` a reading per second, including travel; ParameterError if a cost is not above 0."""
+
+    of: Utility = field(default_factory=InformationGain)
+
+    @property
+    def label(self) -> str:
+        """Label of the other utility, per second."""
+        return f"{self.of.label} per second"
+
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+        """Return the utility per second at every design, (n,)."""
+        if not (utility_input.cost_s > 0).all():
+            raise ParameterError(
+                "cost_s",
+                float(utility_input.cost_s.min()),
+                "greater than 0: a reading takes time where the arm stands, too",
+            )
+        return self.of(utility_input) / utility_input.cost_s
+
+
+@dataclass(frozen=True)
+class Finishing:
+    """Utility: the probability that the next reading ends the run, if that may be; until then another utility.
+
+    Information counts bits on every parameter, even one that is known well enough: a greedy robot would refine one
+    length while another is still too uncertain. This utility uses the sds of the stopping rule.
+
+    Parameters
+    ----------
+    of
+        The utility until then.
+    least
+        Probability of ending the run, above 0, at which it replaces the other utility.
+    """
+
+    of: Utility = field(default_factory=InformationGain)
+    least: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not 0 < self.least <= 1:
+            raise ParameterError("least", self.least, "greater than 0, 1 or less")
+
+    @property
+    def label(self) -> str:
+        """Label of the utility until then, and of its replacement near the end."""
+        return f"{self.of.label}, or chance to finish"
+
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+        """Return the utility of every available design, (n,), all by the same one of the two.
+
+        The probability is computed for the 250 designs best by the other utility; it is set to 0 for the rest.
+        """
+        return self.utility_and_label(utility_input)[0]
+
+    def utility_and_label(self, utility_input: UtilityInput) -> tuple[FloatArray, str]:
+        """Return the utility of every available design, (n,), and the label of the one used."""
+        plain = self.of(utility_input)
+        if utility_input.goal is None or not _may_end_with_one_more(utility_input, utility_input.goal):
+            return plain, self.of.label
+        best = np.argsort(-plain, kind="stable")[:_MOST_DESIGNS]
+        chance = _probability_of_ending(utility_input, utility_input.goal, best)
+        if chance.max() < self.least:
+            return plain, self.of.label
+        out = np.zeros(len(plain))
+        out[best] = chance
+        return out, "probability that a reading there ends the run"
+
+
+def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
+    """Return whether one more reading may end the run: the largest sd is 1 to 15 times the goal."""
+    lengths = utility_input.theta[:, goal.columns]
+    spread = utility_input.weight @ (lengths - utility_input.weight @ lengths) ** 2
+    return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)
+
+
+def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
+    """Return the probability that a reading, or the mean of a design's repeats, reaches the target precision, (n,).
+
+    `designs` are places in `rows`.
+    """
+    rows, share = resampled_rows_and_weights(utility_input.weight, _MOST_ASKED)
+    away = utility_input.theta[rows][:, goal.columns]
+    away = away - share @ away / share.sum()
+    answers = utility_input.forecast.predict(
+        utility_input.theta[rows], utility_input.plan.take(utility_input.rows[designs])
+    )
+    n_repeats = utility_input.designs.n_repeats[utility_input.rows[designs]]
+    out = np.empty(len(designs))
+    for n in np.unique(n_repeats).tolist():
+        own = n_repeats == n
+        given = WeightsGivenReading(answers[:, own], share, utility_input.readout, repeats=n)
+        ends = np.ones(given.weight_by_cell.shape, dtype=np.bool_)
+        for length in away.T:
+            mean = given.weighted_sum_by_cell(length) / given.weight_by_cell
+            ends &= given.weighted_sum_by_cell(length**2) / given.weight_by_cell - mean**2 < goal.sd**2
+        out[own] = (given.weight_by_cell * ends).sum(axis=1) / given.weight_by_cell.sum(axis=1)
+    return out
+
+
+class Label(Protocol):
+    """A labelling of hypotheses, as whole numbers; hypotheses of one label need not be distinguished."""
+
+    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
+        """Return labels of weighted hypotheses: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class ParameterValue:
+    """Labels by the value of the parameter `name`, in `n_bins` bins of equal posterior probability."""
+
+    name: str
+    n_bins: int = 16
+
+    def __post_init__(self) -> None:
+        if self.n_bins < 2:
+            raise ParameterError("n_bins", self.n_bins, "2 or more")
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
+        """Return the bin of each hypothesis's parameter: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
+        if self.name not in names:
+            raise ParameterError("parameter", self.name, f"one of {', '.join(names)}")
+        order = np.argsort(theta[:, names.index(self.name)], kind="stable")
+        before = np.cumsum(weight[order]) - 0.5 * weight[order]
+        out = np.empty(len(theta), dtype=np.int64)
+        out[order] = np.minimum(self.n_bins * before / weight.sum(), self.n_bins - 1).astype(np.int64)
+        return out
+
+
+@dataclass(frozen=True)
+class WhichShape:
+    """Labels by the number of the shape, for hypotheses of a set of shapes (parameter "shape")."""
+
+    def __str__(self) -> str:
+        return "the shape"
+
+    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
+        """Return the number of each hypothesis's shape in the set, (n_samples,)."""
+        if "shape" not in names:
+            raise ParameterError("names", names, "shape among them: the hypotheses of two shapes or more")
+        return np.floor(theta[:, names.index("shape")]).astype(np.int64)
+
+
+UTILITY_NAMES = ("finishing", "information", "entropy", "per-second", "about:PARAMETER", "which-shape")
+
+
+def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
+    """Build a utility from its name, one of `UTILITY_NAMES`, such as "entropy" or "about:radius_mm".
+
+    "finishing": `Finishing`; "information": `InformationGain`; "entropy": `ReadingEntropy`; "per-second": `PerSecond`
+    of the information; "about:PARAMETER": `InformationAbout` that parameter; "which-shape": `InformationAbout` the
+    shape.
+
+    Parameters
+    ----------
+    text
+        The name.
+    bin_width
+        Width of the bins of "entropy", in the unit of readings: the step of the instrument.
+
+    Raises
+    ------
+    ParameterError
+        If no utility has the name, or `bin_width` is not above 0.
+    """
+    name, _, parameter = text.partition(":")
+    if name == "about" and parameter:
+        return InformationAbout(ParameterValue(parameter))
+    plain: dict[str, Utility] = {
+        "finishing": Finishing(),
+        "information": InformationGain(),
+        "entropy": ReadingEntropy(bin_width),
+        "per-second": PerSecond(),
+        "which-shape": InformationAbout(WhichShape()),
+    }
+    if text not in plain:
+        raise ParameterError("utility", text, ", ".join(UTILITY_NAMES) + did_you_mean(name, UTILITY_NAMES))
+    return plain[text]
+
+
+def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
+    """Compute the utility of every available design (paper, the machine learning system).
+
+    Raises
+    ------
+    ShapeError
+        If the utility returns a wrong number of values.
+    ParameterError
+        If one of its values is not finite.
+    ReachError
+        If no design is available.
+    """
+    if isinstance(utility, Finishing):  # the utility with two measures reports which one these values are
+        values, label = utility.utility_and_label(utility_input)
+    else:
+        values, label = utility(utility_input), utility.label
+    return map_of_rows(utility_input.designs, utility_input.rows, np.asarray(values, dtype=np.float64), label)
+
+
+def choose_several(
+    utility_input: UtilityInput, n: int, *, rng: np.random.Generator, chance: FloatArray | None = None
+) -> tuple[int, ...]:
+    """Choose readings with large joint information, greedily one after another.
+
+    Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + .... With exact terms it reaches at least
+    1 - 1/e (63 %) of the information of the best set (Nemhauser, Wolsey & Fisher 1978). Here each conditional
+    information is averaged over simulated outcomes: each is a draw from the predictive distribution, with its own
+    posterior.
+
+    Parameters
+    ----------
+    utility_input
+        Posterior, designs and sensor.
+    n
+        Number of readings, 1 or more; else ParameterError.
+    rng
+        Source of randomness.
+    chance
+        Probability that a reading at each of `utility_input.rows` returns a value, (n,), by which its information
+        counts; None: all do.
+
+    Returns
+    -------
+    Indices of designs, from `utility_input.rows`, in the order in which they were chosen; two may be the same.
+    """
+    if n < 1:
+        raise ParameterError("n", n, "1 or more")
+    everywhere = np.ones(len(utility_input.rows), dtype=np.bool_)
+    weighing = np.ones(1) if chance is None else chance
+    chosen = [choose(utility_input.information(utility_input.weight) * weighing, everywhere, rng=rng)]
+    rows, share = resampled_rows_and_weights(utility_input.weight, _FEW)
+    few = replace(utility_input, theta=utility_input.theta[rows], weight=share / share.sum())
+    weights = [few.weight] * _OUTCOMES
+    for _ in range(n - 1):
+        weights = _weights_after_simulated_reading(few, chosen[-1], weights, rng)
+        gain = np.mean([few.information(weight) for weight in weights], axis=0)
+        chosen.append(choose(gain * weighing, everywhere, rng=rng))
+    return tuple(int(utility_input.rows[row]) for row in chosen)
+
+
+def _weights_after_simulated_reading(
+    utility_input: UtilityInput, row: int, weights: list[FloatArray], rng: np.random.Generator
+) -> list[FloatArray]:
+    """Simulate one reading per posterior at design `utility_input.rows[row]`; return the posteriors' weights after it.
+
+    `weights`: of each posterior, (n_samples,).
+    """
+    readout = utility_input.readout
+    level = utility_input.forecast.predict(utility_input.theta, utility_input.plan.take(utility_input.rows[[row]]))[
+        :, 0
+    ]
+    sd = readout.noise_sd / np.sqrt(utility_input.designs.n_repeats[utility_input.rows[row]])
+    out = []
+    for weight in weights:
+        truth = rng.choice(len(weight), p=weight)
+        away = (level[truth] + sd * rng.standard_normal() - level) / sd
+        after = weight * np.exp(-0.5 * away**2)
+        out.append(after / after.sum())
+    return out

@@ -1,0 +1,752 @@
+"""Albedo regions, one per hypothesis: frozen values of batched geometry (paper, eq. 1; patterns S_BW, S_a to S_d).
+
+A new kind is a frozen dataclass with `n_regions`, `albedo` and `coverage`. It may register the distance to its edge
+(`edge_distance`) and, where that is closed, its outline (`outlines`); a closed form registered with
+`sensor.gaussian.mean_albedo_under_one_gaussian` makes a footprint over it cost microseconds, not milliseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, singledispatch
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray, frozen_int, read_only_floats, require_finite
+from probewise.errors import ParameterError, ShapeError
+from probewise.recordings import patterns as kinds
+from probewise.recordings.patterns import Pattern
+
+
+class Region(Protocol):
+    """An albedo field for each hypothesis: `n_regions` of them, 1 where all share one.
+
+    Regions are small frozen values of batched geometry (scene/regions.py). The sensor integrates
+    a region in closed form where its kind has one (sensor/gaussian.py), or pixel by pixel through
+    `coverage` (sensor/discrete.py).
+    """
+
+    @property
+    def n_regions(self) -> int:
+        """Number of hypotheses, or 1 where all share one region."""
+        ...
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Return the albedo at points, (n_points, 2) lab frame -> (n_regions, n_points)."""
+        ...
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over each of many square pixels, (n_regions, n_points).
+
+        The pixels have centres `centers_mm` (n_points, 2), side `pixel_mm`, and are turned by `turn_rad` (n_points,).
+        """
+        ...
+
+
+class RegionBatch(Region, Protocol):
+    """Base of regions whose first field has a row for each hypothesis, after `broadcast_and_freeze_fields`."""
+
+    @property
+    def n_regions(self) -> int:
+        """Number of hypotheses, or 1 where all share one region."""
+        first = next(iter(self.__dataclass_fields__))  # type: ignore[attr-defined]
+        return len(getattr(self, first))
+
+
+def broadcast_and_freeze_fields(region: object, **shapes: tuple[int, ...]) -> None:
+    """Broadcast the named arrays of a region to (n_regions, *shape), in place; check that they are finite; freeze them.
+
+    In a shape, -1 is any length. Raises ShapeError for a shape that does not fit, ParameterError for NaN or infinity.
+    """
+    arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
+    lengths = set()
+    for name, shape in shapes.items():
+        array = arrays[name] = arrays[name][None] if arrays[name].ndim == len(shape) else arrays[name]
+        if array.ndim != len(shape) + 1 or any(
+            want not in (-1, got) for want, got in zip(shape, array.shape[1:], strict=True)
+        ):
+            raise ShapeError(f"{name} has shape {array.shape}; allowed: (n_regions, {', '.join(map(str, shape))})")
+        lengths.add(len(array))
+    n_regions = max(lengths, default=1)
+    for name, array in arrays.items():
+        if len(array) not in (1, n_regions):
+            raise ShapeError(f"{name} has {len(array)} rows; allowed: {n_regions}, as the other arrays, or 1")
+        require_finite(name, array)
+        object.__setattr__(region, name, read_only_floats(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
+
+
+def require_positive(name: str, values: FloatArray) -> None:
+    """Raise ParameterError unless all values are greater than 0."""
+    bad = values <= 0
+    if bad.any():
+        raise ParameterError(name, float(values[bad][0]), "greater than 0")
+
+
+@singledispatch
+def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
+    """Trace the closed edge of each hypothesis, for drawing, rasterising and culling.
+
+    Parameters
+    ----------
+    region
+        Ellipses, polygons, a mixture of these, or any kind that registers its outline (`outlines.register`).
+    n_vertices
+        Number of vertices of a curved edge.
+
+    Returns
+    -------
+    One array (n, 2) per hypothesis, mm, the first vertex repeated at the end; pieces of a
+    polygon that crosses itself are separated by NaN.
+
+    Raises
+    ------
+    ParameterError
+        If the region has no closed edge.
+    """
+    raise ParameterError("region", type(region).__name__, "EllipseRegion, PolygonRegion or a mixture of them")
+
+
+@singledispatch
+def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    """Return the distance of places from the nearest edge of a region, mm.
+
+    Parameters
+    ----------
+    region
+        A region of n_regions hypotheses; the distance is infinite for kinds without edges (uniform, ramp, image).
+    x_mm, y_mm
+        Places, (n_samples or 1, n_points).
+
+    Returns
+    -------
+    Distances, (n_samples or n_regions or 1, n_points): exact, but to first order in the distance for an ellipse
+    that is no disc.
+    """
+    return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)
+
+
+def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
+    """Return the share of each square pixel on the positive side of a straight edge.
+
+    Parameters
+    ----------
+    distance_mm
+        Signed distance of the pixel's centre from the edge, positive inside.
+    angle_rad
+        Angle between the edge's normal and a side of the square; broadcasts with the distance.
+    pixel_mm
+        Side of the square.
+
+    Returns
+    -------
+    Share, 0 to 1: the cumulative of the square's projection on the normal, a trapezium.
+    """
+    cosine, sine = np.abs(np.cos(angle_rad)), np.abs(np.sin(angle_rad))
+    wide = 0.5 * pixel_mm * np.maximum(cosine, sine)
+    narrow = 0.5 * pixel_mm * np.minimum(cosine, sine)
+    t = np.abs(distance_mm)
+    left_over = np.maximum(wide + narrow - t, 0.0)
+    # The corner's triangle has area left_over^2 / (8 wide narrow) of the square; without a
+    # corner (narrow = 0) the flank alone decides.
+    corner = left_over**2 / (8 * wide * np.maximum(narrow, 1e-12 * pixel_mm))
+    flank = 0.5 - 0.5 * t / wide
+    outside = np.where(t <= wide - narrow, flank, corner)
+    outside = np.minimum(outside, 0.5)
+    return np.where(distance_mm >= 0, 1 - outside, outside)
+
+
+def share_inside_polygon(
+    edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray
+) -> FloatArray:
+    """Return the share of each square inside a polygon, exactly.
+
+    Green's theorem on the polygon clipped to the square: the sum over directed edges (inside
+    on their left) of the area between the edge, clamped to the square, and its lower side.
+
+    Parameters
+    ----------
+    edges_mm
+        Directed edges, shape (n_regions, n_edges, 2 ends, 2).
+    centers_mm
+        Centres of the pixels, shape (n_points, 2).
+    pixel_mm
+        Side of the square.
+    turn_rad
+        Angle by which each square is turned, shape (n_points,).
+
+    Returns
+    -------
+    Share, shape (n_regions, n_points).
+    """
+    cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+    total = np.zeros((len(edges_mm), len(centers_mm)))
+    for k in range(edges_mm.shape[1]):
+        ends = []
+        for end in (edges_mm[:, k, 0], edges_mm[:, k, 1]):
+            dx = end[:, :1] - centers_mm[:, 0]
+            dy = end[:, 1:] - centers_mm[:, 1]
+            ends.append(((cosine * dx + sine * dy) / pixel_mm, (cosine * dy - sine * dx) / pixel_mm))
+        (x1, y1), (x2, y2) = ends
+        run = x2 - x1
+        upright = np.abs(run) < 1e-12
+        slope = (y2 - y1) / np.where(upright, 1.0, run)
+        a, b = np.clip(x1, -0.5, 0.5), np.clip(x2, -0.5, 0.5)
+        ya, yb = y1 + slope * (a - x1), y1 + slope * (b - x1)
+        rise = yb - ya
+        flat = np.abs(rise) < 1e-9
+        mean_height = np.where(
+            flat,
+            np.clip(0.5 * (ya + yb), -0.5, 0.5),
+            (_integral_of_clip(yb) - _integral_of_clip(ya)) / np.where(flat, 1.0, rise),
+        )
+        total -= np.where(upright, 0.0, (b - a) * (mean_height + 0.5))
+    return np.clip(total, 0.0, 1.0)
+
+
+def _integral_of_clip(y: FloatArray) -> FloatArray:
+    """Return the antiderivative of clip(y, -1/2, 1/2) that is 0 at 0."""
+    inner = np.clip(y, -0.5, 0.5)
+    return 0.5 * inner**2 + 0.5 * np.abs(y - inner)
+
+
+@dataclass(frozen=True, eq=False)
+class UniformRegion(RegionBatch):
+    """A uniform albedo `level`, shape (n_regions,)."""
+
+    level: FloatArray
+
+    def __post_init__(self) -> None:
+        broadcast_and_freeze_fields(self, level=())
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        return np.repeat(self.level[:, None], len(points_mm), axis=1)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over pixels, the level: (n_regions, n_points)."""
+        return self.albedo(centers_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class HalfPlaneRegion(RegionBatch):
+    """Half-planes x cos(normal) + y sin(normal) > offset, albedo `inside`; `outside` elsewhere. Fields (n_regions,)."""
+
+    normal_rad: FloatArray
+    offset_mm: FloatArray
+    inside: float = 1.0
+    outside: float = 0.0
+
+    def __post_init__(self) -> None:
+        broadcast_and_freeze_fields(self, normal_rad=(), offset_mm=())
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        return np.where(self._signed_distance(points_mm) > 0, self.inside, self.outside)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        share = share_inside_half_plane(
+            self._signed_distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm
+        )
+        return self.outside + (self.inside - self.outside) * share
+
+    def _signed_distance(self, points_mm: FloatArray) -> FloatArray:
+        normal = self.normal_rad[:, None]
+        return points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal) - self.offset_mm[:, None]
+
+
+@edge_distance.register
+def _edge_distance_of_half_plane(region: HalfPlaneRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    normal = region.normal_rad[:, None]
+    return np.abs(np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.offset_mm[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonRegion(RegionBatch):
+    """Polygons, albedo `inside` and `outside` them, given by directed edges with the inside on their left.
+
+    `edges_mm` has shape (n_regions, n_edges, 2 ends, 2). Build it with `from_vertices` from the vertices of
+    polygons that do not cross themselves, or with `from_even_odd_vertices` from one polygon that may.
+    """
+
+    edges_mm: FloatArray
+    inside: float = 1.0
+    outside: float = 0.0
+
+    def __post_init__(self) -> None:
+        broadcast_and_freeze_fields(self, edges_mm=(-1, 2, 2))
+
+    @classmethod
+    def from_vertices(cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0) -> PolygonRegion:
+        """Build from vertices (n_regions, n_vertices, 2), clockwise or anticlockwise; edges must not cross."""
+        vertices = np.asarray(vertices_mm, dtype=np.float64)
+        if vertices.ndim != 3 or vertices.shape[1] < 3 or vertices.shape[2] != 2:
+            raise ShapeError(f"vertices_mm has shape {vertices.shape}; allowed: (n_regions, 3 or more, 2)")
+        following = np.roll(vertices, -1, axis=1)
+        area = np.sum(vertices[..., 0] * following[..., 1] - vertices[..., 1] * following[..., 0], axis=1)
+        edges = np.stack([vertices, following], axis=2)
+        edges = np.where((area < 0)[:, None, None, None], edges[:, :, ::-1], edges)
+        return cls(edges, inside, outside)
+
+    @classmethod
+    def from_even_odd_vertices(
+        cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0
+    ) -> PolygonRegion:
+        """Build one region from the vertices (n_vertices, 2) of a polygon that may cross itself.
+
+        Edges are split where they meet; pieces with the inside (even-odd rule) on exactly one
+        side are kept, directed so that the inside is on their left. ParameterError if the area is 0.
+        """
+        vertices = np.asarray(vertices_mm, dtype=np.float64)
+        if vertices.ndim != 2 or len(vertices) < 3 or vertices.shape[1] != 2:
+            raise ShapeError(f"vertices_mm has shape {vertices.shape}; allowed: (3 or more, 2)")
+        edges = np.stack([vertices, np.roll(vertices, -1, axis=0)], axis=1)
+        return cls(_even_odd_boundary_edges(edges)[None], inside, outside)
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        return np.where(_count_ray_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        share = share_inside_polygon(self.edges_mm, centers_mm, pixel_mm, turn_rad)
+        return self.outside + (self.inside - self.outside) * share
+
+
+def _count_ray_crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArray:
+    """Count the edges that a ray to the right of each point crosses, (n_regions, n_points)."""
+    x, y = points_mm[:, 0], points_mm[:, 1]
+    count = np.zeros((len(edges_mm), len(points_mm)), dtype=np.int64)
+    for k in range(edges_mm.shape[1]):
+        x1, y1 = edges_mm[:, k, 0, :1], edges_mm[:, k, 0, 1:]
+        x2, y2 = edges_mm[:, k, 1, :1], edges_mm[:, k, 1, 1:]
+        spans = (y1 > y) != (y2 > y)
+        rise = np.where(y2 == y1, 1.0, y2 - y1)
+        count += spans & (x < x1 + (y - y1) / rise * (x2 - x1))
+    return count
+
+
+def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
+    """Return the even-odd inside's boundary, (n_pieces, 2, 2), from edges (n_edges, 2, 2), split where they meet."""
+    size = float(np.ptp(edges.reshape(-1, 2), axis=0).max())
+    if size == 0:
+        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
+    pieces: dict[tuple[tuple[float, float], tuple[float, float]], None] = {}
+    for start, end in edges:
+        cuts = {0.0, 1.0}
+        step = end - start
+        length2 = float(step @ step)
+        if length2 == 0:
+            continue
+        for other_start, other_end in edges:
+            other = other_end - other_start
+            between = other_start - start
+            cross = step[0] * other[1] - step[1] * other[0]
+            if abs(cross) > 1e-12 * size * size:
+                t = (between[0] * other[1] - between[1] * other[0]) / cross
+                s = (between[0] * step[1] - between[1] * step[0]) / cross
+                if -1e-12 <= s <= 1 + 1e-12:
+                    cuts.add(float(t))
+            elif abs(step[0] * between[1] - step[1] * between[0]) <= 1e-9 * size * math.sqrt(length2):
+                cuts.update((float(between @ step) / length2, float((other_end - start) @ step) / length2))
+        ordered = sorted(t for t in cuts if 0 <= t <= 1)
+        for a, b in pairwise(ordered):
+            if b - a > 1e-9:
+                p, q = (tuple(np.round(start + t * step, 9).tolist()) for t in (a, b))
+                pieces.setdefault((min(p, q), max(p, q)))
+    kept = []
+    for p, q in pieces:
+        ends = np.array([p, q])
+        middle, along = ends.mean(axis=0), ends[1] - ends[0]
+        left = np.array([-along[1], along[0]]) / np.hypot(*along) * 1e-7 * size
+        sides = _count_ray_crossings(edges[None], np.stack([middle + left, middle - left]))[0] % 2
+        if sides[0] != sides[1]:
+            kept.append(ends if sides[0] else ends[::-1])
+    if not kept:
+        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
+    return np.stack(kept)
+
+
+@outlines.register
+def _outlines_of_polygon(region: PolygonRegion, *, n_vertices: int = 96) -> list[FloatArray]:
+    return [_outline_of_edges(edges) for edges in region.edges_mm]
+
+
+def _outline_of_edges(edges: FloatArray) -> FloatArray:
+    if np.array_equal(edges[1, 1], edges[0, 0]):  # given clockwise: each edge was turned round in its place
+        edges = edges[::-1]
+    points = [edges[0, 0]]
+    for start, end in edges:
+        if not np.array_equal(points[-1], start):
+            points += [np.full(2, np.nan), start]
+        points.append(end)
+    return np.array(points)
+
+
+@edge_distance.register
+def _edge_distance_of_polygon(region: PolygonRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    nearest = np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)
+    for k in range(region.edges_mm.shape[1]):
+        (x1, y1), (x2, y2) = (region.edges_mm[:, k, end, :, None].transpose(1, 0, 2) for end in (0, 1))
+        length2 = np.maximum((x2 - x1) ** 2 + (y2 - y1) ** 2, 1e-300)
+        share = np.clip(((x_mm - x1) * (x2 - x1) + (y_mm - y1) * (y2 - y1)) / length2, 0, 1)
+        foot_x, foot_y = x1 + share * (x2 - x1), y1 + share * (y2 - y1)
+        nearest = np.minimum(nearest, np.hypot(x_mm - foot_x, y_mm - foot_y))
+    return nearest
+
+
+@dataclass(frozen=True, eq=False)
+class QuadrantRegion(RegionBatch):
+    """Quadrants (x - cx) dx > 0 and (y - cy) dy > 0 (paper, S_a to S_d).
+
+    `corner_mm` and `direction` (entries +1 or -1) have shape (n_regions, 2). The albedo is `inside` there, `outside`
+    elsewhere.
+    """
+
+    corner_mm: FloatArray
+    direction: FloatArray
+    inside: float = 1.0
+    outside: float = 0.0
+
+    def __post_init__(self) -> None:
+        broadcast_and_freeze_fields(self, corner_mm=(2,), direction=(2,))
+        if not np.isin(self.direction, (-1.0, 1.0)).all():
+            raise ParameterError("direction", self.direction.tolist(), "+1 or -1")
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        beyond = (points_mm[None] - self.corner_mm[:, None]) * self.direction[:, None] > 0
+        return np.where(beyond.all(axis=-1), self.inside, self.outside)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        reach = pixel_mm + max(1.0, float(np.abs(centers_mm[None] - self.corner_mm[:, None]).max(initial=0.0)))
+        x, y = self.corner_mm[:, 0], self.corner_mm[:, 1]
+        far_x, far_y = x + 2 * reach * self.direction[:, 0], y + 2 * reach * self.direction[:, 1]
+        square = np.stack([np.stack(p, axis=-1) for p in ((x, y), (far_x, y), (far_x, far_y), (x, far_y))], axis=1)
+        return PolygonRegion.from_vertices(square, inside=self.inside, outside=self.outside).coverage(
+            centers_mm, pixel_mm, turn_rad
+        )
+
+
+@edge_distance.register
+def _edge_distance_of_quadrant(region: QuadrantRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    right = (x_mm - region.corner_mm[:, :1]) * region.direction[:, :1]
+    above = (y_mm - region.corner_mm[:, 1:]) * region.direction[:, 1:]
+    # The edges are two rays from the corner: to the right, and up.
+    return np.minimum(np.hypot(np.minimum(right, 0), above), np.hypot(right, np.minimum(above, 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class EllipseRegion(RegionBatch):
+    """Ellipses, albedo `inside` and `outside` them; a disc has equal semi-axes (paper, eq. 1).
+
+    `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis, anticlockwise from X)
+    (n_regions,).
+    """
+
+    center_mm: FloatArray
+    semi_axes_mm: FloatArray
+    angle_rad: FloatArray
+    inside: float = 1.0
+    outside: float = 0.0
+
+    def __post_init__(self) -> None:
+        broadcast_and_freeze_fields(self, center_mm=(2,), semi_axes_mm=(2,), angle_rad=())
+        require_positive("semi_axes_mm", self.semi_axes_mm)
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """Return the albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""
+        p, q = self._unit_circle_coordinates(points_mm)
+        return np.where(p * p + q * q <= 1, self.inside, self.outside)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over turned square pixels, the edge taken as straight: (n_regions, n_points)."""
+        p, q = self._unit_circle_coordinates(centers_mm)
+        a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
+        level = np.hypot(p, q)
+        # Gradient of the level sqrt(p^2 + q^2); it is zero only at the centre, far from the edge.
+        along, across = p / a, q / b
+        steepness = np.hypot(along, across) / np.maximum(level, 1e-12)
+        distance = (1 - level) / np.maximum(steepness, 1e-12)
+        angle = np.arctan2(across, along) + self.angle_rad[:, None]
+        share = share_inside_half_plane(distance, angle - turn_rad, pixel_mm)
+        return self.outside + (self.inside - self.outside) * share
+
+    def _unit_circle_coordinates(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return coordinates in which the edge is the unit circle, each (n_regions, n_points)."""
+        cosine, sine = np.cos(self.angle_rad)[:, None], np.sin(self.angle_rad)[:, None]
+        dx = points_mm[:, 0] - self.center_mm[:, :1]
+        dy = points_mm[:, 1] - self.center_mm[:, 1:]
+        a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
+        return (cosine * dx + sine * dy) / a, (cosine * dy - sine * dx) / b
+
+
+def disc_region(
+    center_mm: FloatArray, radius_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0
+) -> EllipseRegion:
+    """Build discs, `center_mm` (n_regions, 2), `radius_mm` (n_regions,)."""
+    radius = np.atleast_1d(np.asarray(radius_mm, dtype=np.float64))
+    return EllipseRegion(center_mm, np.stack([radius, radius], axis=-1), np.zeros(len(radius)), inside, outside)
+
+
+@outlines.register
+def _outlines_of_ellipse(region: EllipseRegion, *, n_vertices: int = 96) -> list[FloatArray]:
+    t = np.linspace(0, 2 * np.pi, n_vertices + 1)
+    p = region.semi_axes_mm[:, :1] * np.cos(t)
+    q = region.semi_axes_mm[:, 1:] * np.sin(t)
+    cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
+    x = region.center_mm[:, :1] + cosine * p - sine * q
+    y = region.center_mm[:, 1:] + sine * p + cosine * q
+    return list(np.stack([x, y], axis=-1))
+
+
+@edge_distance.register
+def _edge_distance_of_ellipse(region: EllipseRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
+    a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
+    dx, dy = x_mm - region.center_mm[:, :1], y_mm - region.center_mm[:, 1:]
+    p, q = (cosine * dx + sine * dy) / a, (cosine * dy - sine * dx) / b
+    level = np.hypot(p, q)
+    steepness = np.where(level > 1e-12, np.hypot(p / a, q / b) / np.maximum(level, 1e-12), 1 / np.minimum(a, b))
+    return np.asarray(np.abs(level - 1) / steepness)
+
+
+@dataclass(frozen=True, eq=False)
+class StripesRegion(RegionBatch):
+    """Stripes where frac((x . n - phase) / period) < duty, n the unit normal; fields (n_regions,).
+
+    The albedo is `inside` there, `outside` elsewhere.
+    """
+
+    normal_rad: FloatArray
+    period_mm: FloatArray
+    duty: FloatArray
+    phase_mm: FloatArray
+    inside: float = 1.0
+    outside: float = 0.0
+
+    def __post_init__(self) -> None:
+        broadcast_and_freeze_fields(self, normal_rad=(), period_mm=(), duty=(), phase_mm=())
+        require_positive("period_mm", self.period_mm)
+        if ((self.duty < 0) | (self.duty > 1)).any():
+            raise ParameterError("duty", self.duty.tolist(), "0 to 1")
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        share = self._position_along_normal(points_mm) / self.period_mm[:, None]
+        return np.where(share - np.floor(share) < self.duty[:, None], self.inside, self.outside)
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        period = self.period_mm[:, None]
+        along = self._position_along_normal(centers_mm)
+        along = along - period * np.floor(along / period)
+        angle = self.normal_rad[:, None] - turn_rad
+        share = np.zeros_like(along)
+        # Half a pixel's diagonal is 0.71 pixels: edges further away do not cut the pixel.
+        reach = 1 + math.ceil(0.75 * pixel_mm / float(self.period_mm.min()))
+        for k in range(-reach, reach + 1):
+            start = k * period
+            share += share_inside_half_plane(along - start, angle, pixel_mm)
+            share -= share_inside_half_plane(along - start - self.duty[:, None] * period, angle, pixel_mm)
+        return self.outside + (self.inside - self.outside) * share
+
+    def _position_along_normal(self, points_mm: FloatArray) -> FloatArray:
+        normal = self.normal_rad[:, None]
+        return points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal) - self.phase_mm[:, None]
+
+
+@edge_distance.register
+def _edge_distance_of_stripes(region: StripesRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    normal, period = region.normal_rad[:, None], region.period_mm[:, None]
+    along = np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.phase_mm[:, None]
+    edges = (along, along - region.duty[:, None] * period)
+    from_rise, from_fall = (np.abs(edge - period * np.round(edge / period)) for edge in edges)
+    has_edges = (region.duty > 0) & (region.duty < 1)
+    return np.where(has_edges[:, None], np.minimum(from_rise, from_fall), np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class RampRegion(RegionBatch):
+    """Albedo per_mm (x . n), n the unit normal at `normal_rad`, not limited to 0 to 1; fields (n_regions,)."""
+
+    normal_rad: FloatArray
+    per_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        broadcast_and_freeze_fields(self, normal_rad=(), per_mm=())
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        normal = self.normal_rad[:, None]
+        return self.per_mm[:, None] * (points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal))
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over turned square pixels: exactly the value at their centres."""
+        return self.albedo(centers_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRegion:
+    """One image of albedos: `values` (n_rows, n_columns), first row on top, 0 outside it.
+
+    `pixel_mm` is a pixel's side, `origin_mm` the lower left corner; hypotheses share the image (n_regions is 1).
+    """
+
+    values: FloatArray
+    pixel_mm: float
+    origin_mm: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        values = read_only_floats(self.values)
+        if values.ndim != 2 or values.size == 0:
+            raise ShapeError(f"image has shape {values.shape}; allowed: (n_rows, n_columns), not empty")
+        require_finite("image", values)
+        if not (0 < self.pixel_mm < math.inf):
+            raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
+        object.__setattr__(self, "values", values)
+
+    @property
+    def n_regions(self) -> int:
+        """1: all hypotheses share the image."""
+        return 1
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        return self._albedo_at(points_mm[:, 0], points_mm[:, 1])[None]
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        """Return the mean albedo over turned square pixels, (1, n_points): exact if unturned, else by eight strips."""
+        cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+        steep, flat = np.maximum(np.abs(cosine), 1e-9), np.maximum(np.abs(sine), 1e-9)
+        half = 0.5 * pixel_mm
+        height = half * (np.abs(cosine) + np.abs(sine))
+        total, area = np.zeros(len(centers_mm)), np.zeros(len(centers_mm))
+        n_strips = 8
+        for k in range(n_strips):
+            low, high = (2 * k / n_strips - 1) * height, (2 * (k + 1) / n_strips - 1) * height
+            y = 0.5 * (low + high)
+            # Inside the square |c x + s y| and |c y - s x| are at most half a side.
+            middle_1, middle_2 = -sine * y * cosine / steep**2, cosine * y * sine / flat**2
+            left = np.maximum(middle_1 - half / steep, middle_2 - half / flat)
+            right = np.maximum(left, np.minimum(middle_1 + half / steep, middle_2 + half / flat))
+            bottom, top = centers_mm[:, 1] + low, centers_mm[:, 1] + high
+            near, far = centers_mm[:, 0] + left, centers_mm[:, 0] + right
+            total += self._albedo_integral_to_lower_left(far, top) - self._albedo_integral_to_lower_left(near, top)
+            total -= self._albedo_integral_to_lower_left(far, bottom) - self._albedo_integral_to_lower_left(
+                near, bottom
+            )
+            area += (right - left) * (high - low)
+        return (total / area)[None]
+
+    @cached_property
+    def _summed_area_table(self) -> FloatArray:
+        """Summed-area table: sums of the pixels to the lower left of each corner, (n_rows + 1, n_columns + 1)."""
+        padded = np.zeros((self.values.shape[0] + 1, self.values.shape[1] + 1))
+        padded[1:, 1:] = self.values[::-1].cumsum(axis=0).cumsum(axis=1)
+        return padded
+
+    def _albedo_integral_to_lower_left(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Return the integral of the albedo to the lower left of each point (x, y), in mm^2."""
+        n_rows, n_columns = self.values.shape
+        u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)
+        v = np.clip((y_mm - self.origin_mm[1]) / self.pixel_mm, 0, n_rows)
+        i, j = np.minimum(v.astype(np.int64), n_rows - 1), np.minimum(u.astype(np.int64), n_columns - 1)
+        u, v, table = u - j, v - i, self._summed_area_table
+        lower = (1 - u) * table[i, j] + u * table[i, j + 1]
+        upper = (1 - u) * table[i + 1, j] + u * table[i + 1, j + 1]
+        return np.asarray(((1 - v) * lower + v * upper) * self.pixel_mm**2)
+
+    def _albedo_at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        n_rows, n_columns = self.values.shape
+        column = np.floor((x_mm - self.origin_mm[0]) / self.pixel_mm).astype(np.int64)
+        row = n_rows - 1 - np.floor((y_mm - self.origin_mm[1]) / self.pixel_mm).astype(np.int64)
+        within = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
+        found = self.values[np.where(within, row, 0), np.where(within, column, 0)]
+        return np.where(within, found, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RegionsOfMixedKinds(RegionBatch):
+    """Regions whose kind may differ between hypotheses, as for a set of shapes.
+
+    `which`, shape (n_regions,), is the index of each hypothesis' part; part k holds, in
+    order, the regions of the hypotheses with which == k.
+    """
+
+    which: IntArray
+    parts: tuple[Region, ...]
+
+    def __post_init__(self) -> None:
+        which = frozen_int(self.which)
+        object.__setattr__(self, "which", which)
+        for k, part in enumerate(self.parts):
+            wanted = int(np.sum(which == k))
+            if wanted and part.n_regions != wanted:
+                raise ShapeError(f"part {k} holds {part.n_regions} regions; allowed: {wanted}, one per {k} in which")
+        if which.ndim != 1 or (which.size and (which.min() < 0 or which.max() >= len(self.parts))):
+            raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one per hypothesis")
+
+    def rows_and_regions(self) -> list[tuple[IntArray, Region]]:
+        """List, for each part that occurs, the row numbers of its hypotheses in `which`, and their region."""
+        pairs = [(np.flatnonzero(self.which == k), part) for k, part in enumerate(self.parts)]
+        return [(rows, part) for rows, part in pairs if rows.size]
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        out = np.empty((self.n_regions, len(points_mm)))
+        for rows, part in self.rows_and_regions():
+            out[rows] = part.albedo(points_mm)
+        return out
+
+    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+        out = np.empty((self.n_regions, len(centers_mm)))
+        for rows, part in self.rows_and_regions():
+            out[rows] = part.coverage(centers_mm, pixel_mm, turn_rad)
+        return out
+
+
+@outlines.register
+def _outlines_of_mixed_kinds(region: RegionsOfMixedKinds, *, n_vertices: int = 96) -> list[FloatArray]:
+    traces: list[FloatArray] = [np.empty((0, 2))] * region.n_regions
+    for rows, part in region.rows_and_regions():
+        for row, trace in zip(rows, outlines(part, n_vertices=n_vertices), strict=True):
+            traces[int(row)] = trace
+    return traces
+
+
+@edge_distance.register
+def _edge_distance_of_mixed_kinds(region: RegionsOfMixedKinds, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    shape = (region.n_regions, max(x_mm.shape[1], y_mm.shape[1]))
+    x_mm, y_mm = np.broadcast_to(x_mm, shape), np.broadcast_to(y_mm, shape)
+    out = np.empty(shape)
+    for rows, part in region.rows_and_regions():
+        out[rows] = edge_distance(part, x_mm[rows], y_mm[rows])
+    return out
+
+
+def region_of(pattern: Pattern) -> Region:
+    """Build the region that a pattern of a recording describes (n_regions is 1).
+
+    Raises
+    ------
+    ParameterError
+        If the pattern is of no known kind, or its numbers describe no area.
+    """
+    match pattern:
+        case kinds.Uniform(level):
+            return UniformRegion(np.array([level]))
+        case kinds.HalfPlane(normal, offset, inside, outside):
+            return HalfPlaneRegion(np.array([normal]), np.array([offset]), inside, outside)
+        case kinds.Quadrant(corner, direction, inside, outside):
+            return QuadrantRegion(np.array([corner]), np.array([direction]), inside, outside)
+        case kinds.Disc(center, radius, inside, outside):
+            return disc_region(np.array([center]), np.array([radius]), inside=inside, outside=outside)
+        case kinds.Polygon(vertices, inside, outside):
+            return PolygonRegion.from_even_odd_vertices(np.array(vertices), inside=inside, outside=outside)
+        case kinds.Stripes(normal, period, duty, phase, inside, outside):
+            return StripesRegion(
+                np.array([normal]), np.array([period]), np.array([duty]), np.array([phase]), inside, outside
+            )
+        case kinds.Ramp(normal, per_mm):
+            return RampRegion(np.array([normal]), np.array([per_mm]))
+        case kinds.Image(albedo, pixel, origin, _):
+            return ImageRegion(albedo, pixel, origin)
+        case _:
+            raise ParameterError("pattern", pattern, "a pattern of probewise.recordings.patterns")

@@ -63,8 +63,9 @@ def test_a_region_with_its_closed_form():
 
 
 def test_an_effect():
-    creep = example("ArmCreep", "probewise.effects.pose")()
-    assert creep.words == "an arm that creeps"
+    kind = example("arm_creep", "probewise.effects.pose")
+    assert kind.words == "an arm that creeps"
+    creep = kind()
     plan = paper_plan()
     poses = Poses(*(np.zeros((1, len(plan))) for _ in range(3)))
     moved = creep.apply(poses, np.array([[0.8]]), plan)

@@ -22,7 +22,7 @@ from probewise.diagnosis import (
     model_with,
     repaired_of,
 )
-from probewise.effects import VOCABULARY, NamedEffect
+from probewise.effects import VOCABULARY, Effect
 from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
 from probewise.experiment import (
     Experiment,
@@ -102,10 +102,6 @@ def record(number, plan, asked):
 
 OVEN = simulator()
 FIELD = Recording.from_arrays(x_mm=[500.0], y_mm=250.0, readings=[10.0], patterns={"field": EDGE}, unit="LEGO")
-
-
-class Empty(NamedEffect):
-    """An effect of which nothing was written yet."""
 
 
 class OneNumber:
@@ -434,7 +430,7 @@ MISTAKES = {
     ),
     "names for effects": (
         lambda: diagnosis.diagnose(RECORDING, effects=["lag"], rng=RNG),
-        "effects is .*; allowed: classes",
+        "effects is .*; allowed: effects by name",
     ),
     "a number for an effect": (
         lambda: diagnosis.diagnose(RECORDING, effects={"lag": 3}, rng=RNG),
@@ -442,11 +438,11 @@ MISTAKES = {
     ),
     "an effect by another name": (
         lambda: diagnosis.diagnose(RECORDING, effects={"lagg": VOCABULARY["lag"]}, rng=RNG),
-        "effects is 'lagg'; allowed: 'lag', the name of the class Lag",
+        "effects is 'lagg'; allowed: 'lag', the name of that effect",
     ),
-    "an effect that says nothing": (
-        lambda: diagnosis.diagnose(RECORDING, effects={"own": Empty}, rng=RNG),
-        "allowed: a class of an effect with .*; name is missing",
+    "a class for an effect": (
+        lambda: diagnosis.diagnose(RECORDING, effects={"own": Effect}, rng=RNG),
+        r"effects\['own'\] is .*; allowed: a function decorated with probewise.effects.light_effect",
     ),
     "one letter after the other": (
         lambda: model_with(RECORDING, "lag", rng=RNG),

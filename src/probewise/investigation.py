@@ -29,7 +29,7 @@ from probewise._kinds import (
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
-from probewise.effects import VOCABULARY, NamedEffect
+from probewise.effects import VOCABULARY, EffectKind
 from probewise.errors import FileError, ParameterError, did_you_mean
 from probewise.progress import Progress, silent
 from probewise.recordings import (
@@ -71,7 +71,7 @@ def investigate(
     plan: Plan,
     *,
     sensor: SensorPrior | None = None,
-    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    effects: Mapping[str, EffectKind] = VOCABULARY,
     budget: Budget | None = None,
     rounds: int = MOST_ROUNDS,
     hands: bool = True,

@@ -14,9 +14,7 @@ from probewise.diagnosis.arm_scans import candidate_scans
 from probewise.diagnosis.audit import ExpectedSensor, PlanTemplates, ProjectedTemplates, _curing_step_by_effect
 from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.sensors import default_sensor
-from probewise.effects import Extent
-from probewise.effects.optics import EdgeMisplacement
-from probewise.effects.pose import Backlash
+from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plan import Plan
@@ -24,7 +22,7 @@ from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FreeLevels, FreeMixture
 
 SPOT = np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0])  # a Gaussian of sd 5 mm
-TWO = {"backlash": Backlash, "edge_misplacement": EdgeMisplacement}
+TWO = {name: VOCABULARY[name] for name in ("backlash", "edge_misplacement")}
 
 
 def thinned(plan: Plan, step: int = 4) -> Plan:
@@ -55,7 +53,7 @@ def by_least_squares(plan: Plan, expected: ExpectedSensor) -> tuple[float, float
     slopes = np.stack([(own(z + step * e) - own(z - step * e)) / (2 * step) for e in np.eye(len(z))], axis=1)
     design = np.concatenate([slopes, np.eye(len(z))])
     left, raw = [], []
-    for kind in (Backlash, EdgeMisplacement):
+    for kind in TWO.values():
         theta = np.concatenate([sensor.theta(z[None, :]), [[1e-3]]], axis=1)
         trace = predict((kind(),), theta) - own(z)
         padded = np.concatenate([trace, np.zeros(len(z))])
@@ -78,7 +76,7 @@ def test_the_smallest_size_leaves_lambda_eight():
     (width_mm,) = seen.smallest_detectable_amplitudes(seen.laid.built["backlash"])
     theta = expected.null.theta(expected.z[None, :])
     plain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
-    with_play = plain.with_effects(Backlash())
+    with_play = plain.with_effects(VOCABULARY["backlash"]())
     trace = with_play.predict(np.concatenate([theta, [[width_mm]]], axis=1), plan) - plain.predict(theta, plan)
     assert share * np.linalg.norm(trace) / expected.sd == pytest.approx(8.0, rel=0.05)
 
@@ -199,7 +197,7 @@ def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():
     theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 58.0, 11.0])
     samples = theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8))
     sensor = SimpleNamespace(names=names, samples=samples)
-    audit = audit_plan(plan, sensor=sensor, effects={"backlash": Backlash})
+    audit = audit_plan(plan, sensor=sensor, effects={"backlash": VOCABULARY["backlash"]})
     assert audit.effects[0].detectability == "fine"
     assert "noise 0.47 LEGO" in audit.assumed
 

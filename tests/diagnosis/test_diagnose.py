@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import Diagnosis, Improvement, diagnose, diagnosis_json, diagnosis_schema
-from probewise.effects import EFFECTS, VOCABULARY, Extent, Origin
+from probewise.effects import EFFECTS, VOCABULARY, Origin
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
 from probewise.sensor import N_FREE_FORM, Stage
@@ -415,7 +415,7 @@ def test_what_a_free_ssf_takes_up_whole_is_no_effect_until_the_sensor_is_known()
     found = clean_diagnosis()
     named = {name for hypothesis in found.hypotheses for name in hypothesis.effects}
     assert not {"orientation_error", "edge_blur"} & named
-    blur = VOCABULARY["edge_blur"].for_extent(Extent(10.0, 60.0, plan))
+    blur = VOCABULARY["edge_blur"]
     heights = np.where(np.arange(len(plan)) < 400, np.nan, 20.0)
     raised = dataclasses.replace(plan, covariates={**plan.covariates, "height_mm": heights})
     assert blur.is_absorbed_by_ssf(plan)

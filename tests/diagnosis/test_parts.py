@@ -31,8 +31,8 @@ from probewise.diagnosis.sensors import FreeFormSensor, default_sensor, sensor_f
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.effects import VOCABULARY, Extent
+from probewise.effects.effect import Where
 from probewise.effects.noise import CorrelatedNoise
-from probewise.effects.pose import Backlash
 from probewise.effects.reference import candidate_scan_groups, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import (
@@ -77,8 +77,8 @@ def placed(effect, change, without, plan, covariates):
 
 def test_an_effect_of_scans_of_which_one_has_no_usable_reading_is_located_in_the_others():
     plan = line(scans=4).plan
-    effect = replace(VOCABULARY["scan_angle_error"].for_extent(Extent(0.0, 1.0, plan)), choices=(("s1", "s2"),))
-    (bound,) = effect.variants()
+    effect = VOCABULARY["scan_angle_error"].for_extent(Extent(0.0, 1.0, plan))
+    bound = replace(effect, where=Where(scans=("s1", "s2")))
     kept = plan.take(plan.scan != 1)  # as of usable readings
     scans = Covariate("scan", kept.scan.astype(float), np.arange(len(kept)), groups=True)
     change = np.where(kept.scan == 1, 2.0, 0.0)
@@ -186,7 +186,7 @@ def test_the_prior_of_an_earlier_free_form_does_not_depend_on_the_unit():
 
 def test_the_weight_of_a_variant_is_the_sum_over_its_settings():
     one = (np.zeros((5, 1)),) * 5
-    templates = EffectTemplates(one, one, (Backlash(),) * 3, np.array([0, 0, 1, 2, 2]))
+    templates = EffectTemplates(one, one, (VOCABULARY["backlash"](),) * 3, np.array([0, 0, 1, 2, 2]))
     np.testing.assert_allclose(templates.variant_probabilities(np.log([1.0, 3.0, 10.0, 5.0, 1.0])), [0.2, 0.5, 0.3])
 
 
@@ -427,7 +427,7 @@ def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
 
 def test_an_effect_of_one_scan_is_in_that_scan():
     scan = Covariate("scan", np.repeat([0.0, 1.0], 6), np.arange(12), groups=True)
-    effect = replace(VOCABULARY["scan_misplacement"].for_extent(EXTENT), scans=("s1",))
+    effect = replace(VOCABULARY["scan_misplacement"].for_extent(EXTENT), where=Where(scans=("s1",)))
     one = np.repeat([0.0, 1.0], 6)
     (found,) = placed(effect, one, 0 * one, line(6).plan, [scan])
     assert (found.covariate, found.scan, found.start) == ("scan", "s1", None)
@@ -437,7 +437,7 @@ def test_an_effect_of_one_mounting_is_in_the_scans_that_feel_it_the_strongest_fi
     """A scan over white looks the same from any angle: nothing shows there, though its mounting is turned too."""
     plan = line(6, scans=3).plan
     scan = Covariate("scan", np.repeat([0.0, 1.0, 2.0], 6), np.arange(18), groups=True)
-    effect = replace(VOCABULARY["scan_angle_error"].for_extent(EXTENT), scans=plan.scan_names)
+    effect = replace(VOCABULARY["scan_angle_error"].for_extent(EXTENT), where=Where(scans=plan.scan_names))
     change = np.repeat([0.5, 0.001, -2.0], 6)
     found = placed(effect, change, 0 * change, plan, [scan])
     assert [place.scan for place in found] == ["s2", "s0"]

@@ -17,9 +17,8 @@ from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.samples import ModelSamples, sample_model, weights_beside_other_effects
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.sensors import FreeFormSensor, GaussianMixtureSensor, default_sensor
-from probewise.effects import Extent
+from probewise.effects import EFFECTS, Extent
 from probewise.effects.noise import DriftingNoise
-from probewise.effects.reading import AmbientGradient, GainDrift
 from probewise.recordings import Recording, Uniform, two_way_plan
 from probewise.systems import RunTable, Simulator
 
@@ -71,7 +70,7 @@ def test_a_sensors_effects_count_from_where_those_that_were_fitted_do():
         PLAN, x_mm=PLAN.x_mm + 5e3, time_s=PLAN.time_s + 1.7e9, patterns=dict.fromkeys(PLAN.pattern_names, Uniform(1.0))
     )
     fitted = far.take(np.arange(40, 90))
-    effects = [kind.for_extent(Extent(10.0, 60.0, fitted)) for kind in (AmbientGradient, GainDrift)]
+    effects = [EFFECTS[name].for_extent(Extent(10.0, 60.0, fitted)) for name in ("ambient_gradient", "gain_drift")]
     sensor, rng = default_sensor(Extent(10.0, 60.0, fitted), 1), np.random.default_rng(0)
     chain = sensor.chain(far, effects, n_nodes=16)
     own = {"ambient_gradient.per_mm_x": 0.01, "gain_drift.frac": 0.2, "gain_drift.tau_s": 30.0}

@@ -11,35 +11,11 @@ import pytest
 
 from probewise._words import value_with_sd
 from probewise.diagnosis.findings import parameters_found
-from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
+from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
 from probewise.effects.noise import CorrelatedNoise, Dropouts
-from probewise.effects.optics import (
-    AlbedoGradient,
-    EdgeMisplacement,
-    EdgeShadow,
-    Glint,
-    Halo,
-    HeightOffset,
-    Reflection,
-    ScanMisplacement,
-    distinct_scan_lines,
-)
-from probewise.effects.pose import ArmKnock, Backlash, MissingTooth, PeriodicPositionError, ScanAngleError, StickSlip
-from probewise.effects.reading import (
-    AmbientGradient,
-    AmbientStep,
-    Flicker,
-    GainDrift,
-    GainStep,
-    Hysteresis,
-    Lag,
-    Nonlinearity,
-    Overshoot,
-    Polarisation,
-    Saturation,
-)
-from probewise.effects.reference import CountsFromOrigin, Origin, orientation_deg, sign_of_motion
+from probewise.effects.optics import distinct_scan_lines
+from probewise.effects.reference import Origin, orientation_deg, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
@@ -87,15 +63,12 @@ def base() -> Chain:
     )
 
 
-EFFECTS = {**VOCABULARY, **RARE_EFFECTS}
-
-
 @pytest.mark.parametrize("name", EFFECTS)
 def test_every_effect_keeps_the_contract(name):
     effect = EFFECTS[name].for_extent(EXTENT)
     names = effect.prior.names
     assert effect.name == name
-    assert effect.words
+    assert EFFECTS[name].words
     assert isinstance(effect.stage, Stage)
     assert len(effect.units) == len(names)
     assert effect.covariates
@@ -109,8 +82,7 @@ def test_every_effect_keeps_the_contract(name):
         assert said[0].islower()
         assert any(c.isdigit() for c in said)
         assert all(scan in said for scan in variant.scans)
-        assert len(variant.variants()) == len(effect.variants())
-    EFFECTS[name]()  # a sensor file needs its function only, whatever the prior's scale
+    assert EFFECTS[name]().prior.names == names  # a sensor file needs its function only, whatever the prior's scale
 
 
 @pytest.mark.parametrize("name", [name for name, kind in EFFECTS.items() if kind.stage is not Stage.NOISE])
@@ -273,21 +245,24 @@ def test_an_effect_that_could_not_show_is_not_built():
     missing = {name for name, kind in VOCABULARY.items() if kind.for_extent(one_scan) is None}
     assert missing == {"hysteresis", "battery_sag", "scan_misplacement", "scan_angle_error", "height_offset"}
     nowhere = Extent(10.0, 60.0, plan.take(np.arange(404, 405)))
-    assert PeriodicPositionError.for_extent(nowhere) is None
-    assert Glint.for_extent(nowhere) is None
-    assert AmbientStep.for_extent(nowhere) is None
+    for name in ("periodic_position_error", "glint", "ambient_step", "missing_tooth"):
+        assert EFFECTS[name].for_extent(nowhere) is None
+
+
+OF_MOUNTINGS = ("scan_angle_error", "height_offset")
 
 
 def test_effects_of_a_mounting_may_sit_in_each_mounting_and_each_scan():
     names = PLAN.scan_names
     at_90 = tuple(name for name in names if "90" in name)
-    for kind in (ScanAngleError, HeightOffset):
-        effect = kind.for_extent(EXTENT)
+    for name in OF_MOUNTINGS:
+        effect = VOCABULARY[name].for_extent(EXTENT)
         found = [variant.scans for variant in effect.variants()]
         assert at_90 in found
         assert [scans for scans in found if len(scans) == 1] == [(name,) for name in names]
         assert len(found) == len(set(found)) == len(names) + 4
-    assert [v.scans for v in ScanMisplacement.for_extent(EXTENT).variants()] == [(name,) for name in names]
+    misplaced = VOCABULARY["scan_misplacement"].for_extent(EXTENT)
+    assert [v.scans for v in misplaced.variants()] == [(name,) for name in names]
 
 
 @pytest.mark.parametrize(
@@ -305,12 +280,12 @@ def test_orientations_a_whole_turn_apart_are_one_mounting(written_deg, as_deg):
     turned = replace(plan, orientation_rad=np.radians(np.array(written_deg, dtype=float))[plan.scan % 4])
     np.testing.assert_array_equal(orientation_deg(turned), np.array(as_deg, dtype=float)[plan.scan % 4])
     together = tuple(name for k, name in enumerate(names) if k % 4 in (0, 2))
-    for kind in (ScanAngleError, HeightOffset):
-        groups = [variant.scans for variant in kind.for_extent(Extent(10.0, 60.0, turned)).variants()]
+    for name in OF_MOUNTINGS:
+        groups = [variant.scans for variant in VOCABULARY[name].for_extent(Extent(10.0, 60.0, turned)).variants()]
         assert together in groups
         assert len(groups) == len(set(groups))
     once = replace(plan, orientation_rad=np.where(plan.scan == 1, 2 * np.pi, 0.0))
-    every = [variant.scans for variant in ScanAngleError.for_extent(Extent(10.0, 60.0, once)).variants()]
+    every = [v.scans for v in VOCABULARY["scan_angle_error"].for_extent(Extent(10.0, 60.0, once)).variants()]
     assert every == [(name,) for name in names]  # all scans together are no mounting that could be off
 
 
@@ -328,8 +303,8 @@ def test_a_mounting_of_one_of_several_recordings_may_be_off_alone():
         covariates={},
         sessions=(0,) * len(plan.scan_names) + (1, 1),
     )
-    for kind in (ScanAngleError, HeightOffset):
-        groups = [variant.scans for variant in kind.for_extent(Extent(10.0, 60.0, both)).variants()]
+    for name in OF_MOUNTINGS:
+        groups = [variant.scans for variant in VOCABULARY[name].for_extent(Extent(10.0, 60.0, both)).variants()]
         at_0 = tuple(name for name in plan.scan_names if name in ("edge_0", "quadrants"))
         assert {at_0, (*at_0, "later_0"), plan.scan_names, ("later_0", "later_90")} <= set(groups)
         assert len(groups) == len(set(groups))
@@ -364,7 +339,7 @@ def over(plan: Plan) -> Chain:
     return replace(base(), scene=KnownScene(plan.patterns))
 
 
-FROM_ORIGIN = [name for name, kind in EFFECTS.items() if issubclass(kind, CountsFromOrigin)]
+FROM_ORIGIN = [name for name, kind in EFFECTS.items() if getattr(kind, "counts", "")]
 
 
 @pytest.mark.parametrize("name", FROM_ORIGIN)
@@ -374,8 +349,9 @@ def test_an_effect_means_the_same_on_a_recording_far_from_0(name):
     x_mm, y_mm = ((axis.min() + axis.max()) / 2 for axis in (PLAN.x_mm, PLAN.y_mm))
     at_0, there = moved_by(PLAN, -first_s, -x_mm, -y_mm), moved_by(PLAN, *dataclasses.astuple(FAR))
     near, far = (EFFECTS[name].for_extent(Extent(10.0, 60.0, plan)) for plan in (at_0, there))
-    assert near.origin == Origin()
-    assert dataclasses.astuple(far.origin) == pytest.approx((FAR.time_s + first_s, FAR.x_mm + x_mm, FAR.y_mm + y_mm))
+    assert near.where.origin == Origin()
+    expected = (FAR.time_s + first_s, FAR.x_mm + x_mm, FAR.y_mm + y_mm)
+    assert dataclasses.astuple(far.where.origin) == pytest.approx(expected)
     np.testing.assert_allclose(far.bank(), near.bank(), rtol=1e-6)
     u = np.random.default_rng(0).random((50, len(near.prior.names)))
     np.testing.assert_allclose(far.prior.from_unit_cube(u), near.prior.from_unit_cube(u), rtol=1e-6)
@@ -422,8 +398,9 @@ def test_effects_of_one_scan_leave_the_others_alone():
     """Turned, raised or moved in one scan: the readings of all others are those of the plain chain."""
     plain = base().predict(np.zeros((1, 0)), PLAN)
     inside = np.array([PLAN.scan_names[k] == "edge_90_out" for k in PLAN.scan])
-    for kind, size in ((ScanAngleError, 20.0), (HeightOffset, 1.0), (ScanMisplacement, 1.0)):
-        effect = next(v for v in kind.for_extent(EXTENT).variants() if v.scans == ("edge_90_out",))
+    for name, size in (("scan_angle_error", 20.0), ("height_offset", 1.0), ("scan_misplacement", 1.0)):
+        variants = VOCABULARY[name].for_extent(EXTENT).variants()
+        effect = next(v for v in variants if v.scans == ("edge_90_out",))
         found = base().with_effects(effect).predict(np.array([[size]]), PLAN)
         np.testing.assert_allclose(found[:, ~inside], plain[:, ~inside], atol=1e-9)
         assert np.abs(found[:, inside] - plain[:, inside]).max() > 0.5
@@ -431,29 +408,26 @@ def test_effects_of_one_scan_leave_the_others_alone():
 
 def test_a_shadow_falls_on_the_patterns_with_raised_edges_alone():
     """Two-way scans of half planes, quadrants and a disc: all of the kinds, one of them, or all but one."""
-    effect = EdgeShadow.for_extent(EXTENT)
-    choices = [variant.patterns for variant in effect.variants()]
+    variants = VOCABULARY["edge_shadow"].for_extent(EXTENT).variants()
+    choices = [variant.patterns for variant in variants]
     kinds = [{type(PLAN.patterns[name]) for name in names} for names in choices]
     assert [len(own) for own in kinds] == [0, 1, 1, 1, 2, 2, 2]
     assert set().union(*kinds) == {HalfPlane, Quadrant, Disc}
     plain = base().predict(np.zeros((1, 0)), PLAN)
     theta = np.array([[0.05, 4.0]])
 
-    def shadow(names: tuple[str, ...]) -> np.ndarray:
-        return base().with_effects(replace(effect, patterns=names)).predict(theta, PLAN) - plain
-
-    everywhere = shadow(())
-    for names in choices[1:]:
+    everywhere, *shadows = (base().with_effects(variant).predict(theta, PLAN) - plain for variant in variants)
+    for names, shadow in zip(choices[1:], shadows, strict=True):
         inside = np.array([PLAN.pattern_names[k] in names for k in PLAN.pattern])
-        np.testing.assert_array_equal(shadow(names)[:, ~inside], 0.0)
-        np.testing.assert_array_equal(shadow(names)[:, inside], everywhere[:, inside])
-        assert np.abs(shadow(names)).max() > 0.5
-    assert EdgeShadow.for_extent(Extent(10.0, 60.0, there_and_back())).choices == ((),)
+        np.testing.assert_array_equal(shadow[:, ~inside], 0.0)
+        np.testing.assert_array_equal(shadow[:, inside], everywhere[:, inside])
+        assert np.abs(shadow).max() > 0.5
+    (alone,) = VOCABULARY["edge_shadow"].for_extent(Extent(10.0, 60.0, there_and_back())).variants()
+    assert alone.patterns == ()
 
 
 def test_effects_stack_alike_whatever_the_order_given():
     """Three of one stage among others: names, columns and readings do not depend on who came first."""
-    effects = (EdgeMisplacement(), AlbedoGradient(), Flicker(), AmbientGradient(), Backlash(), Halo())
     sizes = {
         "edge_misplacement": [0.5],
         "albedo_gradient": [2e-3, 1e-3],
@@ -464,7 +438,7 @@ def test_effects_stack_alike_whatever_the_order_given():
     }
     plan = PLAN.take(np.arange(60, 130, 7))
     found = []
-    for order in [*permutations(effects)][::97]:
+    for order in [*permutations(VOCABULARY[name]() for name in sizes)][::97]:
         chain = base().with_effects(*order)
         theta = np.array([[x for effect in chain.effects for x in sizes[effect.name]]])
         found.append((chain.names, chain.predict(theta, plan)))
@@ -473,24 +447,29 @@ def test_effects_stack_alike_whatever_the_order_given():
         np.testing.assert_array_equal(readings, found[0][1])
 
 
+def between_s(step):
+    """The ends of the prior of its moment."""
+    return tuple(step.prior.from_unit_cube(np.array([[0.5, 0.0], [0.5, 1.0]]))[:, 1])
+
+
 def test_the_moments_of_a_step_lie_between_the_readings():
-    step = AmbientStep.for_extent(EXTENT)
-    ends = np.array([variant.between_s for variant in step.variants()])
+    step = VOCABULARY["ambient_step"].for_extent(EXTENT)
+    ends = np.array([between_s(variant) for variant in step.variants()])
     np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1])
     assert (ends[0, 0], ends[-1, 1]) == (PLAN.time_s.min(), PLAN.time_s.max())
-    short = AmbientStep.for_extent(Extent(0.0, 1.0, paper_plan()))
+    short = VOCABULARY["ambient_step"].for_extent(Extent(0.0, 1.0, paper_plan()))
     assert len(short.variants()) == 407
     for variant in (short.variants()[5], short.variants()[-1]):
-        low, high = variant.between_s
+        low, high = between_s(variant)
         readings = variant.apply(np.zeros((1, 408)), np.array([[2.0, low + 0.1], [2.0, high - 0.1]]), paper_plan())
         np.testing.assert_array_equal(readings[0], readings[1])
         np.testing.assert_array_equal(readings[0], 2.0 * (paper_plan().time_s >= high))
 
 
-@pytest.mark.parametrize("kind", [AmbientStep, ArmKnock, GainStep])
-def test_gates_open_what_each_variant_acts_on(kind):
+@pytest.mark.parametrize("name", ["ambient_step", "arm_knock", "gain_jump"])
+def test_gates_open_what_each_variant_acts_on(name):
     """Route one: everywhere, and the gate; route two: each variant by itself."""
-    effect = kind.for_extent(EXTENT).with_fewer_variants()
+    effect = EFFECTS[name].for_extent(EXTENT).with_fewer_variants()
     gates = effect.variant_masks(PLAN)
     plain = base().predict(np.zeros((1, 0)), PLAN)
     everywhere = base().with_effects(effect).predict(gates.always, PLAN) - plain
@@ -501,7 +480,7 @@ def test_gates_open_what_each_variant_acts_on(kind):
 
 
 def test_a_reflection_is_the_same_scene_seen_from_beside():
-    reflection = Reflection.for_extent(EXTENT)
+    reflection = EFFECTS["reflection"].for_extent(EXTENT)
     share, dx_mm, dy_mm = 0.3, 4.0, -2.5
     seen = base().with_effects(reflection).predict(np.array([[share, dx_mm, dy_mm]]), PLAN)
     beside = replace(PLAN, x_mm=PLAN.x_mm + dx_mm, y_mm=PLAN.y_mm + dy_mm)
@@ -510,18 +489,8 @@ def test_a_reflection_is_the_same_scene_seen_from_beside():
     np.testing.assert_allclose(seen, expected, atol=1e-9)
 
 
-def test_a_missing_tooth_moves_what_lies_beyond_it_along_its_axis_alone():
-    tooth = MissingTooth.for_extent(EXTENT)
-    for axis, name in enumerate(("x_mm", "y_mm")):
-        at_mm = float(np.median(getattr(PLAN, name)))
-        own = getattr(PLAN, name)
-        moved = replace(PLAN, **{name: own + 0.7 * (own > at_mm)})
-        seen = base().with_effects(tooth).predict(np.array([[0.7, at_mm, float(axis)]]), PLAN)
-        np.testing.assert_allclose(seen, base().predict(np.zeros((1, 0)), moved), atol=1e-9)
-
-
 def test_a_slide_that_sticks_lags_ever_more_and_jumps_once_a_period():
-    slide = StickSlip.for_extent(EXTENT)
+    slide = EFFECTS["stick_slip"].for_extent(EXTENT)
     amp_mm, period_mm, phase = 0.8, 20.0, 0.15
     x_mm = np.linspace(-30, 30, 6001)
     poses = Poses(x_mm[None], np.zeros((1, len(x_mm))), np.zeros((1, 1)))
@@ -540,10 +509,12 @@ def test_places_that_differ_in_the_last_digit_are_one_place():
     out = -50 + 0.1 * np.arange(1001)
     back = np.nextafter(out[::-1], np.inf)
     both = Extent(0.0, 1.0, plan_along(np.append(out, back), np.zeros(2002), np.repeat([0, 1], 1001)))
-    for kind in (PeriodicPositionError, StickSlip):
-        assert kind.for_extent(both).shortest_mm == pytest.approx(0.3)
-    alone = MissingTooth.for_extent(Extent(0.0, 1.0, plan_along(out, np.zeros(1001))))
-    np.testing.assert_allclose(MissingTooth.for_extent(both).places_mm[0], alone.places_mm[0], atol=1e-12)
+    for name in ("periodic_position_error", "stick_slip"):
+        prior = EFFECTS[name].for_extent(both).prior
+        assert prior.from_unit_cube(np.array([[0.5, 0.0, 0.5]]))[0, 1] == pytest.approx(0.3)
+    alone = Extent(0.0, 1.0, plan_along(out, np.zeros(1001)))
+    there, here = (EFFECTS["missing_tooth"].for_extent(extent).variants() for extent in (both, alone))
+    np.testing.assert_allclose([v.bank()[0, 0] for v in there], [v.bank()[0, 0] for v in here], atol=1e-12)
 
 
 def test_rest_is_rest_whatever_the_last_digit_of_a_place():
@@ -556,7 +527,7 @@ def test_rest_is_rest_whatever_the_last_digit_of_a_place():
     np.testing.assert_array_equal(sign_of_motion(along_y), np.repeat([1.0, -1.0], 20))
     at_rest = Extent(0.0, 1.0, plan_along(exact, y_mm))
     assert at_rest.length_mm == 1.0
-    assert AmbientGradient.for_extent(at_rest) is None
+    assert VOCABULARY["ambient_gradient"].for_extent(at_rest) is None
 
 
 def test_times_that_differ_in_the_last_digit_are_one_time():
@@ -564,81 +535,45 @@ def test_times_that_differ_in_the_last_digit_are_one_time():
     time_s = np.repeat([0.1, 0.2, 0.3], 2)
     time_s[1::2] = np.nextafter(time_s[1::2], np.inf)
     extent = Extent(0.0, 1.0, replace(plan, time_s=time_s))
-    assert AmbientStep.for_extent(extent).times_s == (0.1, 0.2, 0.3)
+    assert VOCABULARY["ambient_step"].for_extent(extent).change_points.at == (0.1, 0.2, 0.3)
     assert extent.gap_s == pytest.approx(0.1)
 
 
 def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():
-    step = AmbientStep.for_extent(Extent(0.0, 1.0, there_and_back()))
+    step = VOCABULARY["ambient_step"].for_extent(Extent(0.0, 1.0, there_and_back()))
     theta = np.full((4000, 2), [1.5, 5.0])
     weights = np.array([0.0, 0.25, 0.75, 0.0, 0.0])
     found = step.variants()[2].redraw_by_variant(theta, weights, rng=np.random.default_rng(0))
     np.testing.assert_array_equal(found[:, 0], 1.5)
     assert (found[:, 1].min() > 10.0, found[:, 1].max() < 30.0) == (True, True)
     assert np.mean(found[:, 1] < 20.0) == pytest.approx(0.25, abs=0.03)
-    plain = Backlash().redraw_by_variant(theta[:, :1], np.ones(1), rng=np.random.default_rng(0))
+    plain = VOCABULARY["backlash"]().redraw_by_variant(theta[:, :1], np.ones(1), rng=np.random.default_rng(0))
     np.testing.assert_array_equal(plain, theta[:, :1])
 
 
-@pytest.mark.parametrize("kind", [Flicker, PeriodicPositionError])
-def test_sine_and_cosine_join_into_amplitude_and_phase(kind):
-    effect = kind.for_extent(EXTENT)
+@pytest.mark.parametrize("name", ["flicker", "periodic_position_error"])
+def test_sine_and_cosine_join_into_amplitude_and_phase(name):
+    effect = VOCABULARY[name].for_extent(EXTENT)
     entry = effect.bank()[3]
     start = effect.start(entry, np.array([1.2, -0.5]))
     rate = entry[0, 1]
     x = np.linspace(0, 7, 50)
-    w = 2 * np.pi * (rate if kind is Flicker else 1 / rate)
+    w = 2 * np.pi * (rate if name == "flicker" else 1 / rate)
     both = entry[0, 0] * (1.2 * np.sin(w * x) - 0.5 * np.cos(w * x))
     np.testing.assert_allclose(start[0] * np.sin(w * x + start[2]), both, atol=1e-12)
 
 
 def test_frequencies_lie_close_enough_to_find_any():
     """Half the spacing lets a wave of the whole recording slip by a quarter of a turn at either end, at most."""
-    flicker = Flicker.for_extent(Extent(10.0, 60.0, paper_plan()))
+    flicker = VOCABULARY["flicker"].for_extent(Extent(10.0, 60.0, paper_plan()))
     frequencies = flicker.bank()[:, 0, 1]
-    assert flicker.highest_hz == pytest.approx(0.5 / 1.2)
+    assert flicker.prior.from_unit_cube(np.array([[0.5, 1.0, 0.5]]))[0, 1] == pytest.approx(0.5 / 1.2)
     assert np.diff(frequencies).max() * np.ptp(paper_plan().time_s) <= 0.51
-
-
-def test_gain_drift_scales_the_signal_and_fades():
-    plan = there_and_back()
-    out = GainDrift().apply(np.full((1, 6), 50.0), np.array([[0.1, 20.0]]), plan)
-    np.testing.assert_allclose(out[0], 50 * (1 + 0.1 * np.exp(-plan.time_s / 20)))
-
-
-def test_lag_is_the_recursion_in_every_scan():
-    """v_k = a v_(k-1) + (1 - a) y_k, reading by reading."""
-    rng = np.random.default_rng(3)
-    plan, taus = PLAN.take(np.arange(90, 320)), np.array([[0.3], [1.7], [12.0]])
-    values = rng.normal(size=(3, len(plan)))
-    found = Lag().apply(values, taus, plan)
-    for tau, y, v in zip(taus[:, 0], values, found, strict=True):
-        held = y.copy()
-        for k in range(1, len(plan)):
-            if plan.scan[k] == plan.scan[k - 1]:
-                a = np.exp(-(plan.time_s[k] - plan.time_s[k - 1]) / tau)
-                held[k] = a * held[k - 1] + (1 - a) * y[k]
-        np.testing.assert_allclose(v, held, atol=1e-12)
-
-
-def test_an_overshoot_is_left_by_every_rise_and_decays():
-    """Pulse by pulse; falls leave nothing, and the time between scans counts."""
-    rng = np.random.default_rng(4)
-    plan, thetas = PLAN.take(np.arange(90, 320)), np.array([[0.1, 0.4], [-0.05, 6.0]])
-    values = rng.normal(size=(2, len(plan)))
-    found = Overshoot().apply(values, thetas, plan)
-    for (share, tau), y, v in zip(thetas, values, found, strict=True):
-        expected = y.copy()
-        for k in range(1, len(plan)):
-            if y[k] > y[k - 1]:
-                expected[k:] += share * (y[k] - y[k - 1]) * np.exp(-(plan.time_s[k:] - plan.time_s[k]) / tau)
-        np.testing.assert_allclose(v, expected, atol=1e-12)
-    np.testing.assert_array_equal(Overshoot().apply(-np.sort(-values, axis=1), thetas, plan), -np.sort(-values, axis=1))
 
 
 def test_an_overshoot_needs_time_that_passes():
     plan = replace(there_and_back(), time_s=np.zeros(6))
-    assert Overshoot.for_extent(Extent(10.0, 60.0, plan)) is None
+    assert EFFECTS["overshoot"].for_extent(Extent(10.0, 60.0, plan)) is None
 
 
 @pytest.mark.parametrize(("gap", "told"), [(0.03, True), (0.0, False)])
@@ -646,36 +581,27 @@ def test_a_size_of_either_sign_is_told_with_its_range(gap, told):
     """And one that is not told from 0 has no sign to tell."""
     share = 0.01 * np.random.default_rng(3).standard_normal(500)
     samples = np.stack([share + gap * np.sign(share), np.full(500, 6.0)], axis=1)
-    said = sentence_from_samples(Overshoot(), samples)
+    said = sentence_from_samples(EFFECTS["overshoot"](), samples)
     assert ("; its size share may have either sign, between -0.05" in said) is told
-
-
-def test_polarised_light_is_the_law_of_malus():
-    """A polarised share p of the light gives I (1 - p + 2 p cos^2(psi - phi))."""
-    plan, p, phi = replace(there_and_back(), orientation_rad=np.linspace(0.0, 3.0, 6)), 0.03, 0.8
-    theta = p * np.array([[np.cos(2 * phi), np.sin(2 * phi)]])
-    out = Polarisation().apply(np.full((1, 6), 50.0), theta, plan)
-    np.testing.assert_allclose(out[0], 50 * (1 - p + 2 * p * np.cos(plan.orientation_rad - phi) ** 2))
 
 
 def test_polarisation_shows_only_in_orientations_that_differ():
     opposite = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.3 + np.pi], 3))
-    assert Polarisation.for_extent(Extent(10.0, 60.0, opposite)) is None
+    assert EFFECTS["polarisation"].for_extent(Extent(10.0, 60.0, opposite)) is None
     turned = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.7], 3))
-    assert Polarisation.for_extent(Extent(10.0, 60.0, turned)) is not None
+    assert EFFECTS["polarisation"].for_extent(Extent(10.0, 60.0, turned)) is not None
 
 
-def test_saturation_is_a_hard_limit_as_its_softness_goes_to_zero():
+def test_a_soft_saturation_is_below_its_limit_and_nothing_far_below():
     values = np.array([[10.0, 49.0, 50.0, 51.0, 80.0]])
-    hard = Saturation().apply(values, np.array([[50.0, 1e-6]]), there_and_back())
-    np.testing.assert_allclose(hard, np.minimum(values, 50.0), atol=1e-5)
-    soft = Saturation().apply(values, np.array([[50.0, 4.0]]), there_and_back())
+    soft = VOCABULARY["saturation"]().apply(values, np.array([[50.0, 4.0]]), there_and_back())
     assert (soft < np.minimum(values, 50.0)).all()
     assert soft[0, 0] == pytest.approx(10.0, abs=1e-3)
 
 
 def test_nonlinearity_keeps_black_and_white():
-    out = Nonlinearity().apply(np.array([[-1e-17, 0.0, 0.25, 1.0, 1 + 1e-15]]), np.array([[0.5]]), there_and_back())
+    values = np.array([[-1e-17, 0.0, 0.25, 1.0, 1 + 1e-15]])
+    out = VOCABULARY["nonlinearity"]().apply(values, np.array([[0.5]]), there_and_back())
     np.testing.assert_allclose(out, [[0.0, 0.0, 0.5, 1.0, 1.0]])
 
 
@@ -699,7 +625,7 @@ def test_a_missing_voltage_of_the_battery_is_that_of_the_readings_around_it():
     with_gaps = np.array([np.nan, 7500.0, np.nan, 7400.0, np.nan, np.nan, 7100.0, np.nan])
     plan = replace(plan, covariates={"battery_mv": with_gaps})
     effect = VOCABULARY["battery_sag"].for_extent(Extent(0.0, 1.0, plan))
-    assert effect.typical_per_volt == pytest.approx(0.02 / 0.4)
+    assert effect.bank()[0, 0, 0] == pytest.approx(0.02 / 0.4)
     below = np.array([0.5, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 0.9])
     out = effect.apply(np.full((1, 8), 40.0), np.array([[0.1]]), plan)
     np.testing.assert_allclose(out[0], 40 * (1 - 0.1 * below))
@@ -761,5 +687,5 @@ def test_hysteresis_compares_the_directions_that_the_recording_has(x_mm, said):
     recording = Recording.from_arrays(
         x_mm=x_mm, y_mm=0.0, readings=np.arange(len(x_mm)), scan=scan, patterns=Uniform(0.5), unit="V"
     )
-    effect = Hysteresis.for_extent(Extent.of(recording))
+    effect = VOCABULARY["hysteresis"].for_extent(Extent.of(recording))
     assert said in effect.sentence(np.array([3.0]), np.array([0.2]))

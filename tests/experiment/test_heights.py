@@ -11,7 +11,6 @@ from exploring import run
 from probewise.arm import LegoArm, Pose, Reading, as_instrument, read_geometry, shipped_geometry_path
 from probewise.calibration import FittedSensor
 from probewise.cli._bench import InstrumentWithCallbacks
-from probewise.effects.optics import HeightGradient
 from probewise.errors import DoubtfulResultWarning, ParameterError, ReachError
 from probewise.experiment import arm_over, experiment_for, explore, read_journal, result_json
 from probewise.inference import GaussianKnown
@@ -159,8 +158,8 @@ def test_a_slope_among_the_rivals_is_one_hundredth_of_the_calibrated_height(clos
     plain = replace(close_sensor, names=NAMES, samples=SAMPLES, effects=())
     for sensor, height_mm in ((plain, LOW_MM), (replace(plain, instrumentation=Instrumentation()), 14.0)):
         experiment = experiment_for(sensor, CIRCLE, FIELD, trust=0.9)
-        (slope,) = [kind.effect for kind in experiment.kinds if kind.left_out == HeightGradient.name]
-        assert slope.effect.typical == pytest.approx(0.01 * height_mm / np.hypot(300.0, 200.0))
+        (slope,) = [kind.effect for kind in experiment.kinds if kind.left_out == "height_gradient"]
+        assert slope.effect.bank()[0, 0, 0] == pytest.approx(0.01 * height_mm / np.hypot(300.0, 200.0))
 
 
 def test_a_journal_names_the_height_only_beside_others_to_choose(small, close_sensor):

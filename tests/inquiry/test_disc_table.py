@@ -6,10 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.effects import VOCABULARY, Known
-from probewise.effects.optics import AlbedoGradient, EdgeBlur
-from probewise.effects.pose import Backlash
-from probewise.effects.reading import Hysteresis, Saturation
+from probewise.effects import EFFECTS, VOCABULARY, Known
 from probewise.inquiry import (
     Designs,
     DirectForecast,
@@ -27,7 +24,6 @@ from probewise.inquiry.forecast import MOST_LEVELS
 from probewise.scene import Circle, HypothesisScene, Rectangle
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 
-SATURATION = Saturation(20.0, 75.0, 0.05, 15.0)
 LEVELS = np.linspace(10.0, 60.0, 101)
 
 
@@ -160,11 +156,11 @@ def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():
 def test_a_sensor_with_known_effects_is_looked_up_too(made, places, names):
     """A repaired sensor predicts from the table what its chain predicts by quadrature."""
     values = {
-        "backlash": (Backlash(), (6.0,)),
-        "edge_blur": (EdgeBlur(), (8.0,)),
-        "saturation": (SATURATION, (45.0, 1.0)),
+        "backlash": (6.0,),
+        "edge_blur": (8.0,),
+        "saturation": (45.0, 1.0),
     }
-    model = replace(made.chain(), effects=tuple(Known(*values[name]) for name in names))
+    model = replace(made.chain(), effects=tuple(Known(EFFECTS[name](), values[name]) for name in names))
     forecast, theta = forecast_of(model), made.circles(40)
     assert isinstance(forecast.model, DiscTable | TabulatedChain)
     run = replace(places, scan=np.zeros(len(places), dtype=np.int64), scan_names=("run",))
@@ -172,12 +168,12 @@ def test_a_sensor_with_known_effects_is_looked_up_too(made, places, names):
     assert away.max() < 0.05
     assert np.sqrt((away**2).mean()) < 0.002
     # A rival beside what is known looks the same table up.
-    acting = TabulatedChain.of(model.with_effects(Hysteresis()), forecast.model)
+    acting = TabulatedChain.of(model.with_effects(EFFECTS["hysteresis"]()), forecast.model)
     both = np.concatenate([theta, np.full((40, 1), 4.0)], axis=1)
-    expected = model.with_effects(Hysteresis()).predict(both, run)
+    expected = model.with_effects(EFFECTS["hysteresis"]()).predict(both, run)
     assert np.abs(acting.predict(both, run) - expected).max() < 0.05
 
 
 def test_an_effect_that_changes_with_the_place_is_asked_itself(made):
-    graded = replace(made.chain(), effects=(Known(AlbedoGradient(), (1e-4, 0.0)),))
+    graded = replace(made.chain(), effects=(Known(EFFECTS["albedo_gradient"](), (1e-4, 0.0)),))
     assert forecast_of(graded).model is graded

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.effects.reading import GainDrift
+from probewise.effects import EFFECTS
 from probewise.inquiry import Designs, DirectForecast, Grid, InformationGain, Readout, UtilityInput, forecast_of
 from probewise.inquiry.forecast import predict_where_visible
 from probewise.recordings import Instrumentation
@@ -55,7 +55,9 @@ def test_most_hypotheses_are_not_asked_about_most_places():
 
 
 @pytest.mark.parametrize(
-    "model", [chain(SHAPES[0], FreeLevels()), chain(SHAPES[0], effects=(GainDrift(),))], ids=["levels", "effects"]
+    "model",
+    [chain(SHAPES[0], FreeLevels()), chain(SHAPES[0], effects=(EFFECTS["gain_drift"](),))],
+    ids=["levels", "effects"],
 )
 def test_readings_that_depend_on_more_than_the_shape_are_asked_everywhere(model):
     theta = np.full((2, len(model.names)), 50.0)

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from mixtures import fixed_mixture
 from scipy.special import ndtr
 
-from probewise.effects.optics import HeightGradient
-from probewise.effects.pose import PositionScale
+from probewise.effects import EFFECTS
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds
@@ -95,7 +94,7 @@ def _model(request):
 
 def test_hypotheses_predicted_in_blocks_read_as_all_at_once(monkeypatch):
     plan, chain = plan_of(40), Chain(FreeMixture(2), FreeLevels(), KnownScene(PATTERNS))
-    chain = chain.with_effects(HeightGradient(), PositionScale())
+    chain = chain.with_effects(EFFECTS["height_gradient"](), EFFECTS["position_scale"]())
     theta = np.concatenate([thetas(30, 2), np.random.default_rng(3).normal(0, 0.01, (30, 3))], axis=1)
     whole = chain.predict(theta, plan)
     monkeypatch.setattr("probewise.sensor.chain._MOST_NUMBERS", 7 * 40 * 2)

@@ -10,8 +10,8 @@ import numpy as np
 from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
+from probewise.effects import EFFECTS, Origin
 from probewise.effects.noise_distribution import PredictiveMixture
-from probewise.effects.reference import CountsTimeFromOrigin
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
@@ -95,15 +95,17 @@ def predict(
     there = chain.plan_at_calibrated_height(plan)  # once, so that the chain lays out the scene once for all blocks
     model = chain if sensor.effects else DeduplicatedModel(chain, there)
     for effect in sensor.effects_on_new_scans:
-        for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
+        kind = EFFECTS[effect.name]
+        for column in {*getattr(kind, "reads", ())} - {*plan.covariates}:
             warnings.warn(
                 f"the plan has no column {column}, which {effect.name} reads: predicted as for its reference value",
                 DoubtfulResultWarning,
                 stacklevel=2,
             )
-        if isinstance(effect, CountsTimeFromOrigin) and (plan.time_s < effect.origin.time_s).all():
+        from_s = sensor.origins.get(effect.name, Origin()).time_s
+        if getattr(kind, "counts", "") == "time" and (plan.time_s < from_s).all():
             warnings.warn(
-                f"the plan's times, up to {plan.time_s.max():.12g} s, lie before {effect.origin.time_s:.12g} s, "
+                f"the plan's times, up to {plan.time_s.max():.12g} s, lie before {from_s:.12g} s, "
                 f"from which {effect.name} counts: is it another clock?",
                 DoubtfulResultWarning,
                 stacklevel=2,

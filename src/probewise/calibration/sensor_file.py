@@ -26,9 +26,9 @@ from probewise.calibration.fields import posterior_mean_ssf_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
-from probewise.effects import EFFECTS, Origin
-from probewise.effects.optics import EdgeShadow
-from probewise.effects.reference import CountsFromOrigin
+from probewise.effects import EFFECTS, Extent, LightEffect, Origin
+from probewise.effects.optics import edge_shadow, edge_shadow_of_patterns
+from probewise.effects.reference import ZERO
 from probewise.errors import FileError, ParameterError, ProbewiseError, printable, shown
 from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
@@ -57,7 +57,7 @@ _FOR_A_FREE_FORM = 4  # Gaussians that approximate a free-form SSF where a mixtu
 # The light sensor's own `gain_step`, until 0.1, before any simulator had an effect of that name.
 _GAIN_STEP = re.compile(r'"gain_step(?="|\.frac"|\.at_s")')
 # Effects that may be restricted to some patterns.
-_BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
+_BOUND_TO_PATTERNS = frozenset({edge_shadow.name})
 
 
 @dataclass(frozen=True)
@@ -177,10 +177,10 @@ class FittedSensor(NamedSamples):
         return tuple(self._build_effect(name) for name in self.effects if name not in BOUND_TO_SCANS)
 
     def _build_effect(self, name: str) -> AnyEffect:
-        kind: type[AnyEffect] = EFFECTS[name]
-        if name in self.origins:
-            return cast(AnyEffect, cast(type[CountsFromOrigin], kind)(origin=self.origins[name]))
-        return _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else kind()
+        if name in self.patterns:
+            return edge_shadow_of_patterns(edge_shadow, Extent.usual(ZERO), self.patterns[name])
+        kind = EFFECTS[name]
+        return kind(self.origins.get(name, ZERO)) if isinstance(kind, LightEffect) else kind()
 
     @property
     def samples_for_new_scans(self) -> FloatArray:
@@ -438,7 +438,7 @@ def require_fitted_sensor(sensor: object, more: str = "") -> None:
 
 
 def _counts_from_origin(name: str) -> bool:
-    return issubclass(EFFECTS[name], CountsFromOrigin)
+    return bool(getattr(EFFECTS[name], "counts", ""))
 
 
 def _precision_determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:

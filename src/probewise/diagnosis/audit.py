@@ -40,7 +40,7 @@ from probewise.diagnosis.sensors import (
 )
 from probewise.diagnosis.templates import templates_of_effect
 from probewise.diagnosis.words import substitute_reading_unit
-from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.effects import VOCABULARY, EffectKind, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
@@ -88,7 +88,7 @@ class PlanTemplates:
         cls,
         expected: ExpectedSensor,
         plan: Plan,
-        effects: Mapping[str, type[NamedEffect[Any]]],
+        effects: Mapping[str, EffectKind],
         *,
         most: int | None = None,
     ) -> Self:
@@ -424,7 +424,7 @@ def audit_plan(
     *,
     sensor: SensorPrior | None = None,
     noise_sd: float | None = None,
-    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    effects: Mapping[str, EffectKind] = VOCABULARY,
     progress: Progress = silent,
 ) -> PlanAudit:
     """Determine for each effect whether a plan detects it and tells it from every other, and which readings would help.
@@ -503,7 +503,7 @@ def audit_plan_of_diagnosis(
     diagnosis: Diagnosis,
     *,
     sensor: SensorPrior | None = None,
-    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    effects: Mapping[str, EffectKind] = VOCABULARY,
 ) -> PlanAudit:
     """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
 
@@ -572,7 +572,7 @@ def _expected_sensor_and_description(
 
 
 def audits_and_cosines(
-    laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
+    laid: PlanTemplates, effects: Mapping[str, EffectKind], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Return the audit of every effect, and the matrix of cosines (row imitated by column; shares on the diagonal)."""
     seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
@@ -621,7 +621,7 @@ _STRIDES = (1, 4)
 def choose_cure_scans(
     plan: Plan,
     expected: ExpectedSensor,
-    effects: Mapping[str, type[NamedEffect[Any]]],
+    effects: Mapping[str, EffectKind],
     ailing: Sequence[str],
     progress: Progress = silent,
 ) -> list[Scan]:

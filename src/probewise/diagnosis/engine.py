@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -40,8 +40,8 @@ from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreemen
 from probewise.diagnosis.sensors import SensorPrior
 from probewise.diagnosis.verdict import GlobalTest, Judged, judge, run_global_test
 from probewise.diagnosis.words import hypothesis_in_words
-from probewise.effects import VOCABULARY, NamedEffect
-from probewise.effects.effect import require_effect_classes, sentence_from_samples
+from probewise.effects import VOCABULARY, EffectKind
+from probewise.effects.effect import require_effect_kinds, sentence_from_samples
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
@@ -55,7 +55,7 @@ def diagnose(
     *,
     sensor: SensorPrior | None = None,
     null: Null | None = None,
-    effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    effects: Mapping[str, EffectKind] = VOCABULARY,
     thorough: Thorough | None = None,
     hands: bool = True,
     rng: np.random.Generator,
@@ -102,7 +102,7 @@ def diagnose(
     """
     require_rng(rng)
     require_progress(progress)
-    require_effect_classes(effects)
+    require_effect_kinds(effects)
     if null is not None:
         allowed = "a null model: SensorAndShape, of probewise.diagnosis; a sensor is sensor="
         require_like("null", null, ("admits", "starts", "n_params"), allowed)

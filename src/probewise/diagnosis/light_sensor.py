@@ -22,7 +22,7 @@ from probewise.diagnosis.arm_scans import (
 from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.locate import Covariate
-from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Extent, NamedEffect
+from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, EffectKind, Extent, LightEffect, NamedEffect
 from probewise.effects.reference import orientation_deg, sign_of_motion
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene import edge_distance, region_of
@@ -166,7 +166,7 @@ class LightSensorApparatus(Apparatus):
     `hands`: a person can exchange or turn sheets; otherwise the next scans are over the pattern of the last reading.
     """
 
-    vocabulary: Mapping[str, type[NamedEffect[Any]]] = field(default_factory=lambda: dict(VOCABULARY))
+    vocabulary: Mapping[str, EffectKind] = field(default_factory=lambda: dict(VOCABULARY))
     hands: bool = True
     words = Words(
         null="the sensor",
@@ -190,12 +190,13 @@ class LightSensorApparatus(Apparatus):
         """
         extent, plan = Extent.of(recording), recording.plan
         kinds = {**self.vocabulary, **RARE_EFFECTS, **NUISANCES}
+        if null is None:
+            absorbed = {
+                n for n, kind in kinds.items() if isinstance(kind, LightEffect) and kind.is_absorbed_by_ssf(plan)
+            }
+            kinds = {name: kind for name, kind in kinds.items() if name not in absorbed}
         able = {name: effect for name, kind in kinds.items() if (effect := kind.for_extent(extent)) is not None}
-        return {
-            name: effect
-            for name, effect in able.items()
-            if (null.admits(effect) if null is not None else not effect.is_absorbed_by_ssf(plan))
-        }
+        return {name: effect for name, effect in able.items() if null is None or null.admits(effect)}
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Return the names of effects defined outside this library."""

@@ -1,7 +1,8 @@
 """Effects: physics that a sensor model may leave out, each one function at one stage of the chain.
 
 The paper's model, M = I_min + (I_max - I_min) R, holds the footprint (in its response R) and two levels; these are the
-named departures from it. A new effect is a class (a `NamedEffect`), passed as ``effects={**VOCABULARY, name: class}``.
+named departures from it. A new effect is one function, decorated with `light_effect`, passed as
+``effects={**VOCABULARY, name: effect}``.
 
 Drifts, gradients, scales and the phases of waves count from an `Origin`: time 0 and place (0, 0), or, where all of a
 recording lies farther from 0 than ten times its duration (or its size), its first time (or the middle of its places).
@@ -9,70 +10,64 @@ recording lies farther from 0 than ten times its duration (or its size), its fir
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 from probewise.effects import noise, optics, pose, reading
-from probewise.effects.effect import NamedEffect, NoiseEffect
+from probewise.effects.effect import AGAIN, Effect, EffectKind, LightEffect, NamedEffect, NoiseEffect, light_effect
 from probewise.effects.known import Estimated, Known
 from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.reference import Extent, Origin
 
-VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
-    {
-        effect.name: effect
-        for effect in (
-            reading.AmbientGradient,
-            reading.AmbientStep,
-            reading.OffsetDrift,
-            reading.GainDrift,
-            reading.BatterySag,
-            reading.Flicker,
-            reading.Saturation,
-            reading.Nonlinearity,
-            reading.Hysteresis,
-            reading.Lag,
-            pose.Backlash,
-            pose.PositionScale,
-            pose.PeriodicPositionError,
-            optics.EdgeMisplacement,
-            optics.ScanMisplacement,
-            pose.ScanAngleError,
-            pose.OrientationError,
-            pose.SensorTilt,
-            optics.HeightGradient,
-            optics.HeightOffset,
-            optics.AlbedoGradient,
-            optics.AlbedoPatch,
-            optics.EdgeBlur,
-            optics.EdgeShadow,
-            optics.Halo,
-            optics.Glint,
-            noise.Quantisation,
-            noise.SignalDependentNoise,
-            noise.CorrelatedNoise,
-            noise.Outliers,
-            noise.Dropouts,
-        )
-    }
+
+def _by_name(*effects: EffectKind) -> Mapping[str, EffectKind]:
+    return MappingProxyType({str(effect.name): effect for effect in effects})
+
+
+VOCABULARY: Mapping[str, EffectKind] = _by_name(
+    reading.ambient_gradient,
+    reading.ambient_step,
+    reading.offset_drift,
+    reading.gain_drift,
+    reading.battery_sag,
+    reading.flicker,
+    reading.saturation,
+    reading.nonlinearity,
+    reading.hysteresis,
+    reading.lag,
+    pose.backlash,
+    pose.position_scale,
+    pose.periodic_position_error,
+    optics.edge_misplacement,
+    optics.scan_misplacement,
+    pose.scan_angle_error,
+    pose.orientation_error,
+    pose.sensor_tilt,
+    optics.height_gradient,
+    optics.height_offset,
+    optics.albedo_gradient,
+    optics.albedo_patch,
+    optics.edge_blur,
+    optics.edge_shadow,
+    optics.halo,
+    optics.glint,
+    noise.Quantisation,
+    noise.SignalDependentNoise,
+    noise.CorrelatedNoise,
+    noise.Outliers,
+    noise.Dropouts,
 )
 """Every effect that the diagnosis considers, by name."""
 
-RARE_EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
-    {
-        effect.name: effect
-        for effect in (
-            pose.ArmKnock,
-            reading.GainStep,
-            pose.BentRails,
-            pose.MissingTooth,
-            pose.StickSlip,
-            optics.Reflection,
-            pose.SlowTurn,
-            optics.SlowSinking,
-            reading.Overshoot,
-            reading.Polarisation,
-        )
-    }
+RARE_EFFECTS: Mapping[str, EffectKind] = _by_name(
+    pose.arm_knock,
+    reading.gain_jump,
+    pose.bent_rails,
+    pose.missing_tooth,
+    pose.stick_slip,
+    optics.reflection,
+    pose.slow_turn,
+    optics.slow_sinking,
+    reading.overshoot,
+    reading.polarisation,
 )
 """Rare physics outside the vocabulary, by name.
 
@@ -81,7 +76,7 @@ form of the unknown.
 """
 
 
-EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
+EFFECTS: Mapping[str, EffectKind] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
 
 PROPOSAL = "formula:"
@@ -91,10 +86,6 @@ PROPOSAL = "formula:"
 def is_out_of_vocabulary(name: str) -> bool:
     """Return whether an effect is outside the vocabulary: a rare one, or a proposed formula."""
     return name in RARE_EFFECTS or name.startswith(PROPOSAL)
-
-
-AGAIN = "~again"
-"""Suffix of an effect's second copy: the same physics twice, as two steps of the light."""
 
 
 def name_without_copy_suffix(name: str) -> str:
@@ -123,15 +114,19 @@ __all__ = [
     "PROPOSAL",
     "RARE_EFFECTS",
     "VOCABULARY",
+    "Effect",
+    "EffectKind",
     "Estimated",
     "Extent",
     "HeavyTailedPrior",
     "Known",
+    "LightEffect",
     "LogHeavyTailedPrior",
     "NamedEffect",
     "NoiseEffect",
     "Origin",
     "is_out_of_vocabulary",
+    "light_effect",
     "name_of_first_copy",
     "name_without_copy_suffix",
     "spoken_name",

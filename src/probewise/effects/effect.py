@@ -1,12 +1,13 @@
-"""What the diagnosis needs of an effect besides its formula; bases of effects that are linear, change, or oscillate."""
+"""An effect: physics that a model may leave out, one function at one stage, with its priors, bank and words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,19 +17,30 @@ from probewise._kinds import require_mapping
 from probewise._words import unit_after_number
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.priors import HeavyTailedPrior
-from probewise.effects.reference import Extent
+from probewise.effects.reference import ZERO, Extent, Origin
 from probewise.errors import ParameterError
-from probewise.priors import Prior, Product, Uniform
+from probewise.priors import Marginal, Prior, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage
 
 _BOTH_SIGNS = 0.05  # least share of samples of either sign
 _NEAR_ZERO, _FEW_NEAR_ZERO = 0.1, 0.01  # in medians of their sizes; of a normal distribution about 0, .054 are so near
-_OWN = ("name", "stage", "units", "covariates", "prior", "apply", "bank", "sentence")
 _MOST_CHANGE_POINTS, _FEW = 512, 48  # intervals of a change point; so many that are enough to detect one
 
+AGAIN = "~again"
+"""Suffix of an effect's second copy: the same physics twice, as two waves."""
+
+PHASE = Uniform(-2 * np.pi, 2 * np.pi)
+"""Prior of a phase, two full turns: every phase has an equivalent far from both ends."""
 
 V = TypeVar("V")
+
+Act: TypeAlias = Callable[[Any, FloatArray, Any], Any]
+"""Function of the stage's value, parameters (n_samples, n_params) and the plan or table; returns the value with the
+effect."""
+
+Say: TypeAlias = Callable[[FloatArray, FloatArray], str]
+"""Function of the parameters' mean and sd, (n_params,) each; returns a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +56,12 @@ class VariantMasks:
 
 
 class NamedEffect(Generic[V]):
-    """An effect as the diagnosis needs it: formula, prior, template bank, and a sentence for the verdict.
-
-    A new effect is one class of this kind, passed as ``effects={**VOCABULARY, name: class}``. What its methods return
-    is said here.
-    """
+    """An effect as the diagnosis needs it: formula, prior, template bank, and a sentence for the verdict."""
 
     words: ClassVar[str] = ""
     """A noun phrase that follows "the model leaves out"; without one the name itself is written."""
 
-    if TYPE_CHECKING:  # each effect has these, besides `name`, `stage`, `prior` and `apply` of `sensor.stages.Effect`
+    if TYPE_CHECKING:  # each effect has these
 
         @property
         def name(self) -> str: ...
@@ -81,62 +89,43 @@ class NamedEffect(Generic[V]):
         def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
             """Describe the effect in plain words; posterior mean and sd of the parameters, (n_params,) each."""
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """Names of the plan's columns that it reads besides place, time and scan; by default none."""
-        return ()
+        @property
+        def counted_from(self) -> str:
+            """From where it counts a time, a place or a column, in words; "" for 0, or if it does not count."""
 
-    @property
-    def counted_from(self) -> str:
-        """From where it counts a time, a place or a column, in words; "" for 0, or if it does not count: the default.
+        @property
+        def amplitudes(self) -> tuple[int, ...]:
+            """Indices of the amplitudes: the readings change in proportion to first order, and 0 means no effect."""
 
-        The recording that is diagnosed sets this origin, so that the effect means the same in any other plan.
-        """
-        return ""
+        @property
+        def scans(self) -> tuple[str, ...]:
+            """Names of the scans it is restricted to; () for all."""
 
-    @property
-    def amplitudes(self) -> tuple[int, ...]:
-        """Indices of the amplitudes: the readings change in proportion to first order, and 0 means no effect.
+        @property
+        def patterns(self) -> tuple[str, ...]:
+            """Names of the patterns it is restricted to; () for all."""
 
-        By default the first parameter alone.
-        """
-        return (0,)
+    else:
+        counted_from, amplitudes, scans, patterns = "", (0,), (), ()
+
+    n_peaks: int = 1
+    """Number of equivalent posterior modes within the prior; a fit finds one of them."""
+
+    has_change_point: bool = False
+    """Whether its variants are the intervals of a change point."""
+
+    relative_odds: float = 1.0
+    """Prior odds of this variant against the first one."""
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
-        """Values of parameters, by index, at which it has no effect; None if there are no such values.
-
-        By default all amplitudes are 0.
-        """
+        """Values of parameters, by index, at which it has no effect: all amplitudes 0; None without amplitudes."""
         return dict.fromkeys(self.amplitudes, 0.0) or None
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Build the effect with a prior at the recording's scales; None where the recording cannot show it.
-
-        An effect of the battery needs its voltage, one of the direction of motion needs a scan that turns back.
-        By default the scales do not depend on the recording: its parameters are pure numbers.
-        """
+        """Build the effect with a prior at the recording's scales; None where the recording cannot show it."""
         return cls()
-
-    def is_absorbed_by_ssf(self, plan: Plan) -> bool:
-        """Return whether a free SSF absorbs the effect under this plan, which hides it; by default False."""
-        return False
-
-    @property
-    def n_peaks(self) -> int:
-        """Number of equivalent posterior modes within the prior; a fit finds one of them."""
-        return 1
-
-    @property
-    def scans(self) -> tuple[str, ...]:
-        """Names of the scans it is restricted to; () for all."""
-        return ()
-
-    @property
-    def patterns(self) -> tuple[str, ...]:
-        """Names of the patterns it is restricted to; () for all."""
-        return ()
 
     def variants(self) -> tuple[Self, ...]:
         """List the effect with each of its discrete choices made, of prior odds `relative_odds`.
@@ -145,16 +134,6 @@ class NamedEffect(Generic[V]):
         Variants differ in their `scans` or `patterns`, or only in their priors.
         """
         return (self,)
-
-    @property
-    def has_change_point(self) -> bool:
-        """Whether its variants are the intervals of a change point; by default not."""
-        return False
-
-    @property
-    def relative_odds(self) -> float:
-        """Prior odds of this variant against the first one; by default all are equally probable."""
-        return 1.0
 
     def variant_masks(self, plan: Plan) -> VariantMasks | None:
         """Return the masks of variants that differ only in the readings they act on; None, the default, for others."""
@@ -183,22 +162,364 @@ class NamedEffect(Generic[V]):
         return np.asarray(setting)
 
 
-def require_effect_classes(effects: object) -> None:
-    """Raise ParameterError unless `effects` maps each name to a class of that name with all required members."""
-    allowed = "classes of effects by name, such as {**VOCABULARY, 'overflow': Overflow}, of probewise.effects"
+@dataclass(frozen=True)
+class Fixed(Uniform):
+    """Prior of a parameter that a variant of an effect fixes, to within rounding; reports leave it out.
+
+    `odds` are the prior odds of that variant against the first.
+    """
+
+    odds: float = 1.0
+
+
+@dataclass(frozen=True)
+class Where:
+    """Origin from which a light sensor's effect counts; names of the scans or patterns it is restricted to, () all."""
+
+    origin: Origin = ZERO
+    scans: tuple[str, ...] = ()
+    patterns: tuple[str, ...] = ()
+
+
+EVERYWHERE = Where()
+"""On all scans and patterns, counting from 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Effect(NamedEffect[Any]):
+    """An effect, bound to a recording and perhaps to a target.
+
+    Parameters
+    ----------
+    name
+        `name` or `name:target`.
+    stage
+        Stage of the chain at which it acts.
+    parameters
+        Prior of each parameter, by name; or of all together.
+    units
+        Unit of each parameter.
+    covariates
+        Names of the covariates along which the residual shows if the effect is left out.
+    act
+        Function of the stage's value, parameters (n_samples, n_params) and plan or table; returns the value with the
+        effect.
+    entries
+        Template bank: trial settings, (n_entries, n_columns, n_params).
+    says
+        Function that describes it in a sentence.
+    amplitudes
+        Indices of the parameters that are amplitudes.
+    absent
+        Parameter values, by index, at which it has no effect, if these are not zero amplitudes.
+    alternatives
+        Mutually exclusive variants of it, with other priors and entries; it itself is another variant.
+    counted_from
+        From where it counts a time, a place or a column, in words; "" for 0, or if it does not count.
+    expression
+        Formula of a proposal, which has no name in the vocabulary; otherwise empty.
+    needs_rising_time
+        Whether it looks back to earlier times of a run, which time must then not fall within.
+    where
+        Of a light sensor's effect: origin, scans, patterns.
+    """
+
+    name: str
+    stage: Stage
+    parameters: Mapping[str, Marginal] | Prior
+    units: tuple[str, ...]
+    covariates: tuple[str, ...]
+    act: Act
+    entries: FloatArray
+    says: Say
+    amplitudes: tuple[int, ...] = (0,)
+    absent: Mapping[int, float] = field(default_factory=dict)
+    alternatives: tuple[Effect, ...] = ()
+    counted_from: str = ""
+    expression: str = ""
+    needs_rising_time: bool = False
+    where: Where = EVERYWHERE
+
+    @cached_property
+    def prior(self) -> Prior:
+        """Prior of its parameters."""
+        return Product(self.parameters) if isinstance(self.parameters, Mapping) else self.parameters
+
+    @property
+    def nothing(self) -> Mapping[int, float] | None:
+        """Parameter values, by index, at which it has no effect: `absent`, else all amplitudes 0; else None."""
+        return dict(self.absent) or dict.fromkeys(self.amplitudes, 0.0) or None
+
+    @property
+    def scans(self) -> tuple[str, ...]:
+        """Names of the scans it is restricted to; () for all."""
+        return self.where.scans
+
+    @property
+    def patterns(self) -> tuple[str, ...]:
+        """Names of the patterns it is restricted to; () for all."""
+        return self.where.patterns
+
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """Names of the parameters that this one of several variants fixes; reports leave them out."""
+        return tuple(name for name, prior in self.marginals.items() if isinstance(prior, Fixed))
+
+    @property
+    def relative_odds(self) -> float:  # type: ignore[override]
+        """Prior odds of this one of several variants against the first."""
+        return math.prod((prior.odds for prior in self.marginals.values() if isinstance(prior, Fixed)), start=1.0)
+
+    @property
+    def marginals(self) -> Mapping[str, Marginal]:
+        """Prior of each parameter, by name; none where all have one together."""
+        return self.parameters if isinstance(self.parameters, Mapping) else {}
+
+    def apply(self, value: Any, theta: FloatArray, plan: Any) -> Any:
+        """Return the value of its stage with the effect applied, with parameters theta (n_samples, n_params)."""
+        return self.act(value, theta, plan)
+
+    def bank(self) -> FloatArray:
+        """Return the template bank: trial settings, (n_entries, n_columns, n_params)."""
+        return self.entries
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Describe the effect in plain words, given the parameters' mean and sd, (n_params,) each."""
+        return self.says(mean, sd)
+
+    @property
+    def n_peaks(self) -> int:  # type: ignore[override]
+        """Number of equivalent posterior modes within the prior.
+
+        A phase spans two turns, which doubles it; a wave's second copy, or a second time constant, may be exchanged
+        with the first.
+        """
+        exchangeable = self.name.endswith(AGAIN) or "tau2" in self.prior.names
+        return (2 if exchangeable else 1) * (2 if "phase" in self.prior.names else 1)
+
+    def variants(self) -> tuple[Effect, ...]:
+        """Return itself and its alternatives: the same objects at each call, so that two fits have equal effects."""
+        return self._variants
+
+    @cached_property
+    def _variants(self) -> tuple[Effect, ...]:
+        return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepEffect(Effect):
+    """An effect with a change point, its last parameter: a variant for each interval in which that may lie.
+
+    With `is_thinned` False, all intervals are needed to detect it: its moment is what identifies it.
+    """
+
+    change_points: ChangePoints
+    is_thinned: bool = True
+    has_change_point: ClassVar[bool] = True  # type: ignore[misc]
+
+    @cached_property
+    def _variants(self) -> tuple[Effect, ...]:
+        out = []
+        for low, high in pairwise(self.change_points.at):
+            entries = self.entries.copy()
+            entries[:, :, -1] = 0.5 * (low + high)
+            priors = {**self.marginals, list(self.marginals)[-1]: Uniform(low, high)}
+            out.append(replace(self, parameters=priors, entries=entries))
+        return tuple(out)
+
+    def with_fewer_variants(self) -> Self:
+        """Return the effect with its change points thinned to at most 48 intervals, unless it needs all of them."""
+        return replace(self, change_points=self.change_points.fewer()) if self.is_thinned else self
+
+    def variant_masks(self, plan: Any) -> VariantMasks | None:
+        """Return the masks of the rows after each candidate change point; None where a law goes on from there.
+
+        What is added to readings or poses, or to the gain, is nothing before it and the same everywhere after it.
+        """
+        return self.change_points.masks(self.entries[0], plan) if self.stage in _ROW_BY_ROW else None
+
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw theta's last column, the change point: an interval by `weights`, (n_variants,), uniform within it."""
+        return self.change_points.redrawn(theta, weights, rng=rng)
+
+
+_ROW_BY_ROW = (Stage.OFFSET, Stage.GAIN, Stage.POSE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WaveEffect(Effect):
+    """A wave: its entries are a sine and a cosine each, its amplitude is the first parameter, its phase the last.
+
+    The readings suggest further frequencies, `suggested` (n_suggested,): refits may start there. A test of the readings
+    leaves them out, for other readings would have suggested others.
+    """
+
+    suggested: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def bank(self) -> FloatArray:
+        """Return the template bank, (n_entries, 2, n_params), suggested frequencies last."""
+        if not self.suggested.size:
+            return self.entries
+        return np.concatenate([self.entries, sine_and_cosine_entries(self.entries[0, 0, 0], self.suggested)])
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        """Return the wave that is the sum of an entry's sine and cosine, in their fitted amounts, (n_params,)."""
+        setting = entry[0].copy()
+        sine, cosine = amounts * setting[0]
+        setting[0], setting[-1] = np.hypot(sine, cosine), np.arctan2(cosine, sine)
+        return np.asarray(setting)
+
+    def with_fewer_variants(self) -> Self:
+        """Return the effect without suggested frequencies."""
+        return self._without_suggested if self.suggested.size else self
+
+    @cached_property
+    def _without_suggested(self) -> Self:
+        return replace(self, suggested=np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class LightEffect:
+    """A light sensor's effect before it is bound to a recording; declared by `light_effect`.
+
+    Parameters
+    ----------
+    name, stage, covariates
+        As of `Effect`.
+    words
+        A noun phrase that follows "the model leaves out".
+    build
+        Function of this and the extent of a recording; returns the effect at the recording's scales, None where the
+        recording cannot show it.
+    counts
+        Whether its formula holds the "time" or the "place" itself, which count from the recording's origin.
+    reads
+        Names of the plan's columns that it reads besides place, time and scan.
+    is_absorbed_by_ssf
+        Function of the plan: whether a free SSF absorbs the effect, which hides it.
+    """
+
+    name: str
+    stage: Stage
+    words: str
+    covariates: tuple[str, ...]
+    build: Callable[[LightEffect, Extent], Effect | None]
+    counts: Literal["", "time", "place"] = ""
+    reads: tuple[str, ...] = ()
+    is_absorbed_by_ssf: Callable[[Plan], bool] = lambda plan: False
+
+    def for_extent(self, extent: Extent) -> Effect | None:
+        """Bind the effect to a recording, with a prior at its scales; None where the recording cannot show it."""
+        return self.build(self, extent)
+
+    def __call__(self, origin: Origin = ZERO) -> Effect:
+        """Return the effect of a stored model, of which the function alone counts, whatever the prior's scales."""
+        found = self.for_extent(Extent.usual(origin))
+        assert found is not None
+        return found
+
+    def bind(
+        self,
+        of: Extent,
+        parameters: Mapping[str, Marginal] | Prior,
+        units: tuple[str, ...],
+        act: Act,
+        entries: FloatArray,
+        says: Say,
+        *,
+        kind: type[Effect] = Effect,
+        where: Where = EVERYWHERE,
+        **more: Any,
+    ) -> Effect:
+        """Return the effect with these parameters and functions, counting from the recording's origin if it counts."""
+        counted_from = ""
+        if self.counts:
+            where, at = replace(where, origin=of.origin), of.origin
+            if self.counts == "time" and at.time_s:
+                counted_from = f"time counts from {at.time_s:.12g} s"
+            elif self.counts == "place" and (at.x_mm or at.y_mm):
+                counted_from = f"X and Y count from ({at.x_mm:g}, {at.y_mm:g}) mm"
+        given = (self.name, self.stage, parameters, units, self.covariates, act, entries, says)
+        return kind(*given, counted_from=counted_from, where=where, **more)
+
+    def linear(
+        self,
+        of: Extent,
+        units: Mapping[str, str],
+        typical: float,
+        act: Act,
+        says: Say,
+        *,
+        positive: bool = False,
+        sizes: Sequence[float] = (1.0,),
+        where: Where = EVERYWHERE,
+        kind: type[Effect] = Effect,
+    ) -> Effect:
+        """Return the effect whose readings change in proportion to each parameter, by name in `units`.
+
+        `sizes`, in typical ones, are tried in turn.
+        """
+        parameters = dict.fromkeys(units, HeavyTailedPrior(typical, positive=positive))
+        entries, every = (typical * np.array(sizes))[:, None, None] * np.eye(len(units)), tuple(range(len(units)))
+        given = (of, parameters, tuple(units.values()), act, entries, says)
+        return self.bind(*given, amplitudes=every, where=where, kind=kind)
+
+    def step(
+        self, of: Extent, sizes: Mapping[str, tuple[float, str]], act: Act, says: Say, *, is_thinned: bool = True
+    ) -> Effect | None:
+        """Return the effect that begins between two readings; `sizes` are typical size and unit of each amplitude.
+
+        `act` gets the mask of the readings after each sample's change point, (n_samples, n_points), for the plan. None
+        for a recording of one time.
+        """
+        if len(distinct_values(of.plan.time_s)) < 2:
+            return None
+        points = ChangePoints.of(of.plan.time_s)
+        low, high = points.at[0], points.at[-1]
+        parameters = {name: HeavyTailedPrior(size) for name, (size, _) in sizes.items()}
+        entries = np.diag([size for size, _ in sizes.values()])
+        return self.bind(
+            of,
+            {**parameters, "at_s": Uniform(low, high)},
+            (*(unit for _, unit in sizes.values()), "s"),
+            lambda value, theta, plan: act(value, theta, plan.time_s > theta[:, -1:]),
+            np.column_stack([entries, np.full(len(sizes), (low + high) / 2)])[None, :, :],
+            says,
+            kind=StepEffect,
+            amplitudes=tuple(range(len(sizes))),
+            change_points=points,
+            is_thinned=is_thinned,
+        )
+
+
+def light_effect(
+    name: str, stage: Stage, words: str, covariates: tuple[str, ...], **more: Any
+) -> Callable[[Callable[[LightEffect, Extent], Effect | None]], LightEffect]:
+    """Declare a light sensor's effect: decorate the function that builds it; see `LightEffect`."""
+    return lambda build: LightEffect(name, stage, words, covariates, build, **more)
+
+
+def one_of(choices: Sequence[Effect]) -> Effect | None:
+    """Return the first of an effect's mutually exclusive choices, with the others as alternatives; None for none."""
+    return replace(choices[0], alternatives=tuple(choices[1:])) if choices else None
+
+
+EffectKind: TypeAlias = "LightEffect | type[NamedEffect[Any]]"
+"""An effect before it is bound to a recording: `for_extent` binds it."""
+
+
+def require_effect_kinds(effects: object) -> None:
+    """Raise ParameterError unless `effects` maps each name to an effect of that name, as `light_effect` makes them."""
+    allowed = "effects by name, such as {**VOCABULARY, 'overflow': overflow}, of probewise.effects"
     require_mapping("effects", effects, allowed)
     assert isinstance(effects, Mapping)
     for name, kind in effects.items():
-        if not isinstance(kind, type) or not hasattr(kind, "for_extent"):
-            raise ParameterError(f"effects[{name!r}]", kind, "a class that follows probewise.effects.NamedEffect")
-        lacking = [each for each in _OWN if getattr(kind, each, None) in (None, getattr(NamedEffect, each, None))]
-        if lacking:
+        if not isinstance(kind, LightEffect) and not (isinstance(kind, type) and issubclass(kind, NoiseEffect)):
             raise ParameterError(
-                f"effects[{name!r}]", kind, f"a class of an effect with {', '.join(_OWN)}; {lacking[0]} is missing"
+                f"effects[{name!r}]", kind, "a function decorated with probewise.effects.light_effect, or a NoiseEffect"
             )
-        own = cast(type[NamedEffect[Any]], kind).name
-        if own != name:
-            raise ParameterError("effects", name, f"{own!r}, the name of the class {kind.__name__}")
+        if kind.name != name:
+            raise ParameterError("effects", name, f"{kind.name!r}, the name of that effect")
 
 
 class NoiseEffect(NamedEffect[NoiseParameters]):
@@ -286,49 +607,6 @@ def single_column_bank(*parameters: ArrayLike) -> FloatArray:
     return np.stack(np.broadcast_arrays(*parameters), axis=-1)[:, None, :].astype(np.float64)
 
 
-class LinearEffect(NamedEffect[V]):
-    """Base of effects whose readings change in proportion to each parameter, to first order.
-
-    A subclass is a frozen dataclass with one field that begins with `typical`: the typical size of every parameter.
-    """
-
-    parameters: ClassVar[tuple[str, ...]]
-    """Names of the parameters."""
-    positive = False
-    """Whether the parameters are never negative."""
-
-    @cached_property
-    def _typical_size(self) -> float:
-        (name,) = (each.name for each in fields(self) if each.name.startswith("typical"))  # type: ignore[arg-type]
-        return float(getattr(self, name))
-
-    @property
-    def amplitudes(self) -> tuple[int, ...]:
-        return tuple(range(len(self.parameters)))
-
-    @cached_property
-    def prior(self) -> Product:
-        size = HeavyTailedPrior(self._typical_size, positive=self.positive)
-        return Product(dict.fromkeys(self.parameters, size))
-
-    def bank(self) -> FloatArray:
-        return self._typical_size * np.eye(len(self.parameters))[None, :, :]
-
-
-@dataclass(frozen=True)
-class ScanGroupEffect(LinearEffect[V]):
-    """Base of linear effects on one scan, or on all scans of one mounting (orientation).
-
-    `scans` are the affected scans, chosen among the groups of scans in `choices`.
-    """
-
-    scans: tuple[str, ...] = ()
-    choices: tuple[tuple[str, ...], ...] = ()
-
-    def variants(self) -> tuple[Self, ...]:
-        return tuple(replace(self, scans=choice) for choice in self.choices)
-
-
 def scans_in_words(scans: tuple[str, ...]) -> str:
     """Return the names of scans as a phrase: "scan a", or "scans a, b"."""
     return f"scan{'s' if len(scans) > 1 else ''} {', '.join(scans)}"
@@ -380,101 +658,9 @@ class ChangePoints:
         return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
 
 
-@dataclass(frozen=True)
-class ChangePointEffect(NamedEffect[V]):
-    """Base of effects that act on the readings taken after `at_s`, the last parameter.
-
-    `times_s` are the times of the readings. Between which two of them the change point lies is a discrete choice
-    (`between_s`); its position within that interval does not affect any reading.
-    """
-
-    times_s: tuple[float, ...] = (0.0, 1e5)
-    between_s: tuple[float, float] | None = None
-
-    @property
-    def typical_sizes(self) -> Mapping[str, float]:
-        """Typical size of each amplitude, by name."""
-        raise NotImplementedError
-
-    @property
-    def amplitudes(self) -> tuple[int, ...]:
-        return tuple(range(len(self.typical_sizes)))
-
-    @cached_property
-    def prior(self) -> Product:
-        sizes = {name: HeavyTailedPrior(size) for name, size in self.typical_sizes.items()}
-        return Product({**sizes, "at_s": Uniform(*self.change_interval_s)})
-
-    def bank(self) -> FloatArray:
-        sizes = np.diag(list(self.typical_sizes.values()))
-        return np.column_stack([sizes, np.full(len(sizes), sum(self.change_interval_s) / 2)])[None, :, :]
-
-    @property
-    def change_interval_s(self) -> tuple[float, float]:
-        """Bounds of the interval in which the change point may lie, s: `between_s`, else the whole recording."""
-        return self.between_s or (self.times_s[0], self.times_s[-1])
-
-    @staticmethod
-    def after_change_mask(theta: FloatArray, plan: Plan) -> BoolArray:
-        """Return the mask of the readings taken after each sample's change point, (n_samples, n_points)."""
-        return np.asarray(plan.time_s > theta[:, -1:])
-
-    @property
-    def has_change_point(self) -> bool:
-        return True
-
-    def variants(self) -> tuple[Self, ...]:
-        return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
-
-    def with_fewer_variants(self) -> Self:
-        return replace(self, times_s=ChangePoints(self.times_s).fewer().at)
-
-    def variant_masks(self, plan: Plan) -> VariantMasks:
-        return ChangePoints(self.times_s).masks(self.bank()[0], plan)
-
-    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        return ChangePoints(self.times_s).redrawn(theta, weights, rng=rng)
-
-
-def candidate_change_times_s(extent: Extent) -> tuple[float, ...] | None:
-    """Return the distinct times of a recording's readings, thinned to at most 512 intervals; None for one time."""
-    times = distinct_values(extent.plan.time_s)
-    return None if len(times) < 2 else thinned(times, _MOST_CHANGE_POINTS)
-
-
-PHASE = Uniform(-2 * np.pi, 2 * np.pi)
-"""Prior of a phase, two full turns: every phase has an equivalent far from both ends."""
-
-
 def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of waves, a sine and a cosine each, (n_bank, 2, n_params).
 
     `parameters` are those before the phase, which is the last: numbers or (n_bank,); the first is the amplitude.
     """
     return np.concatenate([single_column_bank(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
-
-
-def starting_point_of_wave(entry: FloatArray, amounts: FloatArray) -> FloatArray:
-    """Return the parameters, (n_params,), of the sum of a bank entry's sine and cosine, times the fitted amounts (2,).
-
-    The amplitude is the first, the phase the last; those between are the entry's.
-    """
-    setting = entry[0].copy()
-    sine, cosine = amounts * setting[0]
-    setting[0], setting[-1] = np.hypot(sine, cosine), np.arctan2(cosine, sine)
-    return np.asarray(setting)
-
-
-class PeriodicEffect(NamedEffect[V]):
-    """Base of effects whose phase has a prior over two turns, which hold every posterior mode twice."""
-
-    @property
-    def n_peaks(self) -> int:
-        return 2
-
-
-class WaveEffect(PeriodicEffect[V]):
-    """Base of effects with amplitude, frequency or period, and phase; bank entries hold a sine and a cosine."""
-
-    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        return starting_point_of_wave(entry, amounts)

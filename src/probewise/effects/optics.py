@@ -7,17 +7,25 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
-from probewise.effects.effect import LinearEffect, NamedEffect, ScanGroupEffect, V, scans_in_words, single_column_bank
+from probewise.effects.effect import (
+    Act,
+    Effect,
+    LightEffect,
+    Say,
+    Where,
+    light_effect,
+    one_of,
+    scans_in_words,
+    single_column_bank,
+)
 from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reference import (
-    CountsPlaceFromOrigin,
-    CountsTimeFromOrigin,
     Extent,
     Origin,
     candidate_scan_groups,
@@ -39,60 +47,42 @@ _LEAST_PLACES = 8
 _STEP = 1e-3  # of a standard deviation, for the central difference: its error is a millionth of this
 _USUAL_MM = 14.0  # the height assumed where a recording gives none
 _ANGLES = 8
+_LEAST_ANGLE_RAD, _ONE_DIRECTION_RAD = np.radians([-89.5, 1.0])
 
 
-@dataclass(frozen=True)
-class EdgeMisplacement(LinearEffect[SceneView]):
+@light_effect("edge_misplacement", Stage.SCENE, "misplaced edges", ("slope",))
+def edge_misplacement(kind: LightEffect, of: Extent) -> Effect:
     """Every pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X (all others)."""
-
-    typical_mm: float = 0.3
-
-    name = "edge_misplacement"
-    words = "misplaced edges"
-    stage = Stage.SCENE
-    units = ("mm",)
-    covariates = ("slope",)
-    parameters = ("offset_mm",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(typical_mm=0.003 * extent.length_mm)
-
-    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return _with_shifted_patterns(value, theta * np.ones(len(plan)), plan)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the printed edges lie {value_with_sd(mean[0], sd[0])} mm from their described place, in all scans"
+    return kind.linear(
+        of,
+        {"offset_mm": "mm"},
+        0.003 * of.length_mm,
+        lambda value, theta, plan: _with_shifted_patterns(value, theta * np.ones(len(plan)), plan),
+        lambda mean, sd: (
+            f"the printed edges lie {value_with_sd(mean[0], sd[0])} mm from their described place, in all scans"
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class ScanMisplacement(ScanGroupEffect[SceneView]):
+@light_effect("scan_misplacement", Stage.SCENE, "a misplaced pattern in one scan", ("scan", "slope"))
+def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
     """In one scan the pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X."""
 
-    typical_mm: float = 0.3
-
-    name = "scan_misplacement"
-    words = "a misplaced pattern in one scan"
-    stage = Stage.SCENE
-    units = ("mm",)
-    covariates = ("scan", "slope")
-    parameters = ("offset_mm",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        names = tuple(dict.fromkeys(extent.plan.scan_names))
-        if len(names) < 2:
-            return None
-        return cls(choices=tuple((name,) for name in names), typical_mm=0.003 * extent.length_mm)
-
-    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return _with_shifted_patterns(value, theta * scan_indicator(plan, self.scans), plan)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"in {scans_in_words(self.scans)} the pattern lies {value_with_sd(mean[0], sd[0])} mm from where it lies "
-            "in the others"
+    def in_scan(name: str) -> Effect:
+        return kind.linear(
+            of,
+            {"offset_mm": "mm"},
+            0.003 * of.length_mm,
+            lambda value, theta, plan: _with_shifted_patterns(value, theta * scan_indicator(plan, (name,)), plan),
+            lambda mean, sd: (
+                f"in {scans_in_words((name,))} the pattern lies {value_with_sd(mean[0], sd[0])} mm from where it lies "
+                "in the others"
+            ),
+            where=Where(scans=(name,)),
         )
+
+    names = tuple(dict.fromkeys(of.plan.scan_names))
+    return one_of([in_scan(name) for name in names]) if len(names) > 1 else None
 
 
 def _with_shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
@@ -106,12 +96,6 @@ def _with_shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> Sc
         if isinstance(pattern, HalfPlane | Stripes | Ramp):
             angle[rows] = pattern.normal_rad
     return replace(view, dx_mm=view.dx_mm + by_mm * np.cos(angle), dy_mm=view.dy_mm + by_mm * np.sin(angle))
-
-
-_LEAST_ANGLE_RAD = np.radians(-89.5)
-
-
-_ONE_DIRECTION_RAD = np.radians(1.0)
 
 
 def gaussian_bump(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
@@ -146,10 +130,6 @@ class ScanLine:
         """Return the position of points X, Y along the line, and their distance from it; arrays broadcast."""
         c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
         return c * x_mm + s * y_mm, c * y_mm - s * x_mm - self.offset_mm
-
-
-ALONG_X = ScanLine(0.0, 0.0, -50.0, 50.0)
-"""The X axis, 50 mm to either side."""
 
 
 def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
@@ -249,127 +229,81 @@ class PatchPrior:
         return np.stack([height * np.exp(-0.5 * beside**2), along, beside, r], axis=-1)
 
 
-@dataclass(frozen=True)
-class PatchEffect(NamedEffect[V]):
-    """Base of effects that are a patch on or beside the scanned line `line`; `lines` are the candidate lines."""
+def _patch(kind: LightEffect, of: Extent, size: str, unit: str, typical: float, act: Act, says: Say) -> Effect | None:
+    """Return the effect of a patch on or beside one of the scanned lines; None without a line."""
 
-    typical: float
-    line: ScanLine = ALONG_X
-    lines: tuple[ScanLine, ...] = ()
-
-    size: ClassVar[str]
-    """Name of the patch's height."""
-
-    @cached_property
-    def prior(self) -> PatchPrior:
-        return PatchPrior(self.size, self.typical, self.line)
-
-    def variants(self) -> tuple[Self, ...]:
-        return tuple(replace(self, line=line) for line in self.lines)
-
-    def bank(self) -> FloatArray:
+    def on_line(line: ScanLine) -> Effect:
         patches = []
         for share in _RADII:
-            r = share * self.line.length_mm
-            along = np.arange(self.line.low_mm, self.line.high_mm + r / 2, r)
-            x, y = self.line.lab_coordinates_mm(along, np.zeros_like(along))
-            patches.append(single_column_bank(self.typical, x, y, r))
-        return np.concatenate(patches)
+            r = share * line.length_mm
+            along = np.arange(line.low_mm, line.high_mm + r / 2, r)
+            x, y = line.lab_coordinates_mm(along, np.zeros_like(along))
+            patches.append(single_column_bank(typical, x, y, r))
+        prior, units = PatchPrior(size, typical, line), (unit, "mm", "mm", "mm")
+        return kind.bind(of, prior, units, act, np.concatenate(patches), says)
+
+    return one_of([on_line(line) for line in distinct_scan_lines(of.plan)])
 
 
-@dataclass(frozen=True)
-class Glint(PatchEffect[FloatArray]):
+@light_effect("glint", Stage.OFFSET, "a glint at one place", ("place",))
+def glint(kind: LightEffect, of: Extent) -> Effect | None:
     """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y)."""
 
-    typical: float = 1.0
-    unit: str = field(default="", kw_only=True)
-
-    name = "glint"
-    words = "a glint at one place"
-    stage = Stage.OFFSET
-    size = "amp"
-    units = ("reading", "mm", "mm", "mm")
-    covariates = ("place",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        lines = distinct_scan_lines(extent.plan)
-        return cls(0.02 * extent.span, lines[0], lines, unit=extent.reading_unit) if lines else None
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         amp, x, y, r = (theta[:, k : k + 1] for k in range(4))
-        return np.asarray(value + amp * gaussian_bump((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r))
+        return value + amp * gaussian_bump((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r)
 
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+    def says(mean: FloatArray, sd: FloatArray) -> str:
         return (
             f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
-            f"{value_with_sd(mean[2], sd[2])}) mm the readings are {value_with_sd(abs(mean[0]), sd[0], self.unit)} too "
-            f"{'high' if mean[0] > 0 else 'low'}, over black and white alike: a reflection"
+            f"{value_with_sd(mean[2], sd[2])}) mm the readings are "
+            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} too {'high' if mean[0] > 0 else 'low'}, over black "
+            "and white alike: a reflection"
         )
 
+    return _patch(kind, of, "amp", "reading", 0.02 * of.span, act, says)
 
-@dataclass(frozen=True)
-class AlbedoGradient(CountsPlaceFromOrigin, LinearEffect[SceneView]):
+
+@light_effect("albedo_gradient", Stage.SCENE, "unevenly white paper", ("place",), counts="place")
+def albedo_gradient(kind: LightEffect, of: Extent) -> Effect:
     """Paper or illumination that is uneven across the table: S (1 + per_mm_x X + per_mm_y Y).
 
-    X and Y are those of the lab frame, from `origin`.
+    X and Y are those of the lab frame, from the origin.
     """
 
-    typical_per_mm: float = 2e-4
-
-    name = "albedo_gradient"
-    words = "unevenly white paper"
-    stage = Stage.SCENE
-    units = ("1/mm", "1/mm")
-    covariates = ("place",)
-    parameters = ("per_mm_x", "per_mm_y")
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(typical_per_mm=0.02 / extent.length_mm, origin=extent.origin)
-
-    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+    def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         regions = _regions_with_readings(value, plan)
-        return replace(value, regions={name: RegionWithGradient(r, theta, self.origin) for name, r in regions.items()})
+        return replace(value, regions={name: RegionWithGradient(r, theta, of.origin) for name, r in regions.items()})
 
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
+    return kind.linear(
+        of,
+        {"per_mm_x": "1/mm", "per_mm_y": "1/mm"},
+        0.02 / of.length_mm,
+        act,
+        lambda mean, sd: (
             f"the signal over white changes by {value_with_sd(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
             f"{value_with_sd(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
             "its illumination is uneven"
-        )
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class AlbedoPatch(PatchEffect[SceneView]):
+@light_effect("albedo_patch", Stage.SCENE, "a stain on the paper", ("place",))
+def albedo_patch(kind: LightEffect, of: Extent) -> Effect | None:
     """A stain or a bright patch on every pattern: S + albedo exp(-d^2 / 2 r^2), d the distance from (x, y)."""
 
-    typical: float = 0.05
+    def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
+        regions = _regions_with_readings(value, plan)
+        return replace(value, regions={name: RegionWithPatch(r, theta) for name, r in regions.items()})
 
-    name = "albedo_patch"
-    words = "a stain on the paper"
-    stage = Stage.SCENE
-    size = "albedo"
-    units = ("1", "mm", "mm", "mm")
-    covariates = ("place",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        lines = distinct_scan_lines(extent.plan)
-        return cls(line=lines[0], lines=lines) if lines else None
-
-    def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return replace(
-            value, regions={name: RegionWithPatch(r, theta) for name, r in _regions_with_readings(value, plan).items()}
-        )
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        kind = "whiter" if mean[0] > 0 else "darker"
+    def says(mean: FloatArray, sd: FloatArray) -> str:
         return (
             f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
-            f"{value_with_sd(mean[2], sd[2])}) mm every pattern is "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {kind} than it should be: a stain or a worn area"
+            f"{value_with_sd(mean[2], sd[2])}) mm every pattern is {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
+            f"{'whiter' if mean[0] > 0 else 'darker'} than it should be: a stain or a worn area"
         )
+
+    return _patch(kind, of, "albedo", "1", 0.05, act, says)
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,69 +405,55 @@ def _distance_to_unchanged_edge(
     return edge_distance(region.region, x_mm, y_mm)
 
 
-@dataclass(frozen=True)
-class HeightGradient(CountsPlaceFromOrigin, LinearEffect[Footprint]):
+@light_effect("height_gradient", Stage.FOOTPRINT, "a sloping table", ("place",), counts="place")
+def height_gradient(kind: LightEffect, of: Extent) -> Effect:
     """A table that slopes: mm_per_mm X adds to the height; footprint x h/h0, signal x (h0/h)^2.
 
     h = h0 + mm_per_mm X with h0 of the recording's description, or 14 mm where it gives none; where a height is
-    commanded, h is that height + mm_per_mm X. X counts from `origin`.
+    commanded, h is that height + mm_per_mm X. X counts from the origin.
     """
 
-    typical: float = 0.001
-
-    name = "height_gradient"
-    words = "a sloping table"
-    stage = Stage.FOOTPRINT
-    units = ("mm/mm",)
-    covariates = ("place",)
-    parameters = ("mm_per_mm",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        typical = 0.01 * _nominal_height_mm(extent.plan) / extent.length_mm
-        return cls(typical=typical, origin=extent.origin)
-
-    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        added = theta[:, :1] * (plan.x_mm - self.origin.x_mm) / _nominal_height_mm(plan)
+    def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+        added = theta[:, :1] * (plan.x_mm - of.origin.x_mm) / _nominal_height_mm(plan)
         return footprint_at_added_height(value, added, plan)
 
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "grows" if mean[0] > 0 else "shrinks"
-        return (
-            f"the sensor's height above the surface {way} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} mm per "
-            "100 mm along X: the table slopes"
-        )
+    return kind.linear(
+        of,
+        {"mm_per_mm": "mm/mm"},
+        0.01 * _nominal_height_mm(of.plan) / of.length_mm,
+        act,
+        lambda mean, sd: (
+            f"the sensor's height above the surface {'grows' if mean[0] > 0 else 'shrinks'} by "
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} mm per 100 mm along X: the table slopes"
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class HeightOffset(ScanGroupEffect[Footprint]):
+@light_effect("height_offset", Stage.FOOTPRINT, "another sensor height in some scans", ("scan",))
+def height_offset(kind: LightEffect, of: Extent) -> Effect | None:
     """One mounting or scan at another height: mm adds to the height there; footprint x h/h0, signal x (h0/h)^2.
 
-    h0 and h are those of `HeightGradient`.
+    h0 and h are those of `height_gradient`.
     """
 
-    typical_mm: float = 0.15
+    def in_scans(scans: tuple[str, ...]) -> Effect:
+        def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+            added = theta * scan_indicator(plan, scans) / _nominal_height_mm(plan)
+            return footprint_at_added_height(value, added, plan)
 
-    name = "height_offset"
-    words = "another sensor height in some scans"
-    stage = Stage.FOOTPRINT
-    units = ("mm",)
-    covariates = ("scan",)
-    parameters = ("mm",)
+        return kind.linear(
+            of,
+            {"mm": "mm"},
+            0.01 * _nominal_height_mm(of.plan),
+            act,
+            lambda mean, sd: (
+                f"in {scans_in_words(scans)} the sensor hangs {value_with_sd(abs(mean[0]), sd[0])} mm "
+                f"{'higher' if mean[0] > 0 else 'lower'} than in the others"
+            ),
+            where=Where(scans=scans),
+        )
 
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        choices = candidate_scan_groups(extent.plan)
-        return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
-
-    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        added = theta * scan_indicator(plan, self.scans) / _nominal_height_mm(plan)
-        return footprint_at_added_height(value, added, plan)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "higher" if mean[0] > 0 else "lower"
-        much = value_with_sd(abs(mean[0]), sd[0])
-        return f"in {scans_in_words(self.scans)} the sensor hangs {much} mm {way} than in the others"
+    return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
 
 
 def _nominal_height_mm(plan: Plan) -> float:
@@ -541,100 +461,66 @@ def _nominal_height_mm(plan: Plan) -> float:
     return plan.instrumentation.height_mm or _USUAL_MM
 
 
-@dataclass(frozen=True)
-class SlowSinking(CountsTimeFromOrigin, LinearEffect[Footprint]):
+@light_effect("slow_sinking", Stage.FOOTPRINT, "a sensor that slowly rises or sinks", ("time", "level"), counts="time")
+def slow_sinking(kind: LightEffect, of: Extent) -> Effect:
     """The sensor sinks or rises: per_hour t h0 adds to the height; footprint x h/h0, signal x (h0/h)^2.
 
-    t is the time since `origin` in hours; h0 and h are those of `HeightGradient`.
+    t is the time since the origin in hours; h0 and h are those of `height_gradient`.
     """
-
-    typical_per_hour: float = 0.1
-
-    name = "slow_sinking"
-    words = "a sensor that slowly rises or sinks"
-    stage = Stage.FOOTPRINT
-    units = ("1/h",)
-    covariates = ("time", "level")
-    parameters = ("per_hour",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(typical_per_hour=0.01 / (extent.duration_s / 3600), origin=extent.origin)
-
-    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_added_height(value, theta[:, :1] * self.origin.hours(plan), plan)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "rises" if mean[0] > 0 else "sinks"
-        return (
-            f"the sensor {way} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} % of its height per hour: "
-            "it is loose in its holder"
-        )
+    return kind.linear(
+        of,
+        {"per_hour": "1/h"},
+        0.01 / (of.duration_s / 3600),
+        lambda value, theta, plan: footprint_at_added_height(value, theta[:, :1] * of.origin.hours(plan), plan),
+        lambda mean, sd: (
+            f"the sensor {'rises' if mean[0] > 0 else 'sinks'} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
+            "of its height per hour: it is loose in its holder"
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class EdgeBlur(LinearEffect[Footprint]):
+def _has_one_height(plan: Plan) -> bool:
+    ratio = height_ratio(plan)
+    return ratio is None or float(np.ptp(ratio)) == 0.0
+
+
+@light_effect(
+    "edge_blur", Stage.FOOTPRINT, "soft printed edges", ("edge_distance",), is_absorbed_by_ssf=_has_one_height
+)
+def edge_blur(kind: LightEffect, of: Extent) -> Effect:
     """Printed edges are blurred by a Gaussian of sd_mm, which acts as a wider footprint over sharp edges would.
 
-    The footprint's covariance grows by sd_mm^2 along each axis, whatever the sensor's orientation.
+    The footprint's covariance grows by sd_mm^2 along each axis, whatever the sensor's orientation. It equals a wider
+    SSF unless the height varies, which scales a footprint but not a blur.
     """
 
-    typical_mm: float = 2.0
-
-    name = "edge_blur"
-    words = "soft printed edges"
-    stage = Stage.FOOTPRINT
-    units = ("mm",)
-    covariates = ("edge_distance",)
-    parameters = ("sd_mm",)
-    positive = True
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(typical_mm=0.02 * extent.length_mm)
-
-    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+    def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         wider = theta[:, :, None] ** 2
         return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
 
-    def is_absorbed_by_ssf(self, plan: Plan) -> bool:
-        """Return True (it equals a wider SSF) unless the height varies, which scales a footprint but not a blur."""
-        ratio = height_ratio(plan)
-        return ratio is None or float(np.ptp(ratio)) == 0.0
+    return kind.linear(
+        of,
+        {"sd_mm": "mm"},
+        0.02 * of.length_mm,
+        act,
+        lambda mean, sd: f"the printed edges are soft: blurred by {value_with_sd(mean[0], sd[0])} mm (sd)",
+        positive=True,
+        kind=_BlurEffect,
+    )
 
+
+class _BlurEffect(Effect):
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
         """Return a starting sd, (1,): the entry's, its square scaled by the fitted amount."""
         return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
 
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the printed edges are soft: blurred by {value_with_sd(mean[0], sd[0])} mm (sd)"
 
-
-@dataclass(frozen=True)
-class Halo(NamedEffect[Footprint]):
+@light_effect("halo", Stage.FOOTPRINT, "scattered light around the spot", ("edge_distance",))
+def halo(kind: LightEffect, of: Extent) -> Effect:
     """Light scattered in the lens: `share` of the footprint becomes one more Gaussian, of sd r_mm about its centre."""
+    narrowest_mm, widest_mm = 0.1 * of.length_mm, of.length_mm
 
-    least_share: float = 1e-3
-    narrowest_mm: float = 10.0
-    widest_mm: float = 100.0
-
-    name = "halo"
-    words = "scattered light around the spot"
-    stage = Stage.FOOTPRINT
-    units = ("1", "mm")
-    covariates = ("edge_distance",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(narrowest_mm=0.1 * extent.length_mm, widest_mm=extent.length_mm)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product(
-            {"share": LogUniform(self.least_share, 0.7), "r_mm": LogUniform(self.narrowest_mm, self.widest_mm)}
-        )
-
-    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+    def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
 
         def with_halo_appended(own: FloatArray, halo: FloatArray) -> FloatArray:
@@ -655,52 +541,40 @@ class Halo(NamedEffect[Footprint]):
             cov_uv=with_halo_appended(value.cov_uv, np.zeros((1, 1, 1))),
         )
 
-    def bank(self) -> FloatArray:
-        return single_column_bank(0.02, np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
+    return kind.bind(
+        of,
+        {"share": LogUniform(1e-3, 0.7), "r_mm": LogUniform(narrowest_mm, widest_mm)},
+        ("1", "mm"),
+        act,
+        single_column_bank(0.02, np.geomspace(narrowest_mm * 1.2, widest_mm / 1.2, 5)),
+        lambda mean, sd: (
             f"a wide halo around the sensor's spot, of sd {value_with_sd(mean[1], sd[1])} mm, contributes "
             f"{value_with_sd(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
-        )
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class EdgeShadow(NamedEffect[View]):
+@light_effect("edge_shadow", Stage.SEEN, "shadows along the edges", ("edge_distance",))
+def edge_shadow(kind: LightEffect, of: Extent) -> Effect:
     """A raised edge casts a shadow: u - amp exp(-d^2 / 2 w^2), d the sensor's distance from the nearest edge.
 
-    Here u is the seen white fraction. Patterns may be made in different ways, one glued on, another printed. `patterns`
-    are those with raised edges, () for all; `choices` are the candidate groups.
+    Here u is the seen white fraction; widths lie between a hundredth and a third of the longest scan. Patterns may be
+    made in different ways, one glued on, another printed: raised edges may belong to all kinds of pattern, to one kind,
+    or to all kinds but one.
     """
+    kinds = _groups_of_edged_patterns(of.plan)
+    but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
+    choices = tuple(dict.fromkeys([(), *kinds, *but_one])) if len(kinds) > 1 else ((),)
+    found = one_of([edge_shadow_of_patterns(kind, of, patterns) for patterns in choices])
+    assert found is not None
+    return found
 
-    typical: float = 0.01
-    narrowest_mm: float = 1.0
-    widest_mm: float = 30.0
-    patterns: tuple[str, ...] = ()
-    choices: tuple[tuple[str, ...], ...] = ((),)
 
-    name = "edge_shadow"
-    words = "shadows along the edges"
-    stage = Stage.SEEN
-    units = ("1", "mm")
-    covariates = ("edge_distance",)
+def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, ...]) -> Effect:
+    """Return the shadow along the edges of these patterns, () for all."""
+    typical, narrowest_mm, widest_mm = 0.01, 0.01 * of.length_mm, of.length_mm / 3
 
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Return the effect with widths from a hundredth to a third of the length of the longest scan.
-
-        Raised edges may belong to all kinds of pattern, to one kind, or to all kinds but one.
-        """
-        kinds = _groups_of_edged_patterns(extent.plan)
-        but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
-        choices = tuple(dict.fromkeys([(), *kinds, *but_one])) if len(kinds) > 1 else ((),)
-        return cls(narrowest_mm=0.01 * extent.length_mm, widest_mm=extent.length_mm / 3, choices=choices)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"amp": HeavyTailedPrior(self.typical), "w": LogUniform(self.narrowest_mm, self.widest_mm)})
-
-    def apply(self, value: View, theta: FloatArray, plan: Plan) -> View:
+    def act(value: View, theta: FloatArray, plan: Plan) -> View:
         everywhere = (1, len(plan))
         x_mm, y_mm = (
             np.broadcast_to(place, np.broadcast_shapes(place.shape, everywhere))
@@ -709,27 +583,31 @@ class EdgeShadow(NamedEffect[View]):
         parts = [
             (rows, edge_distance(value.regions[name], x_mm[:, rows], y_mm[:, rows]))
             for name, rows in plan.rows_by_pattern()
-            if not self.patterns or name in self.patterns
+            if not patterns or name in patterns
         ]
         distance = np.full((max((len(part) for _, part in parts), default=1), len(plan)), np.inf)
         for rows, part in parts:
             distance[:, rows] = part
         return replace(value, seen=value.seen - theta[:, :1] * gaussian_bump(distance**2, theta[:, 1:2]))
 
-    def variants(self) -> tuple[Self, ...]:
-        return tuple(replace(self, patterns=choice) for choice in self.choices)
-
-    def bank(self) -> FloatArray:
-        return single_column_bank(self.typical, np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        kind = "darker" if mean[0] > 0 else "brighter"
-        where = f" of pattern {', '.join(self.patterns)}" if self.patterns else ""
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        where = f" of pattern {', '.join(patterns)}" if patterns else ""
         why = "the edge casts a shadow" if mean[0] > 0 else "the edge reflects light"
         return (
             f"within {value_with_sd(mean[1], sd[1])} mm of an edge{where} the surface looks "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: {why}"
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {'darker' if mean[0] > 0 else 'brighter'} than the "
+            f"pattern explains: {why}"
         )
+
+    return kind.bind(
+        of,
+        {"amp": HeavyTailedPrior(typical), "w": LogUniform(narrowest_mm, widest_mm)},
+        ("1", "mm"),
+        act,
+        single_column_bank(typical, np.geomspace(narrowest_mm * 1.5, widest_mm / 1.5, 6)),
+        says,
+        where=Where(patterns=patterns),
+    )
 
 
 def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
@@ -741,58 +619,40 @@ def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(names) for names in kinds.values())
 
 
-@dataclass(frozen=True)
-class Reflection(NamedEffect[Footprint]):
+@light_effect("reflection", Stage.FOOTPRINT, "a reflection beside the spot", ("place", "edge_distance"))
+def reflection(kind: LightEffect, of: Extent) -> Effect:
     """`share` of the light comes from a copy of the footprint, displaced by (dx_mm, dy_mm) in the lab frame."""
+    typical, farthest_mm = 0.02, 0.5 * of.length_mm
 
-    typical: float = 0.02
-    farthest_mm: float = 20.0
-
-    name = "reflection"
-    words = "a reflection beside the spot"
-    stage = Stage.FOOTPRINT
-    units = ("1", "mm", "mm")
-    covariates = ("place", "edge_distance")
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(farthest_mm=0.5 * extent.length_mm)
-
-    @cached_property
-    def prior(self) -> Product:
-        reach = Uniform(-self.farthest_mm, self.farthest_mm)
-        return Product({"share": HeavyTailedPrior(self.typical, positive=True), "dx_mm": reach, "dy_mm": reach})
-
-    def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
+    def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         share = np.clip(theta[:, :1, None], 0.0, 1.0)
         turn = plan.orientation_rad[None, :, None]
         dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
-        u_mm = value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy
-        v_mm = value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy
+
+        def doubled(first: FloatArray, second: FloatArray) -> FloatArray:
+            shape = np.broadcast_shapes(first.shape, second.shape)
+            return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)
+
         return Footprint(
-            weight=_concatenated_components(value.weight * (1 - share), value.weight * share),
-            u_mm=_concatenated_components(value.u_mm, u_mm),
-            v_mm=_concatenated_components(value.v_mm, v_mm),
-            var_u=_concatenated_components(value.var_u, value.var_u),
-            var_v=_concatenated_components(value.var_v, value.var_v),
-            cov_uv=_concatenated_components(value.cov_uv, value.cov_uv),
+            weight=doubled(value.weight * (1 - share), value.weight * share),
+            u_mm=doubled(value.u_mm, value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy),
+            v_mm=doubled(value.v_mm, value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy),
+            var_u=doubled(value.var_u, value.var_u),
+            var_v=doubled(value.var_v, value.var_v),
+            cov_uv=doubled(value.cov_uv, value.cov_uv),
             brightness=value.brightness,
         )
 
-    def bank(self) -> FloatArray:
-        angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES
-        far = self.farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
-        dx, dy = (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()
-        return single_column_bank(self.typical, dx, dy)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
+    angles, reach = 2 * math.pi * np.arange(_ANGLES) / _ANGLES, Uniform(-farthest_mm, farthest_mm)
+    far = farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
+    return kind.bind(
+        of,
+        {"share": HeavyTailedPrior(typical, positive=True), "dx_mm": reach, "dy_mm": reach},
+        ("1", "mm", "mm"),
+        act,
+        single_column_bank(typical, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()),
+        lambda mean, sd: (
             f"a second spot, {value_with_sd(mean[1], sd[1])} mm along X and {value_with_sd(mean[2], sd[2])} mm along Y "
             f"from the first, contributes {value_with_sd(mean[0], sd[0], factor=100)} % of the light: a reflection"
-        )
-
-
-def _concatenated_components(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Concatenate values of two sets of Gaussians, (n_samples, n_points, n_gaussians) each, along the last axis."""
-    shape = np.broadcast_shapes(first.shape, second.shape)
-    return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)
+        ),
+    )

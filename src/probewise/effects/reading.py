@@ -2,41 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Self
-
 import numpy as np
 
 from probewise._arrays import FloatArray, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     PHASE,
-    ChangePointEffect,
-    LinearEffect,
-    NamedEffect,
+    Effect,
+    LightEffect,
     WaveEffect,
-    candidate_change_times_s,
+    light_effect,
     sine_and_cosine_entries,
     single_column_bank,
 )
 from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
-from probewise.effects.reference import (
-    CountsPlaceFromOrigin,
-    CountsTimeFromOrigin,
-    Extent,
-    sign_of_motion,
-)
-from probewise.priors import LogUniform, Product, Uniform
+from probewise.effects.reference import Extent, sign_of_motion
+from probewise.priors import LogUniform, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
 _BATTERY = "battery_mv"
 _REFERENCE_MV = 8000.0
 _MOST_EQUAL = 0.01
-_MOST_FREQUENCIES = 1024
+_LOWEST_HZ, _MOST_FREQUENCIES = 0.01, 1024
+_SHARE = 0.02  # typical change of the signal
 _IN_DIRECTION = {-1.0: "of backward motion", 0.0: "at rest", 1.0: "of forward motion"}
+_ALIKE = "over black and white alike"
 
 
 def decaying_sum(added: FloatArray, kept: FloatArray, *, longest: int) -> FloatArray:
@@ -54,114 +45,69 @@ def decaying_sum(added: FloatArray, kept: FloatArray, *, longest: int) -> FloatA
     return held
 
 
-@dataclass(frozen=True)
-class Nonlinearity(NamedEffect[FloatArray]):
+@light_effect("nonlinearity", Stage.RESPONSE, "a bent response curve", ("level",))
+def nonlinearity(kind: LightEffect, of: Extent) -> Effect:
     """A bent response curve: u -> u^gamma, u the seen white fraction clipped to 0..1."""
-
-    typical_log: float = 0.1
-
-    name = "nonlinearity"
-    words = "a bent response curve"
-    stage = Stage.RESPONSE
-    units = ("1",)
-    covariates = ("level",)
-    amplitudes = ()
-
-    @property
-    def nothing(self) -> Mapping[int, float]:
-        return {0: 1.0}
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"gamma": LogHeavyTailedPrior(self.typical_log)})
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(np.clip(value, 0.0, 1.0) ** theta[:, :1])
-
-    def bank(self) -> FloatArray:
-        return single_column_bank(np.exp(self.typical_log * np.array([-1.0, 1.0])))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        seen = 100 * 0.5 ** mean[0]
-        return (
+    return kind.bind(
+        of,
+        {"gamma": LogHeavyTailedPrior(0.1)},
+        ("1",),
+        lambda value, theta, plan: np.clip(value, 0.0, 1.0) ** theta[:, :1],
+        single_column_bank(np.exp(0.1 * np.array([-1.0, 1.0]))),
+        lambda mean, sd: (
             f"the response is bent with exponent {value_with_sd(mean[0], sd[0])}: "
-            f"a half-white view reads as {seen:.1f} % white"
-        )
+            f"a half-white view reads as {100 * 0.5 ** mean[0]:.1f} % white"
+        ),
+        amplitudes=(),
+        absent={0: 1.0},
+    )
 
 
-@dataclass(frozen=True)
-class GainDrift(CountsTimeFromOrigin, NamedEffect[FloatArray]):
-    """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since `origin`, 0 before it."""
+@light_effect("gain_drift", Stage.GAIN, "a gain that drifts", ("time",), counts="time")
+def gain_drift(kind: LightEffect, of: Extent) -> Effect:
+    """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since the origin, 0 before it."""
+    shortest_s, longest_s = 0.01 * of.duration_s, 2 * of.duration_s
 
-    typical: float = 0.02
-    shortest_s: float = 5.0
-    longest_s: float = 5000.0
-
-    name = "gain_drift"
-    words = "a gain that drifts"
-    stage = Stage.GAIN
-    units = ("1", "s")
-    covariates = ("time",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        duration_s = extent.duration_s
-        return cls(shortest_s=0.01 * duration_s, longest_s=2 * duration_s, origin=extent.origin)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"frac": HeavyTailedPrior(self.typical), "tau_s": LogUniform(self.shortest_s, self.longest_s)})
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         # A negative time would let the exponential overflow.
-        fade = np.exp(-np.maximum(self.origin.seconds(plan), 0.0) / theta[:, 1:2])
-        return np.asarray(value * (1 + theta[:, :1] * fade))
+        return value * (1 + theta[:, :1] * np.exp(-np.maximum(of.origin.seconds(plan), 0.0) / theta[:, 1:2]))
 
-    def bank(self) -> FloatArray:
-        return single_column_bank(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        side = "too strong" if mean[0] > 0 else "too weak"
-        return (
-            f"the signal starts {value_with_sd(abs(mean[0]), sd[0], factor=100)} % {side} at time 0 and settles "
+    return kind.bind(
+        of,
+        {"frac": HeavyTailedPrior(_SHARE), "tau_s": LogUniform(shortest_s, longest_s)},
+        ("1", "s"),
+        act,
+        single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 7)),
+        lambda mean, sd: (
+            f"the signal starts {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
+            f"{'too strong' if mean[0] > 0 else 'too weak'} at time 0 and settles "
             f"with a time constant of {value_with_sd(mean[1], sd[1])} s: the lamp warms up"
-        )
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class BatterySag(LinearEffect[FloatArray]):
+@light_effect("battery_sag", Stage.GAIN, "a signal that follows the battery", (_BATTERY,), reads=(_BATTERY,))
+def battery_sag(kind: LightEffect, of: Extent) -> Effect | None:
     """A lamp that dims with its battery: signal x (1 + per_volt (V - V0)), V from `battery_mv`, V0 = 8 V.
 
     Between recorded voltages V is interpolated in time, and beyond them it is the nearest one; it is V0 if there is
     none.
     """
-
-    typical_per_volt: float = 0.05
-
-    name = "battery_sag"
-    words = "a signal that follows the battery"
-    stage = Stage.GAIN
-    units = ("1/V",)
-    covariates = (_BATTERY,)
-    reads = (_BATTERY,)
-    parameters = ("per_volt",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        millivolts = extent.plan.covariates.get(_BATTERY, np.empty(0))
-        recorded = (millivolts[np.isfinite(millivolts)] - _REFERENCE_MV) / 1000
-        fall = float(np.ptp(recorded)) if recorded.size else 0.0
-        return cls(typical_per_volt=0.02 / fall) if fall > 0 else None
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value * (1 + theta[:, :1] * _volts_above_reference(plan)))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "loses" if mean[0] > 0 else "gains"
-        return (
-            f"the signal {way} {value_with_sd(abs(mean[0]), sd[0], factor=100)} % for each volt that the battery "
-            "falls: the lamp follows the battery"
-        )
+    millivolts = of.plan.covariates.get(_BATTERY, np.empty(0))
+    recorded = (millivolts[np.isfinite(millivolts)] - _REFERENCE_MV) / 1000
+    fall = float(np.ptp(recorded)) if recorded.size else 0.0
+    if not fall > 0:
+        return None
+    return kind.linear(
+        of,
+        {"per_volt": "1/V"},
+        _SHARE / fall,
+        lambda value, theta, plan: value * (1 + theta[:, :1] * _volts_above_reference(plan)),
+        lambda mean, sd: (
+            f"the signal {'loses' if mean[0] > 0 else 'gains'} {value_with_sd(abs(mean[0]), sd[0], factor=100)} % for "
+            "each volt that the battery falls: the lamp follows the battery"
+        ),
+    )
 
 
 def _volts_above_reference(plan: Plan) -> FloatArray:
@@ -176,63 +122,32 @@ def _volts_above_reference(plan: Plan) -> FloatArray:
     return np.where(np.isfinite(above), above, np.interp(plan.time_s, plan.time_s[known], above[known]))
 
 
-@dataclass(frozen=True)
-class GainStep(ChangePointEffect[FloatArray]):
+@light_effect("gain_jump", Stage.GAIN, "a sudden change of the signal's strength", ("time", "level"))
+def gain_jump(kind: LightEffect, of: Extent) -> Effect | None:
     """The lamp or lens changes suddenly: signal x (1 + frac 1(t > at_s))."""
-
-    typical: float = 0.02
-
-    name = "gain_jump"
-    words = "a sudden change of the signal's strength"
-    stage = Stage.GAIN
-    units = ("1", "s")
-    covariates = ("time", "level")
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        times = candidate_change_times_s(extent)
-        return None if times is None else cls(times)
-
-    @property
-    def typical_sizes(self) -> Mapping[str, float]:
-        return {"frac": self.typical}
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value * (1 + theta[:, :1] * self.after_change_mask(theta, plan)))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "stronger" if mean[0] > 0 else "weaker"
-        return (
+    return kind.step(
+        of,
+        {"frac": (_SHARE, "1")},
+        lambda value, theta, after: value * (1 + theta[:, :1] * after),
+        lambda mean, sd: (
             f"from {value_with_sd(mean[1], sd[1])} s on, the signal is "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {way}: the lamp or the lens changed suddenly"
-        )
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {'stronger' if mean[0] > 0 else 'weaker'}: "
+            "the lamp or the lens changed suddenly"
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class Polarisation(LinearEffect[FloatArray]):
+@light_effect("polarisation", Stage.GAIN, "a signal that depends on the orientation", ("orientation",))
+def polarisation(kind: LightEffect, of: Extent) -> Effect | None:
     """Glossy paper partly polarises the light, and the sensor is more sensitive to one polarisation (law of Malus).
 
     signal x (1 + cos_frac cos 2 psi + sin_frac sin 2 psi), psi the sensor's orientation.
     """
 
-    typical: float = 0.02
+    def columns(plan: Plan) -> FloatArray:
+        return np.stack([np.cos(2 * plan.orientation_rad), np.sin(2 * plan.orientation_rad)])
 
-    name = "polarisation"
-    words = "a signal that depends on the orientation"
-    stage = Stage.GAIN
-    units = ("1", "1")
-    covariates = ("orientation",)
-    parameters = ("cos_frac", "sin_frac")
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        columns = _columns(extent.plan)
-        return cls() if np.ptp(columns, axis=1).max() > _MOST_EQUAL else None
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value * (1 + theta @ _columns(plan)))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+    def says(mean: FloatArray, sd: FloatArray) -> str:
         size = float(np.hypot(*mean))
         size_sd = float(np.hypot(*(mean * sd))) / size if size > 0 else float(np.hypot(*sd))
         strongest_deg = float(np.rad2deg(np.arctan2(mean[1], mean[0])) / 2) % 180
@@ -241,341 +156,201 @@ class Polarisation(LinearEffect[FloatArray]):
             f"strongest at {strongest_deg:.0f} degrees: the light is polarised"
         )
 
-
-def _columns(plan: Plan) -> FloatArray:
-    """Return the cosine and the sine of twice the orientation, (2, n_points)."""
-    return np.stack([np.cos(2 * plan.orientation_rad), np.sin(2 * plan.orientation_rad)])
-
-
-@dataclass(frozen=True)
-class AmbientGradient(CountsPlaceFromOrigin, LinearEffect[FloatArray]):
-    """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame, from `origin`."""
-
-    typical_per_mm: float = 0.005
-    unit: str = field(default="", kw_only=True)
-
-    name = "ambient_gradient"
-    words = "stray light from one side"
-    stage = Stage.OFFSET
-    units = ("reading/mm", "reading/mm")
-    covariates = ("place",)
-    parameters = ("per_mm_x", "per_mm_y")
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        if not (varies(extent.plan.x_mm) or varies(extent.plan.y_mm)):
-            return None
-        typical = 0.01 * extent.span / extent.length_mm
-        return cls(typical_per_mm=typical, unit=extent.reading_unit, origin=extent.origin)
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        x_mm, y_mm = plan.x_mm - self.origin.x_mm, plan.y_mm - self.origin.y_mm
-        return np.asarray(value + theta[:, :1] * x_mm + theta[:, 1:2] * y_mm)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"the reading changes by {value_with_sd(mean[0], sd[0], self.unit, factor=100)} per 100 mm along X and by "
-            f"{value_with_sd(mean[1], sd[1], self.unit, factor=100)} per 100 mm along Y, over black and white alike: "
-            "stray light from one side"
-        )
+    if np.ptp(columns(of.plan), axis=1).max() <= _MOST_EQUAL:
+        return None
+    units = {"cos_frac": "1", "sin_frac": "1"}
+    return kind.linear(of, units, _SHARE, lambda value, theta, plan: value * (1 + theta @ columns(plan)), says)
 
 
-@dataclass(frozen=True)
-class OffsetDrift(CountsTimeFromOrigin, LinearEffect[FloatArray]):
-    """A slow drift: reading + per_hour t, t the plan's time since `origin` in hours."""
-
-    typical_per_hour: float = 1.0
-    unit: str = field(default="", kw_only=True)
-
-    name = "offset_drift"
-    words = "a slow drift of all readings"
-    stage = Stage.OFFSET
-    units = ("reading/h",)
-    covariates = ("time",)
-    parameters = ("per_hour",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        typical = 0.01 * extent.span / (extent.duration_s / 3600)
-        return cls(typical_per_hour=typical, unit=extent.reading_unit, origin=extent.origin)
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * self.origin.hours(plan))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "rises" if mean[0] > 0 else "falls"
-        return (
-            f"the reading {way} by {value_with_sd(abs(mean[0]), sd[0], self.unit)} per hour, over black and white "
-            "alike: the electronics or the room light drift"
-        )
+@light_effect("ambient_gradient", Stage.OFFSET, "stray light from one side", ("place",), counts="place")
+def ambient_gradient(kind: LightEffect, of: Extent) -> Effect | None:
+    """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame, from the origin."""
+    if not (varies(of.plan.x_mm) or varies(of.plan.y_mm)):
+        return None
+    at, unit = of.origin, of.reading_unit
+    return kind.linear(
+        of,
+        {"per_mm_x": "reading/mm", "per_mm_y": "reading/mm"},
+        0.01 * of.span / of.length_mm,
+        lambda value, theta, plan: value + theta[:, :1] * (plan.x_mm - at.x_mm) + theta[:, 1:2] * (plan.y_mm - at.y_mm),
+        lambda mean, sd: (
+            f"the reading changes by {value_with_sd(mean[0], sd[0], unit, factor=100)} per 100 mm along X and by "
+            f"{value_with_sd(mean[1], sd[1], unit, factor=100)} per 100 mm along Y, {_ALIKE}: stray light from one side"
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class AmbientStep(ChangePointEffect[FloatArray]):
+@light_effect("offset_drift", Stage.OFFSET, "a slow drift of all readings", ("time",), counts="time")
+def offset_drift(kind: LightEffect, of: Extent) -> Effect:
+    """A slow drift: reading + per_hour t, t the plan's time since the origin in hours."""
+    return kind.linear(
+        of,
+        {"per_hour": "reading/h"},
+        0.01 * of.span / (of.duration_s / 3600),
+        lambda value, theta, plan: value + theta[:, :1] * of.origin.hours(plan),
+        lambda mean, sd: (
+            f"the reading {'rises' if mean[0] > 0 else 'falls'} by "
+            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} per hour, {_ALIKE}: "
+            "the electronics or the room light drift"
+        ),
+    )
+
+
+@light_effect("ambient_step", Stage.OFFSET, "a sudden change of the room light", ("time",))
+def ambient_step(kind: LightEffect, of: Extent) -> Effect | None:
     """Light switched on or off in the room: reading + amp 1(t > at_s)."""
-
-    typical: float = 0.5
-    unit: str = field(default="", kw_only=True)
-
-    name = "ambient_step"
-    words = "a sudden change of the room light"
-    stage = Stage.OFFSET
-    units = ("reading", "s")
-    covariates = ("time",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        times = candidate_change_times_s(extent)
-        return None if times is None else cls(times, typical=0.01 * extent.span, unit=extent.reading_unit)
-
-    @property
-    def typical_sizes(self) -> Mapping[str, float]:
-        return {"amp": self.typical}
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * self.after_change_mask(theta, plan))
-
-    def with_fewer_variants(self) -> Self:
-        """Return the effect with all intervals: the time of the step is what identifies it."""
-        return self
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "jumps up" if mean[0] > 0 else "drops"
-        return (
-            f"the reading {way} by {value_with_sd(abs(mean[0]), sd[0], self.unit)} at "
-            f"{value_with_sd(mean[1], sd[1])} s and stays there, over black and white alike: the room light changed"
-        )
+    return kind.step(
+        of,
+        {"amp": (0.01 * of.span, "reading")},
+        lambda value, theta, after: value + theta[:, :1] * after,
+        lambda mean, sd: (
+            f"the reading {'jumps up' if mean[0] > 0 else 'drops'} by "
+            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} at {value_with_sd(mean[1], sd[1])} s and stays "
+            f"there, {_ALIKE}: the room light changed"
+        ),
+        is_thinned=False,
+    )
 
 
-@dataclass(frozen=True)
-class Flicker(CountsTimeFromOrigin, WaveEffect[FloatArray]):
-    """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase), t the time since `origin`.
+@light_effect("flicker", Stage.OFFSET, "a flickering lamp", ("time",), counts="time")
+def flicker(kind: LightEffect, of: Extent) -> Effect | None:
+    """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase), t the time since the origin.
 
     The mains frequency aliased by the sampling, or a slow lamp: any frequency up to half the rate of readings.
     """
+    typical, highest = 0.01 * of.span, 0.5 / of.gap_s
+    if highest <= _LOWEST_HZ:
+        return None
+    n = int(np.clip(np.ceil(2 * (highest - _LOWEST_HZ) * of.duration_s), 8, _MOST_FREQUENCIES))
 
-    typical: float = 0.5
-    lowest_hz: float = 0.01
-    highest_hz: float = 0.5
-    n_frequencies: int = 128
-    unit: str = field(default="", kw_only=True)
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        return value + theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * of.origin.seconds(plan) + theta[:, 2:3])
 
-    name = "flicker"
-    words = "a flickering lamp"
-    stage = Stage.OFFSET
-    units = ("reading", "Hz", "rad")
-    covariates = ("time",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        highest = 0.5 / extent.gap_s
-        if highest <= cls.lowest_hz:
-            return None
-        wanted = 2 * (highest - cls.lowest_hz) * extent.duration_s
-        n_frequencies = int(np.clip(np.ceil(wanted), 8, _MOST_FREQUENCIES))
-        typical, unit = 0.01 * extent.span, extent.reading_unit
-        return cls(typical, cls.lowest_hz, highest, n_frequencies, unit=unit, origin=extent.origin)
-
-    @cached_property
-    def prior(self) -> Product:
-        frequency = Uniform(self.lowest_hz, self.highest_hz)
-        return Product({"amp": HeavyTailedPrior(self.typical, positive=True), "alias_hz": frequency, "phase": PHASE})
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        wave = np.sin(2 * np.pi * theta[:, 1:2] * self.origin.seconds(plan) + theta[:, 2:3])
-        return np.asarray(value + theta[:, :1] * wave)
-
-    def bank(self) -> FloatArray:
-        frequencies = np.linspace(self.lowest_hz, self.highest_hz, self.n_frequencies + 2)[1:-1]
-        return sine_and_cosine_entries(self.typical, frequencies)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"the reading oscillates with an amplitude of {value_with_sd(mean[0], sd[0], self.unit)} at "
-            f"{value_with_sd(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), over black and white alike: "
-            "a lamp flickers"
-        )
+    return kind.bind(
+        of,
+        {"amp": HeavyTailedPrior(typical, positive=True), "alias_hz": Uniform(_LOWEST_HZ, highest), "phase": PHASE},
+        ("reading", "Hz", "rad"),
+        act,
+        sine_and_cosine_entries(typical, np.linspace(_LOWEST_HZ, highest, n + 2)[1:-1]),
+        lambda mean, sd: (
+            f"the reading oscillates with an amplitude of {value_with_sd(mean[0], sd[0], of.reading_unit)} at "
+            f"{value_with_sd(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), {_ALIKE}: a lamp flickers"
+        ),
+        kind=WaveEffect,
+    )
 
 
-@dataclass(frozen=True)
-class Hysteresis(LinearEffect[FloatArray]):
+@light_effect("hysteresis", Stage.OFFSET, "an offset that depends on the direction", ("direction",))
+def hysteresis(kind: LightEffect, of: Extent) -> Effect | None:
     """A reading that depends on the direction of motion: reading + amp d.
 
     d is the sign of the last motion along X, or along Y if X did not change; 0 without motion.
     """
-
-    typical: float = 0.5
-    unit: str = field(default="", kw_only=True)
-    directions: tuple[float, ...] = field(default=(-1.0, 1.0), kw_only=True)  # the signs of motion in the recording
-
-    name = "hysteresis"
-    words = "an offset that depends on the direction"
-    stage = Stage.OFFSET
-    units = ("reading",)
-    covariates = ("direction",)
-    parameters = ("amp",)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        signs = tuple(np.unique(sign_of_motion(extent.plan)).tolist())
-        return cls(0.01 * extent.span, unit=extent.reading_unit, directions=signs) if len(signs) > 1 else None
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * sign_of_motion(plan))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        way, least, most = "higher" if mean[0] > 0 else "lower", self.directions[0], self.directions[-1]
-        size = value_with_sd(abs(mean[0]), sd[0], self.unit, factor=most - least)
-        return (
-            f"readings {_IN_DIRECTION[most]} are {size} {way} than those {_IN_DIRECTION[least]}, over black and white "
-            "alike: hysteresis"
-        )
+    least, *more = np.unique(sign_of_motion(of.plan)).tolist()
+    if not more:
+        return None
+    most = more[-1]
+    return kind.linear(
+        of,
+        {"amp": "reading"},
+        0.01 * of.span,
+        lambda value, theta, plan: value + theta[:, :1] * sign_of_motion(plan),
+        lambda mean, sd: (
+            f"readings {_IN_DIRECTION[most]} are "
+            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit, factor=most - least)} "
+            f"{'higher' if mean[0] > 0 else 'lower'} than those {_IN_DIRECTION[least]}, {_ALIKE}: hysteresis"
+        ),
+    )
 
 
-@dataclass(frozen=True)
-class Lag(NamedEffect[FloatArray]):
+@light_effect("lag", Stage.LAG, "a sensor that follows slowly", ("slope", "direction"))
+def lag(kind: LightEffect, of: Extent) -> Effect:
     """First-order lag of the electronics: v_k = a v_(k-1) + (1 - a) y_k with a = exp(-(t_k - t_(k-1)) / tau_s).
 
     Here y_k are the readings without lag. The first reading of a scan has no lag.
     """
+    shortest_s, longest_s = of.gap_s / 6, 30 * of.gap_s
 
-    shortest_s: float = 0.2
-    longest_s: float = 20.0
-
-    name = "lag"
-    words = "a sensor that follows slowly"
-    stage = Stage.LAG
-    units = ("s",)
-    covariates = ("slope", "direction")
-    amplitudes = ()
-
-    @property
-    def nothing(self) -> Mapping[int, float]:
-        return {0: 0.0}
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(shortest_s=extent.gap_s / 6, longest_s=30 * extent.gap_s)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"tau_s": LogUniform(self.shortest_s, self.longest_s)})
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        same = np.diff(plan.scan, prepend=-1) == 0
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        same, tau_s = np.diff(plan.scan, prepend=-1) == 0, theta[:, :1]
         waited_s = np.where(same, np.maximum(np.diff(plan.time_s, prepend=0.0), 0.0), np.inf)
-        tau_s = theta[:, :1]
         kept = np.where(tau_s > 0, np.exp(-waited_s / np.where(tau_s > 0, tau_s, 1.0)), 0.0)  # 0 where a scan begins
         return decaying_sum((1 - kept) * value, kept, longest=int(np.bincount(plan.scan).max(initial=1)))
 
-    def bank(self) -> FloatArray:
-        return single_column_bank(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
+    return kind.bind(
+        of,
+        {"tau_s": LogUniform(shortest_s, longest_s)},
+        ("s",),
+        act,
+        single_column_bank(np.geomspace(shortest_s * 1.5, longest_s / 3, 7)),
+        lambda mean, sd: (
             f"each reading keeps part of the previous one, with a time constant of {value_with_sd(mean[0], sd[0])} s: "
             "the electronics lag"
-        )
+        ),
+        amplitudes=(),
+        absent={0: 0.0},
+    )
 
 
-@dataclass(frozen=True)
-class Overshoot(NamedEffect[FloatArray]):
+@light_effect("overshoot", Stage.OFFSET, "an overshoot where the light grows", ("time", "direction", "level"))
+def overshoot(kind: LightEffect, of: Extent) -> Effect | None:
     """An overshoot: at each rise the detector reads too high by `share` times the rise, an excess that decays.
 
     y_k + share x sum over j <= k of max(y_j - y_(j-1), 0) exp(-(t_k - t_j) / tau_s), y the readings without it. If
     `share` is negative, that fraction of each rise arrives late. Falls cause nothing.
     """
+    if not np.any(np.diff(of.plan.time_s) > 0):
+        return None
+    shortest_s, longest_s = of.gap_s, 30 * of.gap_s
 
-    typical: float = 0.02
-    shortest_s: float = 0.2
-    longest_s: float = 20.0
-
-    name = "overshoot"
-    words = "an overshoot where the light grows"
-    stage = Stage.OFFSET
-    units = ("1", "s")
-    covariates = ("time", "direction", "level")
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        if not np.any(np.diff(extent.plan.time_s) > 0):
-            return None
-        return cls(shortest_s=extent.gap_s, longest_s=30 * extent.gap_s)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"share": HeavyTailedPrior(self.typical), "tau_s": LogUniform(self.shortest_s, self.longest_s)})
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         waited_s = np.maximum(np.diff(plan.time_s, prepend=plan.time_s[:1]), 0.0)
         rise = np.maximum(np.diff(value, axis=1, prepend=value[:, :1]), 0.0)
-        decayed = decaying_sum(rise, np.exp(-waited_s / theta[:, 1:2]), longest=value.shape[1])
-        return np.asarray(value + theta[:, :1] * decayed)
+        return value + theta[:, :1] * decaying_sum(rise, np.exp(-waited_s / theta[:, 1:2]), longest=value.shape[1])
 
-    def bank(self) -> FloatArray:
-        return single_column_bank(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 6))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+    def says(mean: FloatArray, sd: FloatArray) -> str:
         share, tau = value_with_sd(abs(mean[0]), sd[0], factor=100), value_with_sd(mean[1], sd[1])
         if mean[0] > 0:
             return f"each rise of the signal overshoots by {share} %, which decay with a time constant of {tau} s"
         return f"{share} % of each rise of the signal comes late, with a time constant of {tau} s"
 
+    return kind.bind(
+        of,
+        {"share": HeavyTailedPrior(_SHARE), "tau_s": LogUniform(shortest_s, longest_s)},
+        ("1", "s"),
+        act,
+        single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 6)),
+        says,
+    )
 
-@dataclass(frozen=True)
-class Saturation(NamedEffect[FloatArray]):
+
+@light_effect("saturation", Stage.SATURATION, "readings cut off at a limit", ("level",))
+def saturation(kind: LightEffect, of: Extent) -> Effect:
     """A soft upper limit: reading -> level - softness log(1 + exp((level - reading) / softness)).
 
     As the softness goes to zero this is min(reading, level).
     """
+    lowest, highest = of.low + 0.2 * of.span, of.high + 0.3 * of.span
+    sharpest, softest, unit = 1e-3 * of.span, 0.3 * of.span, of.reading_unit
+    span = (highest - lowest) / 1.1
+    top = highest - 0.3 * span
+    sharp = [(top - share * 0.8 * span, sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]
+    soft = [(top + share * span, 0.1 * span) for share in (-0.2, -0.05, 0.1, 0.25)]
 
-    lowest: float = 0.0
-    highest: float = 150.0
-    sharpest: float = 0.05
-    softest: float = 20.0
-    unit: str = field(default="", kw_only=True)
-
-    name = "saturation"
-    words = "readings cut off at a limit"
-    stage = Stage.SATURATION
-    units = ("reading", "reading")
-    covariates = ("level",)
-    amplitudes = ()
-
-    @property
-    def nothing(self) -> Mapping[int, float]:
-        return {0: self.highest + 100 * self.softest}
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        return cls(
-            lowest=extent.low + 0.2 * extent.span,
-            highest=extent.high + 0.3 * extent.span,
-            sharpest=1e-3 * extent.span,
-            softest=0.3 * extent.span,
-            unit=extent.reading_unit,
-        )
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product(
-            {"level": Uniform(self.lowest, self.highest), "softness": LogUniform(self.sharpest, self.softest)}
-        )
-
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         level, softness = theta[:, :1], theta[:, 1:2]
         return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
 
-    def bank(self) -> FloatArray:
-        span = (self.highest - self.lowest) / 1.1
-        top = self.highest - 0.3 * span
-        sharp = [(top - share * 0.8 * span, self.sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]
-        soft = [(top + share * span, 0.1 * span) for share in (-0.2, -0.05, 0.1, 0.25)]
-        return np.array([*sharp, *soft])[:, None, :]
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        softness = f"{mean[1]:.2g} {self.unit}".rstrip()
-        return (
-            f"no reading rises above {value_with_sd(mean[0], sd[0], self.unit)}: the electronics saturate, "
-            f"from about {softness} below that limit"
-        )
+    return kind.bind(
+        of,
+        {"level": Uniform(lowest, highest), "softness": LogUniform(sharpest, softest)},
+        ("reading", "reading"),
+        act,
+        np.array([*sharp, *soft])[:, None, :],
+        lambda mean, sd: (
+            f"no reading rises above {value_with_sd(mean[0], sd[0], unit)}: the electronics saturate, "
+            f"from about {f'{mean[1]:.2g} {unit}'.rstrip()} below that limit"
+        ),
+        amplitudes=(),
+        absent={0: highest + 100 * softest},
+    )

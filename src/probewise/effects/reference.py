@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import ClassVar, Self
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Self
 
 import numpy as np
 
@@ -59,50 +59,19 @@ class Origin:
         return self.seconds(plan) / 3600
 
 
-@dataclass(frozen=True)
-class CountsFromOrigin:
-    """Base of effects whose formula holds the time or the place itself: they count from `origin`.
-
-    The origin belongs to the recording that is diagnosed, so that the effect means the same in any other plan.
-    """
-
-    name: ClassVar[str]
-    origin: Origin = field(default=Origin(), kw_only=True)
-
-    @property
-    def counted_from(self) -> str:
-        """Phrase on the origin from which the effect counts; "" for 0."""
-        raise NotImplementedError
-
-
-class CountsTimeFromOrigin(CountsFromOrigin):
-    """Base of effects whose formula holds the time."""
-
-    @property
-    def counted_from(self) -> str:
-        """Phrase on the time from which the effect counts, s; "" for 0."""
-        return f"time counts from {self.origin.time_s:.12g} s" if self.origin.time_s else ""
-
-
-class CountsPlaceFromOrigin(CountsFromOrigin):
-    """Base of effects whose formula holds the place."""
-
-    @property
-    def counted_from(self) -> str:
-        """Phrase on the place from which the effect counts, mm; "" for (0, 0)."""
-        x_mm, y_mm = self.origin.x_mm, self.origin.y_mm
-        return f"X and Y count from ({x_mm:g}, {y_mm:g}) mm" if x_mm or y_mm else ""
-
-
 def origins_of(effects: Iterable[object]) -> dict[str, Origin]:
     """Return the origins of those effects that do not count from 0, by the effect's name."""
-    counting = (effect for effect in effects if isinstance(effect, CountsFromOrigin))
-    return {effect.name: effect.origin for effect in counting if effect.origin != Origin()}
+    there = {getattr(effect, "name", ""): getattr(effect, "where", None) for effect in effects}
+    return {name: where.origin for name, where in there.items() if where is not None and where.origin != ZERO}
 
 
 def is_far_from_zero(values: FloatArray, length: float) -> bool:
     """Return whether all values, (n_points,), lie more than ten times `length` from 0; False for length 0."""
     return float(np.nanmin(np.abs(values))) > _FAR * length > 0.0
+
+
+ZERO = Origin()
+"""Time 0 and the place (0, 0)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +84,23 @@ class Extent:
         Least and largest usable reading.
     plan
         Pose, time and pattern of every reading.
+    counted_from
+        Time and place from which effects on this recording count; by default those of `Origin.of`.
     """
 
     low: float
     high: float
     plan: Plan
+    counted_from: Origin | None = None
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
             raise ParameterError("Extent(low, high)", (self.low, self.high), "low < high")
+
+    @classmethod
+    def usual(cls, origin: Origin) -> Self:
+        """Return an extent that can show every effect, of a scan of 100 mm there and back, of 50 units of reading."""
+        return cls(0.0, 50.0, _scan_there_and_back(), origin)
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
@@ -154,7 +131,7 @@ class Extent:
     @cached_property
     def origin(self) -> Origin:
         """Time and place from which effects on this recording count."""
-        return Origin.of(self.plan)
+        return Origin.of(self.plan) if self.counted_from is None else self.counted_from
 
     @cached_property
     def length_mm(self) -> float:
@@ -173,6 +150,24 @@ class Extent:
     def gap_s(self) -> float:
         """Median time between consecutive readings of a scan, s; 1 where no time passes."""
         return median_gap_s(self.plan)
+
+
+@lru_cache(maxsize=1)
+def _scan_there_and_back() -> Plan:
+    """Return a plan over an edge: 100 mm along X, and back with the sensor turned by 90 degrees and less battery."""
+    there, scan, one = np.linspace(-50.0, 50.0, 41), np.repeat([0, 1], 41), np.zeros(82, dtype=np.int64)
+    time_s = np.arange(82.0)
+    return Plan(
+        x_mm=np.append(there, there[::-1]),
+        y_mm=np.zeros(82),
+        orientation_rad=0.5 * np.pi * scan,
+        time_s=time_s,
+        scan=scan,
+        scan_names=("there", "back"),
+        pattern=one,
+        pattern_names=("field",),
+        covariates={"battery_mv": 8000.0 - time_s},
+    )
 
 
 def median_gap_s(plan: Plan) -> float:

@@ -401,7 +401,7 @@ def _digested(value: object) -> Iterator[bytes]:
     """Yield types, names of fields and bits of a value, to be digested."""
     if isinstance(value, NamedEffect):
         yield _EFFECT
-        yield from _digested((value.name, getattr(value, "origin", None), value.scans, value.patterns))
+        yield from _digested((value.name, getattr(value, "where", None)))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield f"<{type(value).__qualname__}>".encode()
         for item in dataclasses.fields(value):

@@ -17,7 +17,6 @@ from probewise._words import count_with_noun
 from probewise.arm.instrument import Pose, Reading
 from probewise.calibration import FittedSensor
 from probewise.effects import spoken_name
-from probewise.effects.reading import AmbientStep, GainDrift, OffsetDrift
 from probewise.experiment.arm_error import ArmError
 from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import HypothesisKind, Posterior
@@ -46,7 +45,7 @@ CLEAN = "clean"
 _CREDIBLE = 0.95
 _NAMED = 0.5
 # Effects in the time of one run, which do not belong to the sensor.
-_OF_THE_RUN = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name})
+_OF_THE_RUN = frozenset({"ambient_step", "offset_drift", "gain_drift"})
 _ALIASES = (
     "No reading of the field can show a tilt of the sensor, an offset of the arm or one error of scale along both "
     "axes: each amounts to another shape."

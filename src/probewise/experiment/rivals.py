@@ -13,17 +13,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.effects import VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior, NamedEffect
+from probewise.effects import VOCABULARY, Effect, Extent, HeavyTailedPrior, LightEffect, LogHeavyTailedPrior
 from probewise.effects.known import WrappedEffect
 from probewise.effects.optics import PatchPrior
-from probewise.effects.pose import Backlash
-from probewise.effects.reading import AmbientStep, GainDrift, Hysteresis, Lag, OffsetDrift
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.inference.problem import Likelihood
@@ -31,7 +29,7 @@ from probewise.inquiry import cards_of
 from probewise.priors import LogUniform, Prior, Product, Uniform
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.sensor import Chain, FixedLevels
-from probewise.sensor.stages import Effect, Poses, SensorModel
+from probewise.sensor.stages import AnyEffect, Poses, SensorModel
 
 ON_FIELD = {
     "ambient_gradient": True,
@@ -57,13 +55,13 @@ ON_FIELD = {
 WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
 """Effects that are aliased with another shape, unless there is a card at a known place."""
 
-OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
+OF_MOTION = frozenset({"backlash", "hysteresis"})
 """Effects of the direction from which the arm comes."""
 
 EACH_S = 8.0
 """Seconds of paced time that each reading takes on average."""
 
-_IN_TIME = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name, Lag.name})
+_IN_TIME = frozenset({"ambient_step", "offset_drift", "gain_drift", "lag"})
 _PACED = "paced_s"  # column of a plan
 _DURATION_S = 150.0
 _SCAN_MM = 100.0
@@ -101,7 +99,7 @@ def rivals_of(
     found = []
     for name, wide in ({**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD).items():
         plan = _plan_there_and_back(math.hypot(*field_mm) if wide else _SCAN_MM, height_mm)
-        effect = VOCABULARY[name].for_extent(Extent(min(dark, bright), max(dark, bright), plan))
+        effect = cast(LightEffect, VOCABULARY[name]).for_extent(Extent(min(dark, bright), max(dark, bright), plan))
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, field_mm)]
     noise = DeclaredNoise.from_likelihood(likelihood)
@@ -112,7 +110,7 @@ def rivals_of(
     return tuple(found)
 
 
-def _forms_of_effect_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[DescribedEffect]:
+def _forms_of_effect_in_run(effect: Effect, field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """Return the forms in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
     in_run = EffectWithRunPrior(effect, field_mm)
     if effect.name in OF_MOTION:
@@ -120,9 +118,8 @@ def _forms_of_effect_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[flo
     if effect.name not in _IN_TIME:
         return [in_run]
     forms: list[DescribedEffect] = [EffectInPacedTime(in_run)]
-    if isinstance(effect, GainDrift):
-        lost = GainLoss(effect.typical, effect.shortest_s, effect.longest_s)
-        forms.append(EffectInPacedTime(EffectWithRunPrior(lost, field_mm)))
+    if effect.name == "gain_drift":
+        forms.append(EffectInPacedTime(EffectWithRunPrior(gain_loss(effect), field_mm)))
     return forms
 
 
@@ -143,26 +140,24 @@ def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
     )
 
 
-@dataclass(frozen=True)
-class GainLoss(GainDrift):
-    """A lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
+def gain_loss(drift: Effect) -> Effect:
+    """Return a lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
 
-    def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal, (n_samples, n_points), but not the dark level."""
+    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         gone = -np.expm1(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
-        return np.asarray(value * np.maximum(1 + theta[:, :1] * gone, 0.0))
+        return value * np.maximum(1 + theta[:, :1] * gone, 0.0)
 
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the change of the signal in percent, and its speed."""
-        way = "rises" if mean[0] > 0 else "falls"
-        in_the_end = 100 * abs(mean[0])
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        way, in_the_end = "rises" if mean[0] > 0 else "falls", 100 * abs(mean[0])
         return (
             f"the signal {way} by {in_the_end:.2g} % in the end, {-in_the_end * math.expm1(-60 / mean[1]):.2g} % in "
             "the first minute of this: the lamp or its battery changes"
         )
 
+    return replace(drift, act=act, says=says)
 
-class DescribedEffect(Effect[Any], Protocol):
+
+class DescribedEffect(AnyEffect, Protocol):
     """An effect that can describe itself in a sentence."""
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -187,7 +182,7 @@ class EffectWithRunPrior(_WrappedDescribedEffect):
     anywhere on the field, of width and height `field_mm`, not only along scanned lines.
     """
 
-    effect: NamedEffect[Any]
+    effect: Effect
     field_mm: tuple[float, float]
 
     @cached_property
@@ -262,7 +257,7 @@ class Pace:
         """Return the recording with a column of paced time in its plan."""
         return replace(recording, plan=self.plan_with_paced_time(recording.plan))
 
-    def in_seconds(self, effect: Effect[Any], theta: FloatArray) -> FloatArray:
+    def in_seconds(self, effect: AnyEffect, theta: FloatArray) -> FloatArray:
         """Return an effect's parameters, (..., n_params), in seconds, those of an `EffectInPacedTime` converted."""
         if not isinstance(effect, EffectInPacedTime):
             return theta

@@ -17,7 +17,6 @@ from scipy.interpolate import CubicSpline
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Known
-from probewise.effects.optics import EdgeBlur, Halo
 from probewise.errors import ParameterError
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
@@ -263,7 +262,7 @@ class DiscTable:
 
 def is_known_footprint_effect(effect: AnyEffect) -> bool:
     """Return whether an effect is known and changes the footprint equally everywhere, so that a table can hold it."""
-    return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
+    return isinstance(effect, Known) and effect.name in ("edge_blur", "halo")
 
 
 def _columns_within(grid: Grid, middle: FloatArray, up: FloatArray, reach: FloatArray) -> tuple[IntArray, IntArray]:

@@ -14,7 +14,7 @@ from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.sensors import default_sensor, starts_of_one_gaussian, starts_with_more_gaussians
 from probewise.diagnosis.templates import EffectTemplates, templates_of_effect
-from probewise.effects import VOCABULARY, Extent, NamedEffect
+from probewise.effects import VOCABULARY, EffectKind, Extent, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
@@ -100,7 +100,7 @@ def cosines_with_vocabulary(
     clean: Recording,
     changed: Recording,
     *,
-    vocabulary: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
+    vocabulary: Mapping[str, EffectKind] = VOCABULARY,
 ) -> dict[str, float]:
     """Return the cosine of an effect's residuals, after a refit of the null model, with every named effect on the mean.
 

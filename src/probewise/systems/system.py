@@ -441,7 +441,8 @@ class SystemChain:
 
 def _act_between_rows(effect: AnyEffect) -> Callable[[BetweenRows, FloatArray], BetweenRows] | None:
     """Return what an effect does between the rows, if it does anything there that its act at the rows does not say."""
-    found: Callable[[BetweenRows, FloatArray], BetweenRows] | None = getattr(effect, "between_rows", None)
+    act = getattr(effect, "act", None)
+    found: Callable[[BetweenRows, FloatArray], BetweenRows] | None = getattr(act, "between_rows", None)
     return found
 
 

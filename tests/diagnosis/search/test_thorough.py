@@ -16,9 +16,9 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
-from probewise.effects import VOCABULARY, Extent
-from probewise.effects.reading import Flicker
-from probewise.priors import Normal, Product
+from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior
+from probewise.effects.effect import PHASE, sine_and_cosine_entries
+from probewise.priors import Normal, Product, Uniform
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
@@ -108,7 +108,9 @@ def test_a_wave_weighs_what_quadrature_over_all_its_phases_says():
     plain = line_recording(0.0)
     time, n = plain.plan.time_s, len(plain)
     recording = replace(plain, readings=plain.readings - 0.05 * time + 0.4 * np.sin(2 * np.pi * 0.11 * time + 1.0))
-    wave = Flicker(typical=0.1, lowest_hz=0.1, highest_hz=0.12, n_frequencies=8)
+    amp, hz = HeavyTailedPrior(0.1, positive=True), Uniform(0.1, 0.12)
+    entries = sine_and_cosine_entries(0.1, np.linspace(0.1, 0.12, 10)[1:-1])
+    wave = replace(EFFECTS["flicker"](), parameters={"amp": amp, "alias_hz": hz, "phase": PHASE}, entries=entries)
     found = search(Prepared(recording, {wave.name: wave}, level, LightSensorApparatus(), recording))
     candidate = next(own for own, _ in thorough._leading_hypotheses(found) if own.names == (wave.name,))
     told = thorough._weigh_by_nested_sampling(

@@ -68,7 +68,7 @@ def write_help(app: object) -> None:
     """Write what `--help` says to files that the reference includes, so that it cannot fall behind."""
     folder = HERE / "api" / "cli"
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("", *(verb.name for verb in VERBS), *(f"arm {task}" for task in TASKS)):
+    for name in ("", *VERBS, *(f"arm {task}" for task in TASKS)):
         text = io.StringIO()
         with redirect_stdout(text):
             main([*name.split(), "--help"])

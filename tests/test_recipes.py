@@ -108,8 +108,8 @@ def test_a_system(tmp_path):
 
 
 def test_a_verb(capsys):
-    verb = example("VERB", "probewise.cli.arm", "probewise.cli._common")
+    define_options = example("add_arguments", "probewise.cli.arm", "probewise.cli._common")
     parser = argparse.ArgumentParser()
-    verb.add_arguments(parser)
-    assert verb.run(parser.parse_args([str(files("probewise.data") / "paper.csv")])) == 0
+    define_options(parser)
+    assert define_options.__globals__["run"](parser.parse_args([str(files("probewise.data") / "paper.csv")])) == 0
     assert capsys.readouterr().out == "408 readings\n"

@@ -7,7 +7,6 @@ The first display of a result loads `report.notebook`.
 from __future__ import annotations
 
 import functools
-import html
 from collections.abc import Callable
 from typing import Protocol
 
@@ -22,6 +21,8 @@ def before_first_display(load: Callable[[], object]) -> None:
 @functools.singledispatch
 def render_html(value: object) -> str:
     """Return a result as an HTML fragment; of a type without a registered renderer, the text of its `str`."""
+    import html
+
     return f"<pre>{html.escape(str(value))}</pre>"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from functools import partial
 
@@ -67,6 +66,8 @@ def message_of(error: BaseException, most: int = 200, *, kind: bool = True) -> s
 
 def did_you_mean(value: object, known: Iterable[str]) -> str:
     """Return "; did you mean NAME?" with the known name nearest to a misspelt one, or "" if none is near."""
+    import difflib  # here, since no help needs it
+
     near = difflib.get_close_matches(value, list(known), n=1) if isinstance(value, str) else []
     return f"; did you mean {near[0]}?" if near else ""
 

@@ -7,7 +7,6 @@ Each function's See Also names the version with every option. Heavy imports happ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ __all__ = [
     "N_LIVE",
     "ORDERS",
     "SHAPE",
+    "SHAPES",
     "UTILITY",
     "audit",
     "calibrate",
@@ -49,6 +49,7 @@ N_LIVE = 300
 CalibrationMethod: TypeAlias = Literal["quick", "full", "paper"]
 CALIBRATION: CalibrationMethod = "quick"
 SHAPE = "circle"
+SHAPES = ("circle", "ellipse", "rectangle", "triangle", "hexagon")  # those of `scene.SHAPES`, without its imports
 MODEL: Model = "ssf"
 METHOD: MethodName = "particles"
 UTILITY = "finishing"
@@ -310,6 +311,8 @@ def explore(
     >>> len(run.readings)
     2
     """
+    from dataclasses import replace
+
     from probewise import experiment
     from probewise._kinds import (
         checked_number,

@@ -246,7 +246,7 @@ def test_a_truth_on_its_bounds_is_taken(truth):
     assert hidden.theta.tolist() == [float(cell) for cell in truth.rpartition(":")[2].split(",")]
 
 
-@pytest.mark.parametrize("verb", [v.name for v in VERBS])
+@pytest.mark.parametrize("verb", VERBS)
 def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, recording_file, tmp_path, capsys):
     out = tmp_path / "taken"
     out.write_text("mine")

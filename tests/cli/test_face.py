@@ -64,7 +64,7 @@ def test_every_package_that_is_documented_is_offered():
 def test_every_verb_has_its_place_on_the_page_of_the_command_line():
     page = (Path(__file__).parents[2] / "docs" / "reference" / "cli.md").read_text(encoding="utf-8")
     headings = {line.removeprefix("## ").split()[0] for line in page.splitlines() if line.startswith("## ")}
-    assert {verb.name for verb in VERBS} <= headings
+    assert set(VERBS) <= headings
 
 
 def test_what_the_api_pages_lead_with_is_public():
@@ -95,20 +95,16 @@ DESTINATIONS = {
 )
 def test_the_command_line_and_python_have_the_same_defaults(verb, parameter, option):
     parser = argparse.ArgumentParser()
-    next(v for v in VERBS if v.name == verb).add_arguments(parser)
+    importlib.import_module(f"probewise.cli.{verb}").add_arguments(parser)
     theirs = parser.get_default(option)
     own = inspect.signature(getattr(verbs, verb)).parameters[parameter].default
     assert own == (tuple(theirs) if parameter == "orders" else theirs[0] if parameter == "shape" else theirs)
 
 
-def test_the_command_line_offers_a_shape_as_soon_as_it_has_a_name(monkeypatch):
+def test_the_command_line_offers_every_shape_that_has_a_name():
     from probewise import scene
 
-    monkeypatch.setitem(scene.SHAPES, "dot", scene.SHAPES["circle"])
-    parser = argparse.ArgumentParser()
-    next(v for v in VERBS if v.name == "explore").add_arguments(parser)
-    assert parser.parse_args(["--sensor", "s.json", "--out", "o", "--shape", "dot"]).shape == ["dot"]
-    assert "dot" in parser.format_help()
+    assert tuple(scene.SHAPES) == verbs.SHAPES
 
 
 def test_a_verb_and_the_function_behind_it_have_the_same_defaults():

@@ -133,14 +133,14 @@ def test_the_module_runs_as_the_command_does():
 def test_help_does_not_load_the_numerical_libraries():
     code = (
         "import sys\nfrom probewise.cli import VERBS, main\n"
-        "for words in [], *([verb.name] for verb in VERBS if verb.name != 'explore'):  # it lists the shapes\n"
+        "for words in [], *([verb] for verb in VERBS):\n"
         "    main([*words, '--help'])\n"
         "sys.exit(any(m in sys.modules for m in ('numpy', 'scipy', 'matplotlib', 'tqdm')))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("verb", [v.name for v in VERBS])
+@pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_explains_itself(verb, capsys):
     assert run(verb, "--help") == 0
     said = capsys.readouterr().out

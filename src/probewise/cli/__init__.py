@@ -14,52 +14,43 @@ could not be drawn (the results are complete);
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import ModuleType
 
-from probewise.cli import (
-    arm,
-    audit,
-    calibrate,
-    challenge,
-    demo,
-    diagnose,
-    emulate_nxt,
-    explore,
-    fit,
-    investigate,
-    predict,
-    sheets,
-    study,
-)
-from probewise.cli._common import OneLineParser, Verb, print_complaint, print_warning
+from probewise.cli._common import OneLineParser, print_complaint, print_warning
 from probewise.cli._output import NotDrawnError
 from probewise.cli._stopping import Stopped, stoppable
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
 
-VERBS: tuple[Verb, ...] = (
-    demo.VERB,
-    calibrate.VERB,
-    predict.VERB,
-    explore.VERB,
-    study.VERB,
-    audit.VERB,
-    diagnose.VERB,
-    investigate.VERB,
-    fit.VERB,
-    challenge.VERB,
-    sheets.VERB,
-    arm.VERB,
-    emulate_nxt.VERB,
-)
+VERBS: Mapping[str, str] = {
+    "demo": "Run everything: calibrate, find a hidden circle with two models, diagnose.",
+    "calibrate": "Fit the sensor model of a recording; choose the number of Gaussians.",
+    "predict": "Predict the readings of a plan: mean, sd and log density of each row.",
+    "explore": "Let the robot find a shape, choosing each measurement itself.",
+    "study": "Measure how many readings the robot needs, over many circles.",
+    "audit": "List, before any data, the effects that a plan cannot detect or tell apart.",
+    "diagnose": "Find which physics a sensor model, or a simulator of your own, leaves out of recordings.",
+    "investigate": "Record, diagnose, take the readings that the diagnosis advises, until it is settled.",
+    "fit": "Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.",
+    "challenge": "Measure how good a diagnosis is, on recordings with concealed effects.",
+    "sheets": "Draw the patterns for a bench at true scale, to print.",
+    "arm": "Check, move and read the LEGO arm; record a plan with it or another arm.",
+    "emulate-nxt": "Emulate a LEGO brick with the arm, behind a serial device.",
+}
+"""Each verb with its summary; `add_arguments` and `run` are in the module of its name."""
 
 
-def parser() -> OneLineParser:
-    """Build the parser of the whole command line."""
+def parser(words: Sequence[str] | None = None) -> OneLineParser:
+    """Build the parser of the whole command line; given `words`, only verbs among them get their options.
+
+    Other verbs need not be imported then.
+    """
     from probewise import __version__
 
     top = OneLineParser(
@@ -68,9 +59,15 @@ def parser() -> OneLineParser:
     )
     top.add_argument("--version", action="version", version=f"probewise {__version__}")
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=OneLineParser)
-    for verb in VERBS:
-        verb.add_arguments(verbs.add_parser(verb.name, help=verb.summary, description=verb.summary))
+    for name, summary in VERBS.items():
+        added = verbs.add_parser(name, help=summary, description=summary)
+        if words is None or name in words:
+            _module_of(name).add_arguments(added)
     return top
+
+
+def _module_of(verb: str) -> ModuleType:
+    return importlib.import_module(f"probewise.cli.{verb.replace('-', '_')}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -84,17 +81,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     _replace_closed_streams()
     try:
-        arguments = parser().parse_args(words)
+        arguments = parser(words).parse_args(words)
     except SystemExit as stop:  # argparse exits this way after --help, --version and errors
         return stop.code if isinstance(stop.code, int) else 2
     arguments.words = words
-    verb = next(v for v in VERBS if v.name == arguments.verb)
+    verb: str = arguments.verb
     os.environ["MPLBACKEND"] = "Agg"  # figures go to files: no window and no display
     with warnings.catch_warnings():
         warnings.showwarning = _write_warning
         try:
             with stoppable():
-                return verb.run(arguments)
+                return int(_module_of(verb).run(arguments))
         except Stopped as stop:
             _write_complaint(verb, f"stopped; {str(stop) or 'nothing was written'}")
             _discard_unwritable_output()
@@ -111,8 +108,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 2
 
 
-def _write_complaint(verb: Verb, text: str) -> None:
-    print_complaint(f"probewise {verb.name}: {text}")
+def _write_complaint(verb: str, text: str) -> None:
+    print_complaint(f"probewise {verb}: {text}")
 
 
 def _replace_closed_streams() -> None:

@@ -7,11 +7,8 @@ import contextlib
 import itertools
 import math
 import os
-import shlex
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -23,16 +20,6 @@ MOST = 100_000
 """Largest count that an option takes unless it says otherwise: of more readings, runs or live points the time, days at
 least, and the memory have no bound."""
 MOST_BATCH = 100  # readings chosen at a time, each given those before it
-
-
-@dataclass(frozen=True)
-class Verb:
-    """One subcommand: `add_arguments` defines its options, `run` executes it and returns the exit status."""
-
-    name: str
-    summary: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], int]
 
 
 class CommandError(ProbewiseError, ValueError):
@@ -181,6 +168,9 @@ def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespa
 
     `options` are added to the words of the command line; `of` is the total number, 1 if it is not known.
     """
+    import shlex
+    import subprocess
+
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
     count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"

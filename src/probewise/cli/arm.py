@@ -8,7 +8,6 @@ from probewise.cli._arm import ARMS, SHIPPED, add_geometry, read_or_shipped_geom
 from probewise.cli._common import (
     DEFAULT_SEED,
     OneLineParser,
-    Verb,
     add_count_option,
     add_path,
     add_quiet,
@@ -163,6 +162,3 @@ def run(arguments: argparse.Namespace) -> int:
     }
     tasks[arguments.task](arguments, read_or_shipped_geometry(arguments))
     return 0
-
-
-VERB = Verb("arm", "Check, move and read the LEGO arm; record a plan with it or another arm.", add_arguments, run)

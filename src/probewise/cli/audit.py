@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_path, add_quiet, print_result
+from probewise.cli._common import add_path, add_quiet, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import Drawings, checked_output_directory, inputs_and_filled_in_plan
 from probewise.cli._simulator import add_simulator, refuse_sensor
@@ -75,6 +75,3 @@ def run(arguments: argparse.Namespace) -> int:
     for line in lines:
         print_result(line, quiet=arguments.quiet)
     return 0
-
-
-VERB = Verb("audit", "List, before any data, the effects that a plan cannot detect or tell apart.", add_arguments, run)

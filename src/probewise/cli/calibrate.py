@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Sequence
 
 from probewise.cli._common import (
-    Verb,
     add_count_option,
     add_out_directory,
     add_path,
@@ -110,6 +109,3 @@ def _require_enough_live_points(n_live: int, orders: Sequence[int]) -> None:
         raise ParameterError("--live", n_live, allowed)
     takes = f"{max(orders)} Gaussians have {n_params} parameters, which take --live {least}"
     raise ParameterError("--orders", max(orders), f"up to {most} with --live {n_live}; {takes}")
-
-
-VERB = Verb("calibrate", "Fit the sensor model of a recording; choose the number of Gaussians.", add_arguments, run)

@@ -8,7 +8,6 @@ from functools import partial
 
 from probewise.cli._common import (
     CommandError,
-    Verb,
     add_count_option,
     add_out_directory,
     add_seed_and_quiet,
@@ -93,6 +92,3 @@ def run(arguments: argparse.Namespace) -> int:
     print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     drawings.raise_if_any_failed()
     return 0
-
-
-VERB = Verb("challenge", "Measure how good a diagnosis is, on recordings with concealed effects.", add_arguments, run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from probewise.cli._common import Verb, add_out_directory, add_seed_and_quiet, print_result
+from probewise.cli._common import add_out_directory, add_seed_and_quiet, print_result
 from probewise.cli._output import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
 
 if TYPE_CHECKING:
@@ -283,6 +283,3 @@ def _diagnose_shipped_recording(seed: int) -> Diagnosis:
 
     rng, *_ = generators_of_diagnosis(seed)
     return diagnose(read_recording(shipped("concealed")), rng=rng)
-
-
-VERB = Verb("demo", "Run everything: calibrate, find a hidden circle with two models, diagnose.", add_arguments, run)

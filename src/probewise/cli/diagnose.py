@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from probewise.cli._common import Verb, add_out_directory, add_path, add_seed_and_quiet, parse_path
+from probewise.cli._common import add_out_directory, add_path, add_seed_and_quiet, parse_path
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
 from probewise.cli._output import Drawings, StagedFiles, checked_output_directory, inputs_and_filled_in_plan
 from probewise.cli._simulator import add_simulator, read_joined_table, refuse_sensor
@@ -209,11 +209,3 @@ def _write_files_of_simulator(diagnosis: Diagnosis, stage: StagedFiles) -> None:
     if diagnosis.next_measurement is not None:
         rows = cast("RunTable", diagnosis.next_measurement.plan)
         stage.write(diagnosis.apparatus.words.next_plan, run_table_csv(rows))
-
-
-VERB = Verb(
-    "diagnose",
-    "Find which physics a sensor model, or a simulator of your own, leaves out of recordings.",
-    add_arguments,
-    run,
-)

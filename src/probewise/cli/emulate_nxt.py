@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import SCENE, add_geometry
-from probewise.cli._common import Verb, add_path, add_seed_and_quiet, print_result
+from probewise.cli._common import add_path, add_seed_and_quiet, print_result
 from probewise.cli._output import checked_output_file
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError, ParameterError
@@ -157,6 +157,3 @@ def _telegram_log(path: Path | None) -> Iterator[Trace]:
             file.write(f"{now_s - began_s:10.3f} {event} {text}\n")
 
         yield write_line
-
-
-VERB = Verb("emulate-nxt", "Emulate a LEGO brick with the arm, behind a serial device.", add_arguments, run)

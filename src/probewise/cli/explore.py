@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterator
 
 from probewise.cli._arm import ARMS, add_geometry
 from probewise.cli._common import (
     MOST_BATCH,
-    Verb,
     add_count_option,
     add_out_directory,
     add_path,
@@ -18,19 +16,7 @@ from probewise.cli._common import (
     parse_positive_int,
 )
 from probewise.errors import shown
-from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
-
-
-class _LazyShapeNames:
-    """The names of all shapes, imported only when asked for: building the parser must not import numpy."""
-
-    def __iter__(self) -> Iterator[str]:
-        from probewise.scene import SHAPES
-
-        return iter(SHAPES)
-
-    def __contains__(self, name: object) -> bool:
-        return name in tuple(self)
+from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, SHAPES, UTILITY
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--shape",
         nargs="+",
-        choices=_LazyShapeNames(),
+        choices=SHAPES,
         default=[SHAPE],
         metavar="SHAPE",
         help=f"possible shapes on the field, one or several of %(choices)s (default {SHAPE})",
@@ -163,6 +149,3 @@ def _parse_finite_numbers(text: str) -> tuple[float, ...]:
 def _parse_counts(text: str) -> tuple[int, ...]:
     """Parse "N,M,...", integers above zero, each once, for argparse."""
     return tuple(dict.fromkeys(parse_positive_int(cell, most=1000) for cell in text.split(",")))
-
-
-VERB = Verb("explore", "Let the robot find a shape, choosing each measurement itself.", add_arguments, run)

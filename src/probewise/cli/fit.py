@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import CommandError, Verb, add_out_directory, add_seed_and_quiet, parse_path
+from probewise.cli._common import CommandError, add_out_directory, add_seed_and_quiet, parse_path
 from probewise.cli._output import Drawings, checked_output_directory
 from probewise.cli._simulator import add_simulator, read_joined_table
 
@@ -60,8 +60,3 @@ def run(arguments: argparse.Namespace) -> int:
         f"{fitted.summary()}\nseed {arguments.seed}; written to {drawings.out}",
         quiet=arguments.quiet,
     )
-
-
-VERB = Verb(
-    "fit", "Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.", add_arguments, run
-)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from probewise.cli._arm import ARMS, SHIPPED, ArmName, add_geometry, parse_arm, parse_place, read_or_shipped_geometry
 from probewise.cli._common import (
     CommandError,
-    Verb,
     add_count_option,
     add_out_directory,
     add_path,
@@ -241,11 +240,3 @@ def _shipped_world_with_effects(truth: str | None, rng: np.random.Generator) -> 
 
     concealed = (CANDIDATES[int(rng.integers(len(CANDIDATES)))],) if truth is None else parse_concealed(truth)
     return replace(world_behind("paper"), concealed=concealed)
-
-
-VERB = Verb(
-    "investigate",
-    "Record, diagnose, take the readings that the diagnosis advises, until it is settled.",
-    add_arguments,
-    run,
-)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import Verb, add_path, add_seed_and_quiet, print_result
+from probewise.cli._common import add_path, add_seed_and_quiet, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import checked_output_file, tables_and_descriptions
 from probewise.cli._simulator import add_simulator
@@ -58,6 +58,3 @@ def run(arguments: argparse.Namespace) -> int:
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{summary}\nwritten to {out}", quiet=arguments.quiet)
     return 0
-
-
-VERB = Verb("predict", "Predict the readings of a plan: mean, sd and log density of each row.", add_arguments, run)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, read_or_shipped_geometry
-from probewise.cli._common import CommandError, Verb, add_path, add_quiet, print_result
+from probewise.cli._common import CommandError, add_path, add_quiet, print_result
 from probewise.cli._output import checked_output_file
 from probewise.errors import ParameterError
 
@@ -105,6 +105,3 @@ def _target_outline_mm(text: str, field_mm: tuple[float, float]):  # type: ignor
     except ParameterError as error:
         raise ParameterError(error.name.replace("--truth", "--target"), error.value, error.allowed) from error
     return outlines(hidden.shape.region(hidden.theta[None, :]), n_vertices=720)[0]
-
-
-VERB = Verb("sheets", "Draw the patterns for a bench at true scale, to print.", add_arguments, run)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from probewise.cli._common import (
     MOST_BATCH,
-    Verb,
     add_count_option,
     add_out_directory,
     add_quiet,
@@ -182,6 +181,3 @@ def _concealed_command_line(arguments: argparse.Namespace) -> str:
         value = getattr(arguments, name)
         words += [] if value is None else [f"--{name}", str(value)]
     return shlex.join([*words, "--max-readings", str(arguments.max_readings)])
-
-
-VERB = Verb("study", "Measure how many readings the robot needs, over many circles.", add_arguments, run)

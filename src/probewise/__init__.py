@@ -8,6 +8,9 @@ The commands of the command line as functions:
 - `audit(plan)` says, before any data, which effects a plan cannot detect or distinguish
 - `diagnose(recordings, rng=rng)` finds the physics that the model leaves out
 
+With `simulator=`, a `Simulator` of your own or its file, `diagnose`, `audit` and `fit` take tables; `investigate` takes
+the readings that a diagnosis advises.
+
 `Inquiry(model, prior, settings, noise, rng=rng)` chooses the settings of any other instrument.
 
 `Recording.from_arrays` and `Recording.from_table` make recordings, `read_recording`, `read_plan` and `read_sensor` read
@@ -27,10 +30,10 @@ from typing import TYPE_CHECKING
 
 from probewise._display import before_first_display
 from probewise._version import __version__
-from probewise.verbs import audit, calibrate, diagnose, explore, predict
+from probewise.verbs import audit, calibrate, diagnose, explore, fit, predict
 
 if TYPE_CHECKING:
-    from probewise import (
+    from probewise import (  # noqa: F401
         arm,
         calibration,
         diagnosis,
@@ -54,57 +57,54 @@ if TYPE_CHECKING:
     )
     from probewise.calibration import read_sensor
     from probewise.inquiry import Inquiry
+    from probewise.investigation import investigate
     from probewise.recordings import Plan, Recording, read_plan, read_recording
+    from probewise.systems import Law, Simulator, read_simulator
 
 __all__ = [
     "Inquiry",
+    "Law",
     "Plan",
     "Recording",
+    "Simulator",
     "__version__",
-    "arm",
     "audit",
     "calibrate",
-    "calibration",
     "diagnose",
-    "diagnosis",
-    "effects",
-    "emulator",
-    "errors",
-    "experiment",
     "explore",
-    "inference",
-    "inquiry",
-    "investigation",
+    "fit",
+    "investigate",
     "nested",
     "predict",
-    "priors",
-    "progress",
-    "proof",
     "read_plan",
     "read_recording",
     "read_sensor",
-    "recordings",
-    "report",
-    "scene",
-    "sensor",
-    "systems",
-    "world",
+    "read_simulator",
 ]
 
 # Where the names come from that are not packages; all are loaded when first used.
 _HOME = {
     "Inquiry": "inquiry",
+    "Law": "systems",
     "Plan": "recordings",
     "Recording": "recordings",
+    "Simulator": "systems",
+    "investigate": "investigation",
     "read_plan": "recordings",
     "read_recording": "recordings",
     "read_sensor": "calibration",
+    "read_simulator": "systems",
 }
+_PACKAGES = (
+    *("arm", "calibration", "diagnosis", "effects", "emulator", "errors", "experiment", "inference", "inquiry"),
+    *("investigation", "nested", "priors", "progress", "proof", "recordings", "report", "scene", "sensor", "systems"),
+    "world",
+)
 
 
 def __getattr__(name: str) -> object:
     """Load a package, or a value of one, when it is first asked for (PEP 562)."""
-    if name not in __all__:
+    if name not in _HOME and name not in _PACKAGES:
         raise AttributeError(f"module 'probewise' has no attribute {name!r}")
     home = importlib.import_module(f"probewise.{_HOME.get(name, name)}")
     found = getattr(home, name) if name in _HOME else home

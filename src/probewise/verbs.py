@@ -6,8 +6,8 @@ Each function's See Also names the version with every option. Heavy imports happ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from probewise import scene
     from probewise.arm import Instrument, Measures
     from probewise.calibration import Calibration, FittedSensor
-    from probewise.diagnosis import Diagnosis, PlanAudit
+    from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
     from probewise.experiment import Exploration, MethodName, Model, Step, Truth
     from probewise.inference import Naive
     from probewise.inquiry import Utility
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from probewise.progress import Progress
     from probewise.recordings import Plan, Prediction, Recording
     from probewise.scene import Shape
+    from probewise.systems import FittedSystem, RunTable, Simulator, SystemPrediction
+
+    Table: TypeAlias = RunTable | Mapping[str, Any]
+    AnySimulator: TypeAlias = Simulator | str | Path
 
 __all__ = [
     "CALIBRATION",
@@ -40,6 +44,7 @@ __all__ = [
     "calibrate",
     "diagnose",
     "explore",
+    "fit",
     "predict",
 ]
 
@@ -146,26 +151,38 @@ def calibrate(
         )
 
 
-def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:
+def predict(
+    model: FittedSensor | FittedSystem | SystemFit | Diagnosis,
+    plan: Plan | Recording | Table,
+    *,
+    rng: np.random.Generator | None = None,
+    progress: bool | Progress = True,
+) -> Prediction | SystemPrediction:
     """Predict the readings of a plan, each with its sd; score those of a recording.
 
     Parameters
     ----------
-    sensor
-        The fitted sensor.
+    model
+        A fitted sensor; or of a simulator the result of `fit`, that of `diagnose` (the repaired model), or what
+        `systems.read_fitted_system` reads.
     plan
-        Pose, time and pattern of every reading; or a recording, whose readings are then scored.
+        Pose, time and pattern of every reading; or a recording, whose readings are then scored. Of a simulator a table
+        of its columns: a dict of arrays, or a DataFrame.
+    rng
+        Source of randomness, for a simulator, whose runs outside the recording are drawn.
+    progress
+        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 
     Returns
     -------
-    Prediction
-        Predictive mean and sd of a reading for each row, (n_points,), in the sensor's unit; natural log density of each
-        recorded reading, per unit of the reading, NaN where there is none or it is outside the declared range.
+    Prediction or SystemPrediction
+        Predictive mean and sd of a reading for each row, (n_points,), in the unit of the readings; natural log density
+        of each recorded reading, per unit of the reading, NaN where there is none or it is outside the declared range.
 
     Raises
     ------
     ParameterError
-        If an argument has the wrong type, or a pattern is not described.
+        If an argument has the wrong type, a pattern is not described, or `rng` is missing.
 
     Warns
     -----
@@ -182,9 +199,18 @@ def predict(sensor: FittedSensor, plan: Plan | Recording) -> Prediction:
     >>> len(probewise.predict(found.sensor, recording))
     408
     """
-    from probewise import calibration
+    from probewise import calibration, diagnosis, systems
+    from probewise._kinds import require_rng
+    from probewise._progress import progress_or_bar
 
-    return calibration.predict(sensor, plan)
+    if isinstance(model, diagnosis.Diagnosis):
+        model = diagnosis.repaired_of(model)
+    fitted = model.fitted if isinstance(model, diagnosis.SystemFit) else model
+    if not isinstance(fitted, systems.FittedSystem):
+        return calibration.predict(fitted, cast("Plan | Recording", plan))
+    require_rng(rng)
+    with progress_or_bar(progress) as told:
+        return systems.predict_system(fitted, cast("Table", plan), rng=cast("np.random.Generator", rng), progress=told)
 
 
 def explore(
@@ -430,13 +456,21 @@ def _naive_levels(
     )
 
 
-def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progress: bool | Progress = True) -> PlanAudit:
+def audit(
+    plan: Plan | Recording | Table,
+    *,
+    simulator: AnySimulator | None = None,
+    sensor: FittedSensor | None = None,
+    progress: bool | Progress = True,
+) -> PlanAudit:
     """Audit a plan before any data: which effects are undetectable or aliased, and which readings would cure that.
 
     Parameters
     ----------
     plan
-        The plan, or a recording, of which only the plan is used.
+        The plan, or a recording, of which only the plan is used; with `simulator` a table of its columns.
+    simulator
+        A simulator of your own, or its FILE.py, in place of the light sensor.
     sensor
         The calibrated sensor, by which detectability is computed; by default a typical one.
     progress
@@ -445,12 +479,12 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progres
     Returns
     -------
     PlanAudit
-        Detectability and aliases of each effect; its `cure_plan` holds the readings to add.
+        Detectability and aliases of each effect; its `cure_plan` holds the readings to add (None with `simulator`).
 
     Raises
     ------
     ParameterError
-        If the plan has no row, or a pattern that is not described.
+        If the plan has no row, or a pattern that is not described, or the table lacks a column.
 
     See Also
     --------
@@ -464,27 +498,67 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progres
     >>> len(probewise.audit(plan).effects_with_detectability("invisible")) > 0
     True
     """
+    from probewise import diagnosis
     from probewise._progress import progress_or_bar
-    from probewise.diagnosis import audit_plan
 
     with progress_or_bar(progress) as told:
-        return audit_plan(plan, sensor=sensor, progress=told)
+        if simulator is None:
+            return diagnosis.audit_plan(cast("Plan | Recording", plan), sensor=sensor, progress=told)
+        acting, table, _ = _simulator_and_table(simulator, plan, sensor=sensor)
+        return diagnosis.audit_system(acting, table)
+
+
+def fit(
+    tables: Table | Sequence[Table],
+    *,
+    simulator: AnySimulator,
+    rng: np.random.Generator,
+    progress: bool | Progress = True,
+) -> SystemFit:
+    """Fit a simulator of your own to a table of readings: posterior and evidence, without a diagnosis.
+
+    Parameters
+    ----------
+    tables
+        The readings with the simulator's columns: a dict of arrays, or a DataFrame; several are fitted together.
+    simulator
+        The simulator, `systems.Simulator`, or its FILE.py.
+    rng
+        Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise fit --seed`.
+    progress
+        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
+
+    Raises
+    ------
+    ParameterError, FileError, ShapeError, NotConvergedError
+        As of `diagnosis.fit_simulator`.
+    """
+    from probewise import diagnosis
+    from probewise._progress import progress_or_bar
+
+    acting, table, notes = _simulator_and_table(simulator, tables)
+    with progress_or_bar(progress) as told:
+        return diagnosis.fit_simulator(acting, table, notes=notes, rng=rng, progress=told)
 
 
 def diagnose(
-    recordings: Recording | Sequence[Recording],
+    recordings: Recording | Table | Sequence[Recording] | Sequence[Table],
     *,
+    simulator: AnySimulator | None = None,
     sensor: FittedSensor | None = None,
     thorough: bool = False,
     rng: np.random.Generator,
     progress: bool | Progress = True,
 ) -> Diagnosis:
-    """Find which physics the sensor model leaves out of recordings.
+    """Find which physics a sensor model, or a simulator of your own, leaves out.
 
     Parameters
     ----------
     recordings
-        One recording, or several of one apparatus, diagnosed together.
+        One recording, or several of one apparatus, diagnosed together; with `simulator` tables of its columns, each a
+        dict of arrays or a DataFrame.
+    simulator
+        A simulator, `systems.Simulator`, or its FILE.py, in place of the light sensor.
     sensor
         An earlier calibration, whose posterior becomes the prior.
     thorough
@@ -532,4 +606,25 @@ def diagnose(
     own, nested_rng = rng.spawn(2)
     with progress_or_bar(progress) as told:
         again = partial(diagnosis.weigh_thoroughly, rng=nested_rng, progress=told) if thorough else None
-        return diagnosis.diagnose(recordings, sensor=sensor, thorough=again, rng=own, progress=told)
+        if simulator is None:
+            taken = cast("Recording | Sequence[Recording]", recordings)
+            return diagnosis.diagnose(taken, sensor=sensor, thorough=again, rng=own, progress=told)
+        acting, table, notes = _simulator_and_table(simulator, recordings, sensor=sensor)
+        return diagnosis.diagnose_system(acting, table, notes=notes, thorough=again, rng=own, progress=told)
+
+
+def _simulator_and_table(
+    simulator: AnySimulator, tables: object, *, sensor: FittedSensor | None = None
+) -> tuple[Simulator, RunTable, tuple[str, ...]]:
+    """Return a simulator, read if it is a file, its tables joined, and notes on them; ParameterError with a sensor."""
+    from pathlib import Path
+
+    from probewise.errors import ParameterError
+    from probewise.systems import concatenate_tables, read_simulator, table_for
+
+    if sensor is not None:
+        raise ParameterError("sensor", sensor, "None with a simulator, which replaces it")
+    acting = read_simulator(simulator) if isinstance(simulator, str | Path) else simulator
+    several = list(tables) if isinstance(tables, list | tuple) else [tables]
+    built = [table_for(acting, cast("Table", each)) for each in several]
+    return acting, *concatenate_tables(built, [f"table {k}" for k in range(1, len(built) + 1)])

@@ -147,12 +147,8 @@ class RandomWalk(NoiseEffect):
 class NoisePerRun(NoiseEffect):
     """Noise that differs between runs: sd x the run's value, whose logarithm has a heavy-tailed prior.
 
-    Parameters
-    ----------
-    runs
-        Names of the runs.
-    n_rows
-        Number of readings from which each run's value was estimated; () where it is not needed.
+    `runs`: names of the runs; `n_rows`: number of readings from which each run's value was estimated; () where it is
+    not needed.
     """
 
     runs: tuple[str, ...] = ()

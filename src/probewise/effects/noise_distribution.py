@@ -64,14 +64,7 @@ class FittedReadings:
 def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return the natural log of the density of each reading alone, (n_samples, n_points), per unit of the reading.
 
-    Parameters
-    ----------
-    noise
-        The noise.
-    readings
-        Measured readings, (n_points,).
-    predicted
-        Noise-free readings, (n_samples, n_points).
+    `readings`: measured readings, (n_points,); `predicted`: noise-free readings, (n_samples, n_points).
     """
     noise = noise_with_walk_variance(noise)
     of_kept = _log_density_rounded(readings, predicted, noise.sd, noise.step)
@@ -113,16 +106,8 @@ def log_probability_at_end(
 ) -> FloatArray:
     """Return the log probability of each reading at an end: of noise that reaches it, (n_samples, n_points).
 
-    Parameters
-    ----------
-    noise
-        The noise.
-    readings
-        Readings at an end of the range, (n_points,).
-    predicted
-        Noise-free readings of an unlimited instrument, (n_samples, n_points).
-    is_high
-        Whether that is the high end.
+    `readings`: readings at an end of the range, (n_points,); `predicted`: noise-free readings of an unlimited
+    instrument, (n_samples, n_points); `is_high`: whether that is the high end.
     """
     noise = noise_with_walk_variance(noise)
     sign = 1.0 if is_high else -1.0
@@ -166,17 +151,9 @@ def _density(z: FloatArray) -> FloatArray:
 class PredictiveMixture:
     """The predictive distribution of readings: the mixture of posterior samples' predictions, added block by block.
 
-    Parameters
-    ----------
-    readings
-        Measured readings, (n_points,).
-    scored
-        Mask of the readings that get a log density, (n_points,).
-    step
-        The declared rounding step, if any.
-    ends
-        Smallest and largest reading of the instrument; infinite for an open end. At an end the "density" is a
-        probability: that the noise reaches the end.
+    `readings`: measured readings, (n_points,); `scored`: mask of the readings that get a log density, (n_points,);
+    `step`: the declared rounding step, if any; `ends`: smallest and largest reading of the instrument; infinite for an
+    open end. At an end the "density" is a probability: that the noise reaches the end.
     """
 
     readings: FloatArray

@@ -164,12 +164,8 @@ class SharedScalePrior:
     expected to be as large. The distribution depends on the root of the sum of squares alone, so that standard-normal
     coordinates have the direction of the values, and their length is that of equal probability.
 
-    Parameters
-    ----------
-    names
-        Names of the values, two or more.
-    each
-        The prior of one value, about: a heavy-tailed prior with sds over the same range.
+    `names`: names of the values, two or more; `each`: the prior of one value, about: a heavy-tailed prior with sds over
+    the same range.
     """
 
     names: tuple[str, ...]

@@ -78,14 +78,8 @@ ZERO = Origin()
 class Extent:
     """Scales of a recording, from the range of its usable readings and from its plan.
 
-    Parameters
-    ----------
-    low, high
-        Least and largest usable reading.
-    plan
-        Pose, time and pattern of every reading.
-    counted_from
-        Time and place from which effects on this recording count; by default those of `Origin.of`.
+    `low`, `high`: least and largest usable reading; `plan`: pose, time and pattern of every reading; `counted_from`:
+    time and place from which effects on this recording count; by default those of `Origin.of`.
     """
 
     low: float
@@ -106,10 +100,7 @@ class Extent:
     def of(cls, recording: Recording) -> Self:
         """Measure the scales of a recording.
 
-        Raises
-        ------
-        ParameterError
-            If there is no usable reading.
+        Raises ParameterError if there is no usable reading.
         """
         readings = recording.readings[recording.usable]
         if readings.size == 0:

@@ -126,9 +126,7 @@ def log_densities_of_scans(
     effects are in the vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the
     same readings. "true" is an upper limit (exact for white noise): it knows the noise-free readings and the noise sd.
 
-    Returns
-    -------
-    Values by name of the scan ("angle", "pattern", "direction"), then of the model.
+    Returns values by name of the scan ("angle", "pattern", "direction"), then of the model.
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}

@@ -104,18 +104,9 @@ def cosines_with_vocabulary(
 ) -> dict[str, float]:
     """Return the cosine of an effect's residuals, after a refit of the null model, with every named effect on the mean.
 
-    Parameters
-    ----------
-    refit
-        The null model's refit.
-    clean, changed
-        Noise-free readings without and with the effect.
-    vocabulary
-        The effects to compare with, by name; those that cannot act in this plan or act on the noise are left out.
-
-    Returns
-    -------
-    Cosine rho by name: the square root of the share of the residual sum of squares that the named effect, at its best
+    `refit`: the null model's refit; `clean`, `changed`: noise-free readings without and with the effect; `vocabulary`:
+    the effects to compare with, by name; those that cannot act in this plan or act on the noise are left out. Returns
+    cosine rho by name: the square root of the share of the residual sum of squares that the named effect, at its best
     fit and together with the null model, explains: from a full refit if the linearised rho is above 0.8. If "halo" or
     "edge_blur" is above 0.8, also of "ssf_order": one more Gaussian in the SSF, which is no missing physics.
     """
@@ -145,19 +136,10 @@ def residual_norms_with_one_named(
 ) -> dict[str, float]:
     """Return the norm of two effects' residuals after a fit of the null model and one of them, in reading units.
 
-    Parameters
-    ----------
-    refit
-        The null model's refit.
-    clean, both
-        Noise-free readings without any effect and with both.
-    names
-        Effects fitted together with the null model, one at a time.
-
-    Returns
-    -------
-    Norm of the residuals by name of the fitted effect; divided by the noise sd, it is the size of the other effect
-    given this one. It may be much smaller than the other's size alone: a saturation can hide a stain.
+    `refit`: the null model's refit; `clean`, `both`: noise-free readings without any effect and with both; `names`:
+    effects fitted together with the null model, one at a time. Returns norm of the residuals by name of the fitted
+    effect; divided by the noise sd, it is the size of the other effect given this one. It may be much smaller than the
+    other's size alone: a saturation can hide a stain.
     """
     found, adjusted = refit.refit(clean, both), refit.without_null_residuals(clean, both)
     usable = np.flatnonzero(clean.usable)

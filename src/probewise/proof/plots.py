@@ -49,18 +49,9 @@ def posterior_widths_of_runs(
 
     Thin lines are the medians of the other panels. A run that has ended keeps its last width.
 
-    Parameters
-    ----------
-    runs
-        For each row, by name: the widest posterior sd after each reading of every run, (n_readings,), mm.
-    target_mm
-        Target precision.
-    axes
-        Axes to draw on, of the shape returned; a new figure without.
-
-    Returns
-    -------
-    Axes, (n_rows, 2), or (1, 1) for a single name.
+    `runs`: for each row, by name: the widest posterior sd after each reading of every run, (n_readings,), mm; `axes`:
+    axes to draw on, of the shape returned; a new figure without. Returns axes, (n_rows, 2), or (1, 1) for a single
+    name.
     """
     n_columns = min(len(runs), 2)
     n_rows = -(-len(runs) // max(n_columns, 1))
@@ -105,16 +96,8 @@ def _reading_numbers(table: FloatArray) -> FloatArray:
 def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None) -> AxesGrid:
     """Draw mean and median readings needed in each row of a study, in all and after the first reading on white.
 
-    Parameters
-    ----------
-    rows
-        Summary by name, drawn from the top in this order.
-    axes
-        Axes to draw on, (1, 2), with one y axis; a new figure without.
-
-    Returns
-    -------
-    Axes, (1, 2).
+    `rows`: summary by name, drawn from the top in this order; `axes`: axes to draw on, (1, 2), with one y axis; a new
+    figure without. Returns axes, (1, 2).
     """
     names = ["\n".join(textwrap.wrap(name, 30)) for name in rows]
     n_lines = sum(1 + name.count("\n") for name in names)
@@ -149,12 +132,7 @@ def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None
 def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
     """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases.
 
-    Parameters
-    ----------
-    bins
-        From `challenge.reliability_bins`.
-    ax
-        Axes to draw on; a new figure without.
+    `bins`: from `challenge.reliability_bins`; `ax`: axes to draw on; a new figure without.
     """
     ax = axes_or_new(ax, size_in=(5.2, 5.0))
     ax.plot([0, 1], [0, 1], color=GREY, linewidth=0.9, linestyle="--", label="honest")
@@ -175,14 +153,8 @@ def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
 def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray, *, ax: Axes | None = None) -> Axes:
     """Draw the confusion matrix: the number of cases in each cell, shaded by its share of the row.
 
-    Parameters
-    ----------
-    truths, said
-        Names of the rows and of the columns.
-    counts
-        Number of cases, (n_truths, n_said).
-    ax
-        Axes to draw on; a new figure without.
+    `truths`, `said`: names of the rows and of the columns; `counts`: number of cases, (n_truths, n_said); `ax`: axes to
+    draw on; a new figure without.
     """
     ax = axes_or_new(ax, size_in=(3.0 + 0.34 * len(said), 2.4 + 0.3 * len(truths)))
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
@@ -212,16 +184,8 @@ def effect_and_size_in_words(row: ConcealedRow) -> str:
 def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None = None) -> AxesGrid:
     """Compare doubt in the sensor model with trust: runs sure and wrong, intervals that hold, median readings.
 
-    Parameters
-    ----------
-    rows
-        From `study.concealed_rows`, drawn from the top in this order.
-    axes
-        Axes to draw on, (1, 3), with one y axis; a new figure without.
-
-    Returns
-    -------
-    Axes, (1, 3).
+    `rows`: from `study.concealed_rows`, drawn from the top in this order; `axes`: axes to draw on, (1, 3), with one y
+    axis; a new figure without. Returns axes, (1, 3).
     """
     names = list(dict.fromkeys(effect_and_size_in_words(row) for row in rows))
     own = axes is None

@@ -62,14 +62,8 @@ def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
 def right_names_of_each_effect(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
     """List the effects that have to be named, as one set of right names each; effects on the mean come first.
 
-    Parameters
-    ----------
-    result
-        A case.
-    merged
-        Whether aliases of an effect are right too; for effects outside the vocabulary they always are.
-    noise
-        Whether noise effects have to be named.
+    `merged`: whether aliases of an effect are right too; for effects outside the vocabulary they always are; `noise`:
+    whether noise effects have to be named.
     """
     physics = [h for h in result["hidden"] if not h["on_noise"] and h["name"] not in NO_PHYSICS]
     mean = [right_names(h) if merged or not h["in_vocabulary"] else frozenset({h["name"]}) for h in physics]
@@ -264,9 +258,7 @@ def confusion_counts(
     An answer that is an alias of the truth counts as the truth. Only names that occur have a row or a column. `label`
     maps a name to that of its row and column, e.g. to merge several.
 
-    Returns
-    -------
-    Truths, in the order of the vocabulary; answers; counts, (n_truths, n_answers).
+    Returns truths, in the order of the vocabulary; answers; counts, (n_truths, n_answers).
     """
     counts: Counter[tuple[str, str]] = Counter()
     for result in results:

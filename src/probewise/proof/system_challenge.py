@@ -47,9 +47,8 @@ def log_densities_of_runs(
     exactly the concealed effects, fitted by the simulator; absent without effects or if the fit fails. "true" knows the
     noise-free reading.
 
-    Returns
-    -------
-    Values by run, "inside" the range of the recorded runs and "beyond" it, then by model; not finite ones are left out.
+    Returns values by run, "inside" the range of the recorded runs and "beyond" it, then by model; not finite ones are
+    left out.
     """
     fitting, *drawing = rng.spawn(3)
     readings = later.covariates[case.drawn.kind.reading]
@@ -87,16 +86,8 @@ def predict_runs(
 
     Parameters per run are drawn from their prior, and an effect's values per run as `predict_system` draws them.
 
-    Parameters
-    ----------
-    samples
-        Posterior samples of the model.
-    about
-        The reference fit of the diagnosis, from which its effects have their scales.
-    table
-        The new runs.
-    rng
-        Random generator, for the choice of samples and for the values per run.
+    `samples`: posterior samples of the model; `about`: the reference fit of the diagnosis, from which its effects have
+    their scales; `table`: the new runs; `rng`: random generator, for the choice of samples and for the values per run.
     """
     chain = cast(SystemChain, samples.chain)
     system = chain.system.with_added_runs(table)

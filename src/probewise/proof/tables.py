@@ -57,14 +57,8 @@ _BOOTSTRAPS = 2000
 class ScoreRow:
     """One row of the table.
 
-    Parameters
-    ----------
-    name
-        Quantity measured.
-    found
-        Estimate with its 95 % interval.
-    least, most
-        Bounds of the target, infinite by default; if both are, there is no target.
+    `found`: estimate with its 95 % interval; `least`, `most`: bounds of the target, infinite by default; if both are,
+    there is no target.
     """
 
     name: str

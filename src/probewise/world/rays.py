@@ -40,20 +40,11 @@ def seen_white_fraction(
     Features finer than a pixel need a footprint with smaller pixels. With 0.25 mm pixels and 64 rays the error is below
     1e-3.
 
-    Parameters
-    ----------
-    surface, spot
-        The surface, and the footprint.
-    x_mm, y_mm, orientation_rad
-        Pose of the sensor frame in the lab frame, (n_points,).
-    scale
-        Factor by which the footprint is enlarged about the sensor frame's origin, (n_points,) or scalar.
-    pattern_mm
-        Displacement of the surface from its description, (n_points, 2) or (2,).
-    retouch
-        Function (albedo, x_mm, y_mm) -> changed albedo, applied pixel by pixel; must be smooth over a pixel.
-    n_rays
-        Rays per pixel that contains an edge.
+    `surface`, `spot`: the surface, and the footprint; `x_mm`, `y_mm`, `orientation_rad`: pose of the sensor frame in
+    the lab frame, (n_points,); `scale`: factor by which the footprint is enlarged about the sensor frame's origin,
+    (n_points,) or scalar; `pattern_mm`: displacement of the surface from its description, (n_points, 2) or (2,);
+    `retouch`: function (albedo, x_mm, y_mm) -> changed albedo, applied pixel by pixel; must be smooth over a pixel;
+    `n_rays`: rays per pixel that contains an edge.
     """
     n_points = len(x_mm)
     moved = np.broadcast_to(np.asarray(pattern_mm, dtype=np.float64), (n_points, 2)).T

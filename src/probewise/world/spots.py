@@ -19,14 +19,9 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 class Spot:
     """A footprint: the share of the seen light that comes from each pixel.
 
-    Parameters
-    ----------
-    weights
-        Share by pixel, shape (n_v, n_u), first row at the smallest v, first column at smallest u; scaled to sum to one.
-    pixel_mm
-        Side of a pixel.
-    corner_mm
-        Corner (u, v) of the raster with the smallest u and v, in the sensor frame.
+    `weights`: share by pixel, shape (n_v, n_u), first row at the smallest v, first column at smallest u; scaled to sum
+    to one; `pixel_mm`: side of a pixel; `corner_mm`: corner (u, v) of the raster with the smallest u and v, in the
+    sensor frame.
     """
 
     weights: FloatArray
@@ -76,16 +71,8 @@ def raster_spot(
 ) -> Spot:
     """Rasterise a density over a square of pixels; rows and columns with negligible weight at the margin are cropped.
 
-    Parameters
-    ----------
-    density
-        Function of arrays u, v (mm) of one shape: sensitivity there; any scale, 0 or more.
-    half_width_mm
-        Half the side of the square.
-    center_mm
-        Its centre in the sensor frame.
-    pixel_mm
-        Side of a pixel.
+    `density`: function of arrays u, v (mm) of one shape: sensitivity there; any scale, 0 or more; `half_width_mm`: half
+    the side of the square; `center_mm`: its centre in the sensor frame; `pixel_mm`: side of a pixel.
     """
     n = math.ceil(half_width_mm / pixel_mm)
     centers = (np.arange(-n, n) + 0.5) * pixel_mm

@@ -17,27 +17,13 @@ from probewise.world.spots import Spot
 class Rows:
     """One row per reading, in order of time.
 
-    Parameters
-    ----------
-    place_mm
-        Position (x, y) of the sensor, shape (n_points, 2): commanded, or true once the arm's errors are applied.
-    direction
-        Unit vector of the last motion, 0 where there was none, shape (n_points, 2).
-    orientation_rad
-        Orientation, commanded or true, shape (n_points,).
-    time_s
-        Time, shape (n_points,).
-    scan
-        Number of the scan, an index of `scan_names`, shape (n_points,).
-    scan_names
-        Name of each scan.
-    covariates
-        Other logged columns by name, arrays of shape (n_points,).
-    across
-        Unit vector across the straight edges of the pattern below, (1, 0) for others (`common_edge_normal`), shape
-        (n_points, 2).
-    edge_mm
-        Distance from the sensor's position to the pattern's nearest edge, infinite where there is none, (n_points,).
+    `place_mm`: position (x, y) of the sensor, shape (n_points, 2): commanded, or true once the arm's errors are
+    applied; `direction`: unit vector of the last motion, 0 where there was none, shape (n_points, 2);
+    `orientation_rad`: orientation, commanded or true, shape (n_points,); `time_s`: time, shape (n_points,); `scan`:
+    number of the scan, an index of `scan_names`, shape (n_points,); `scan_names`: name of each scan; `covariates`:
+    other logged columns by name, arrays of shape (n_points,); `across`: unit vector across the straight edges of the
+    pattern below, (1, 0) for others (`common_edge_normal`), shape (n_points, 2); `edge_mm`: distance from the sensor's
+    position to the pattern's nearest edge, infinite where there is none, (n_points,).
     """
 
     place_mm: FloatArray

@@ -38,10 +38,7 @@ Surface: TypeAlias = Pattern | Oval | CoveredSurface
 def albedo_at(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the albedo at points in mm; `x_mm`, `y_mm` and the result have one shape.
 
-    Raises
-    ------
-    ParameterError
-        If the type of surface is unknown.
+    Raises ParameterError if the type of surface is unknown.
     """
     match surface:
         case CoveredSurface():

@@ -35,14 +35,8 @@ _Surfaces = Sequence[tuple[Surface, IntArray]]
 class View:
     """What the sensor sees at each reading, before its response: the costly part of a simulation.
 
-    Parameters
-    ----------
-    seen
-        Seen white fraction u, shape (n_points,).
-    dimming
-        Factor on the signal from the true height (inverse square) and the commanded LED, shape (n_points,).
-    rows
-        Table of the readings with the sensor's true poses.
+    `seen`: seen white fraction u, shape (n_points,); `dimming`: factor on the signal from the true height (inverse
+    square) and the commanded LED, shape (n_points,); `rows`: table of the readings with the sensor's true poses.
     """
 
     seen: FloatArray
@@ -103,20 +97,10 @@ class World:
     ) -> float:
         """Take one reading over a surface, as an arm does; return the recorded reading.
 
-        Parameters
-        ----------
-        surface
-            The surface below.
-        x_mm, y_mm, orientation_rad
-            Commanded pose, lab frame.
-        time_s
-            Time of the reading.
-        rng
-            Generator of the noise; None: a reading without noise, but rounded.
-        direction
-            Unit vector of the motion to this pose, for backlash and hysteresis; (0, 0): none.
-        height_mm
-            Commanded height of the sensor; None: `self.height_mm`.
+        `surface`: the surface below; `x_mm`, `y_mm`, `orientation_rad`: commanded pose, lab frame; `time_s`: time of
+        the reading; `rng`: generator of the noise; None: a reading without noise, but rounded; `direction`: unit vector
+        of the motion to this pose, for backlash and hysteresis; (0, 0): none; `height_mm`: commanded height of the
+        sensor; None: `self.height_mm`.
         """
         if rng is not None:
             require_rng(rng)
@@ -159,17 +143,8 @@ class World:
     def expected_readings(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> FloatArray:
         """Return the noise-free readings of a plan, not rounded, shape (n_points,).
 
-        Parameters
-        ----------
-        plan
-            The plan.
-        surfaces
-            Surfaces by name of the pattern, in place of the plan's descriptions.
-
-        Raises
-        ------
-        ParameterError
-            If the plan reads over a pattern that is not described.
+        `surfaces`: surfaces by name of the pattern, in place of the plan's descriptions. Raises ParameterError if the
+        plan reads over a pattern that is not described.
         """
         return self.noise_free_readings(self.view(plan, surfaces))
 
@@ -183,21 +158,9 @@ class World:
     ) -> Recording:
         """Simulate the recording of a plan.
 
-        Parameters
-        ----------
-        plan
-            The plan.
-        rng
-            Generator of the noise; None: readings without noise, but rounded.
-        surfaces
-            Surfaces by name of the pattern, in place of the plan's descriptions.
-        view
-            Result of `view`, if already computed.
-
-        Raises
-        ------
-        ParameterError
-            If the plan reads over a pattern that is not described.
+        `rng`: generator of the noise; None: readings without noise, but rounded; `surfaces`: surfaces by name of the
+        pattern, in place of the plan's descriptions; `view`: result of `view`, if already computed. Raises
+        ParameterError if the plan reads over a pattern that is not described.
         """
         return Recording(plan, self._recorded_readings(self.view(plan, surfaces) if view is None else view, rng))
 

@@ -73,14 +73,8 @@ def stratum_of(number: int) -> tuple[Stratum, int]:
 class HiddenEffect:
     """One concealed effect.
 
-    Parameters
-    ----------
-    effect
-        The effect with its parameters.
-    size_lambda
-        Norm of its change after a refit of the null model, in noise sds.
-    region
-        Region where it acts; None: not a local effect.
+    `effect`: the effect with its parameters; `size_lambda`: norm of its change after a refit of the null model, in
+    noise sds; `region`: region where it acts; None: not a local effect.
     """
 
     effect: Concealed
@@ -120,22 +114,11 @@ class AliasedEffect:
 class Truth:
     """The truth of a case.
 
-    Parameters
-    ----------
-    seed, number
-        Seed and number of the case.
-    stratum
-        Stratum of the case.
-    ssf, noise_level, noise_model, plan
-        Names in SSFS, NOISE_LEVELS, NOISE_MODELS and PLANS.
-    noise_sd, black, white
-        Noise sd and levels of the sensor, in reading units.
-    hidden
-        Concealed effects, in the order of the vocabulary.
-    cosine
-        Cosine of a pair after the refit; None: no pair.
-    alias
-        The alias of the concealed effect, in the stratum of aliases; otherwise None.
+    `seed`, `number`: seed and number of the case; `stratum`: stratum of the case; `ssf`, `noise_level`, `noise_model`,
+    `plan`: names in SSFS, NOISE_LEVELS, NOISE_MODELS and PLANS; `noise_sd`, `black`, `white`: noise sd and levels of
+    the sensor, in reading units; `hidden`: concealed effects, in the order of the vocabulary; `cosine`: cosine of a
+    pair after the refit; None: no pair; `alias`: the alias of the concealed effect, in the stratum of aliases;
+    otherwise None.
     """
 
     seed: int
@@ -206,18 +189,9 @@ _ATTEMPTS = 6
 class Case:
     """One case of a challenge.
 
-    Parameters
-    ----------
-    recording
-        The recording to diagnose.
-    truth
-        The truth that the diagnosis is scored against.
-    world
-        The simulated sensor with its concealed effects.
-    test_plans
-        Plans of the held-out readings, by name: "angle", "pattern", "direction" (`held_out_plans`).
-    test_seed
-        Seed sequence of the noise of the held-out readings.
+    `recording`: the recording to diagnose; `truth`: the truth that the diagnosis is scored against; `world`: the
+    simulated sensor with its concealed effects; `test_plans`: plans of the held-out readings, by name: "angle",
+    "pattern", "direction" (`held_out_plans`); `test_seed`: seed sequence of the noise of the held-out readings.
     """
 
     recording: Recording
@@ -230,20 +204,11 @@ class Case:
 def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Case:
     """Draw case `number` of a challenge; it depends on the seed and the number alone.
 
-    Parameters
-    ----------
-    seed
-        The secret seed of the challenge.
-    number
-        Number of the case, from 0: determines its stratum (`stratum_of`) and, with the seed, everything else.
-    norm_after_refit
-        Function of two noise-free recordings, without and with an effect: norm of the effect after a full refit of the
-        null model, in reading units.
-
-    Raises
-    ------
-    NotConvergedError
-        If none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an alias's loss < 3.
+    `seed`: the secret seed of the challenge; `number`: number of the case, from 0: determines its stratum
+    (`stratum_of`) and, with the seed, everything else; `norm_after_refit`: function of two noise-free recordings,
+    without and with an effect: norm of the effect after a full refit of the null model, in reading units. Raises
+    NotConvergedError if none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an alias's
+    loss < 3.
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)

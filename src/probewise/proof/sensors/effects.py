@@ -67,20 +67,10 @@ Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], Any]
 class EffectSampler:
     """A distribution over one kind of effect, up to its amplitude.
 
-    Parameters
-    ----------
-    residual_covariates
-        Names of the covariates along which its residual is visible.
-    make
-        Function of the amplitude and the values that `draws` drew; returns the effect.
-    draws
-        Draw the parameters, one each, in this order.
-    first
-        First amplitude of the search for a size.
-    limit
-        Largest plausible amplitude.
-    scalable
-        Whether the search chooses the amplitude; if False, the amplitude is `first`.
+    `residual_covariates`: names of the covariates along which its residual is visible; `make`: function of the
+    amplitude and the values that `draws` drew; returns the effect; `draws`: draw the parameters, one each, in this
+    order; `first`: first amplitude of the search for a size; `limit`: largest plausible amplitude; `scalable`: whether
+    the search chooses the amplitude; if False, the amplitude is `first`.
     """
 
     residual_covariates: tuple[str, ...]

@@ -57,28 +57,10 @@ def amplitude_of_size(
     Size grows roughly as a power of the amplitude: steps follow a straight line in log-log coordinates, first by
     extrapolation, then by interpolation, with bisection where interpolation gains too little.
 
-    Parameters
-    ----------
-    size
-        Function from amplitude to size.
-    wanted
-        Requested size, greater than 0.
-    first
-        First amplitude tried.
-    limit
-        Largest amplitude.
-    tolerance
-        Relative error of the size at which the search ends.
-    acceptable
-        Relative error accepted when the search ends otherwise.
-    max_calls
-        Largest number of calls of `size`.
-
-    Raises
-    ------
-    NotConvergedError
-        If even the limit is too small, or no amplitude has an acceptable size; `partial` holds (amplitude, size) of the
-        nearest.
+    `size`: function from amplitude to size; `wanted`: requested size, greater than 0; `first`: first amplitude tried;
+    `tolerance`: relative error of the size at which the search ends; `acceptable`: relative error accepted when the
+    search ends otherwise; `max_calls`: largest number of calls of `size`. Raises NotConvergedError if even the limit is
+    too small, or no amplitude has an acceptable size; `partial` holds (amplitude, size) of the nearest.
     """
     low: tuple[float, float] | None = None  # log amplitude and log(size / wanted), size too small
     high: tuple[float, float] | None = None  # the same, size too large
@@ -114,12 +96,8 @@ def amplitude_of_size(
 class EffectSizer:
     """Computes sizes lambda of effects in one plan and with one sensor, and the cosine of two.
 
-    Parameters
-    ----------
-    setup
-        A plan and a world without effects.
-    norm_after_refit
-        Function of two recordings, without and with an effect: its norm after a full refit of the null model.
+    `setup`: a plan and a world without effects; `norm_after_refit`: function of two recordings, without and with an
+    effect: its norm after a full refit of the null model.
     """
 
     setup: CleanSetup
@@ -166,19 +144,9 @@ def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_
     variance (Kullback-Leibler divergence summed over readings). Lost readings count as an effect on the mean: lambda is
     the norm of their expected deviations in noise sds.
 
-    Parameters
-    ----------
-    effect
-        Correlated or signal-dependent noise, outliers, or dropouts.
-    view, readings
-        View of the sensor (`World.view`), and the noise-free readings, shape (n_points,).
-    noise_sd
-        Sd of the noise's Gaussian core, reading units.
-
-    Raises
-    ------
-    ParameterError
-        If the effect is any other.
+    `effect`: correlated or signal-dependent noise, outliers, or dropouts; `view`, `readings`: view of the sensor
+    (`World.view`), and the noise-free readings, shape (n_points,); `noise_sd`: sd of the noise's Gaussian core, reading
+    units. Raises ParameterError if the effect is any other.
     """
     n_points = len(view.seen)
     match effect:

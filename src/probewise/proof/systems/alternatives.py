@@ -89,16 +89,9 @@ _N_CHANGE_POINTS = 80
 def nats_of_alternative(case: SystemCase, names: Sequence[str]) -> float:
     """Return how many nats of log likelihood the best fit of other effects loses on a case's noise-free readings.
 
-    Parameters
-    ----------
-    case
-        The case, with one concealed effect or more.
-    names
-        One or two names of the vocabulary, with their targets; fitted together with the nominal model.
-
-    Returns
-    -------
-    The loss, 0 or more; infinite for more names, for those that this system does not have, and where no fit converges.
+    `case`: the case, with one concealed effect or more; `names`: one or two names of the vocabulary, with their
+    targets; fitted together with the nominal model. Returns the loss, 0 or more; infinite for more names, for those
+    that this system does not have, and where no fit converges.
     """
     drawn = case.drawn
     forms = [_forms_of_name(drawn, name) for name in names]

@@ -77,12 +77,8 @@ _RUN_AWAY = 1e3  # times the largest reading: larger ones count as divergence
 class DrawnSystem:
     """A system with true parameters, without effects.
 
-    Parameters
-    ----------
-    kind, table
-        The system, and the table of all its rows, including those of the two held-out runs.
-    shared, by_run
-        True parameters by name; those per run as arrays over all runs of `table`, held-out runs last.
+    `kind`, `table`: the system, and the table of all its rows, including those of the two held-out runs; `shared`,
+    `by_run`: true parameters by name; those per run as arrays over all runs of `table`, held-out runs last.
     """
 
     kind: SystemKind
@@ -202,24 +198,10 @@ class SystemEffect:
 class SystemCase:
     """One case of a challenge on systems.
 
-    Parameters
-    ----------
-    seed, number, stratum
-        Identification of the case.
-    drawn
-        The system.
-    effects
-        Its concealed effects.
-    noise
-        Its noise.
-    noise_text
-        The line on noise in the simulator file; may be empty.
-    labels
-        Names of the runs, as in the table.
-    noise_free, readings
-        Readings with the effects, without and with noise, at all rows, (n_points,).
-    cosine
-        Cosine of a pair after the refit; None: no pair.
+    `seed`, `number`, `stratum`: identification of the case; `effects`: its concealed effects; `noise_text`: the line on
+    noise in the simulator file; may be empty; `labels`: names of the runs, as in the table; `noise_free`, `readings`:
+    readings with the effects, without and with noise, at all rows, (n_points,); `cosine`: cosine of a pair after the
+    refit; None: no pair.
     """
 
     seed: int

@@ -135,14 +135,8 @@ def parameter_arrays(settings: Sequence[Mapping[str, float]]) -> dict[str, Float
 class TrueSystem:
     """A system at its true parameters.
 
-    Parameters
-    ----------
-    kind, table
-        The system, and the table of the rows that are not held out.
-    parameters
-        True parameters by name, (1, 1) or (1, n_points).
-    readings, states
-        Noise-free and without any effect, (n_points,); the states by name.
+    `kind`, `table`: the system, and the table of the rows that are not held out; `parameters`: true parameters by name,
+    (1, 1) or (1, n_points); `readings`, `states`: noise-free and without any effect, (n_points,); the states by name.
     """
 
     kind: SystemKind

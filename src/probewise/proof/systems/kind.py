@@ -18,16 +18,9 @@ from probewise._arrays import FloatArray, IntArray
 class SystemTable:
     """Rows in order of time; every array is (n_points,).
 
-    Parameters
-    ----------
-    columns
-        Numeric columns by name, including time.
-    run
-        Number, from 0, of each row's run among all runs of a case including held-out ones.
-    time
-        Name of the time column; None if none was recorded.
-    n_runs
-        Number of runs of the case, including held-out ones.
+    `columns`: numeric columns by name, including time; `run`: number, from 0, of each row's run among all runs of a
+    case including held-out ones; `time`: name of the time column; None if none was recorded; `n_runs`: number of runs
+    of the case, including held-out ones.
     """
 
     columns: Mapping[str, FloatArray]
@@ -85,16 +78,9 @@ Formula: TypeAlias = Callable[[Values, Values], Any]
 class Law:
     """A law in continuous time.
 
-    Parameters
-    ----------
-    start
-        Initial value of each state: the name of a parameter, or a number.
-    rates
-        Function of states, parameters and columns; returns the rate of each state.
-    read
-        Function of states, parameters and columns; returns the reading.
-    linear
-        Whether inputs are interpolated linearly between rows; otherwise they are held.
+    `start`: initial value of each state: the name of a parameter, or a number; `rates`: function of states, parameters
+    and columns; returns the rate of each state; `read`: function of states, parameters and columns; returns the
+    reading; `linear`: whether inputs are interpolated linearly between rows; otherwise they are held.
     """
 
     start: Mapping[str, str | float]

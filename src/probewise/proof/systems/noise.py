@@ -30,18 +30,10 @@ OTHER_NOISE = (
 class SystemNoise:
     """A noise model of a case.
 
-    Parameters
-    ----------
-    name
-        "white" or one of OTHER_NOISE.
-    draw
-        Function of noise-free readings, table and a generator; returns readings with noise, (n_points,).
-    parameters
-        Its parameters by name, as in the vocabulary.
-    size_lambda
-        Square root of twice the expected gain in log likelihood over white noise; 0 if its strength is fixed.
-    step
-        Step to which this noise asks to round readings; None: no rounding.
+    `name`: "white" or one of OTHER_NOISE; `draw`: function of noise-free readings, table and a generator; returns
+    readings with noise, (n_points,); `parameters`: its parameters by name, as in the vocabulary; `size_lambda`: square
+    root of twice the expected gain in log likelihood over white noise; 0 if its strength is fixed; `step`: step to
+    which this noise asks to round readings; None: no rounding.
     """
 
     name: str

@@ -54,22 +54,10 @@ def rivals_with_nats(
 ) -> dict[str, float]:
     """Find the forms that explain an effect's noise-free readings nearly as well as the effect itself, six at most.
 
-    Parameters
-    ----------
-    true
-        The system.
-    forms
-        Forms to try.
-    target
-        Noise-free readings with the effect, (n_points,).
-    fitted, model
-        The fit to `target` without the effect: the nominal model with the other concealed effects.
-    without
-        Names not to try.
-
-    Returns
-    -------
-    Loss of log likelihood in nats by name, for those below 12, the smallest first; below TELLING_NATS (3): aliases.
+    `forms`: forms to try; `target`: noise-free readings with the effect, (n_points,); `fitted`, `model`: the fit to
+    `target` without the effect: the nominal model with the other concealed effects; `without`: names not to try.
+    Returns loss of log likelihood in nats by name, for those below 12, the smallest first; below TELLING_NATS (3):
+    aliases.
     """
     left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
     near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], left, fitted, model)
@@ -225,14 +213,7 @@ _PLAIN = 0.25  # least explained share of the sum of squares
 def residual_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
     """Return names that a diagnosis may rank first: the form's covariates, then others that explain about as much.
 
-    Parameters
-    ----------
-    form
-        The concealed form.
-    residuals
-        Residuals after the refit of the nominal model, (n_points,).
-    true
-        The system.
+    `form`: the concealed form; `residuals`: residuals after the refit of the nominal model, (n_points,).
     """
     rows = true.table
     pooled = {name: values for name, values in rows.columns.items() if name != rows.time}

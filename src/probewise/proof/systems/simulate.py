@@ -37,18 +37,8 @@ def solve_law(
 ) -> dict[str, FloatArray]:
     """Solve a law: return every state by name at every row, (n_samples, n_points).
 
-    Parameters
-    ----------
-    kind
-        The system.
-    rows
-        Its rows.
-    parameters
-        By name, (n_samples or 1, 1 or n_points).
-    columns
-        Inputs after their effects, (n_samples or 1, n_points), including time.
-    effects
-        Forms on parameters and rates, and those that delay a column.
+    `parameters`: by name, (n_samples or 1, 1 or n_points); `columns`: inputs after their effects, (n_samples or 1,
+    n_points), including time; `effects`: forms on parameters and rates, and those that delay a column.
     """
     return _Integration(kind, rows, parameters, columns, effects).solve()
 
@@ -420,16 +410,8 @@ def simulate_noise_free(
 ) -> NoiseFreeResult:
     """Simulate a system without noise, at one set of parameters per sample.
 
-    Parameters
-    ----------
-    kind
-        The system.
-    rows
-        The table of the rows to simulate.
-    parameters
-        By name, (n_samples or 1, 1 or n_points) each.
-    effects
-        Forms, each with its parameters by name, (n_samples or 1, 1).
+    `rows`: the table of the rows to simulate; `parameters`: by name, (n_samples or 1, 1 or n_points) each; `effects`:
+    forms, each with its parameters by name, (n_samples or 1, 1).
     """
     placed = [(form, {name: np.atleast_2d(v) for name, v in numbers.items()}) for form, numbers in effects]
     columns = {name: values[None, :] for name, values in rows.columns.items()}

@@ -23,8 +23,7 @@ from probewise.report.plots.canvas import (
     SMALL_PT,
     VERMILLION,
     AxesGrid,
-    axes_or_grid,
-    axes_or_new,
+    grid_of_axes,
     label_axes,
     legend_above,
     legend_below,
@@ -42,23 +41,22 @@ __all__ = [
 _BAND = (0.16, 0.84)
 
 
-def posterior_widths_of_runs(
-    runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0, axes: AxesGrid | None = None
-) -> AxesGrid:
+def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0) -> AxesGrid:
     """Draw the widest posterior sd after each reading: median and middle 68 % of the runs, one panel per row.
 
     Thin lines are the medians of the other panels. A run that has ended keeps its last width.
 
-    `runs`: for each row, by name: the widest posterior sd after each reading of every run, (n_readings,), mm; `axes`:
-    axes to draw on, of the shape returned; a new figure without. Returns axes, (n_rows, 2), or (1, 1) for a single
-    name.
+    `runs`: for each row, by name, the widest posterior sd after each reading of every run, (n_readings,), mm.
     """
     n_columns = min(len(runs), 2)
     n_rows = -(-len(runs) // max(n_columns, 1))
-    own = axes is None
     size_in = (PAGE_IN if n_columns == 2 else 6.8, 0.5 + 2.9 * n_rows)
-    axes = axes_or_grid(axes, n_rows, n_columns, size_in=size_in, sharex=True, sharey=True)
-    tables = {name: _extended_at_last_width(widths) for name, widths in runs.items()}
+    axes = grid_of_axes(n_rows, n_columns, size_in=size_in, sharex=True, sharey=True)
+    longest = {name: max(len(w) for w in widths) for name, widths in runs.items()}
+    tables = {
+        name: np.array([np.pad(w, (0, longest[name] - len(w)), mode="edge") for w in widths])
+        for name, widths in runs.items()
+    }
     for ax, (name, table) in zip(axes.flat, tables.items(), strict=False):
         for other, more in tables.items():
             if other != name:
@@ -76,43 +74,36 @@ def posterior_widths_of_runs(
         ax.set_visible(False)
         axes.flat[len(runs) - n_columns].xaxis.set_tick_params(labelbottom=True)
         axes.flat[len(runs) - n_columns].set_xlabel("number of readings")
-    if own:
-        legend_below(axes)
-    else:
-        axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
+    legend_below(axes)
     return axes
-
-
-def _extended_at_last_width(widths: Sequence[FloatArray]) -> FloatArray:
-    """Extend every run at its last width to the length of the longest: (n_runs, n_readings)."""
-    longest = max(len(w) for w in widths)
-    return np.array([np.pad(w, (0, longest - len(w)), mode="edge") for w in widths])
 
 
 def _reading_numbers(table: FloatArray) -> FloatArray:
     return np.arange(1.0, table.shape[1] + 1)
 
 
-def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None) -> AxesGrid:
+def _value_and_whiskers(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray]:
+    """Return values, (n,), and whiskers down and up, (2, n): rounding may put an end a hair inside the value."""
+    value, low, high = (np.array([getattr(e, k) for e in estimates]) for k in ("value", "low", "high"))
+    return value, np.maximum([value - low, high - value], 0.0)
+
+
+def readings_needed(rows: Mapping[str, Summary]) -> AxesGrid:
     """Draw mean and median readings needed in each row of a study, in all and after the first reading on white.
 
-    `rows`: summary by name, drawn from the top in this order; `axes`: axes to draw on, (1, 2), with one y axis; a new
-    figure without. Returns axes, (1, 2).
+    `rows` are drawn from the top in this order. Returns axes, (1, 2).
     """
     names = ["\n".join(textwrap.wrap(name, 30)) for name in rows]
     n_lines = sum(1 + name.count("\n") for name in names)
-    own = axes is None
-    axes = axes_or_grid(axes, 1, 2, size_in=(PAGE_IN, 1.5 + 0.2 * len(names) + 0.16 * n_lines), sharey=True)
+    axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.5 + 0.2 * len(names) + 0.16 * n_lines), sharey=True)
     y = np.arange(len(names))
     for ax, parts, title in (
         (axes[0, 0], (("mean", BLUE, "o", -0.14), ("median", VERMILLION, "s", 0.14)), "in all"),
         (axes[0, 1], (("after_white", BLUE, "o", 0.0),), "after the first on white"),
     ):
         for part, colour, marker, shift in parts:
-            estimates = [getattr(summary, part) for summary in rows.values()]
-            value, low, high = (np.array([getattr(e, k) for e in estimates]) for k in ("value", "low", "high"))
-            whiskers = np.array([value - low, high - value])
-            known = "median, 95 % interval" if np.isfinite(low).any() else "median"
+            value, whiskers = _value_and_whiskers([getattr(summary, part) for summary in rows.values()])
+            known = "median, 95 % interval" if np.isfinite(whiskers).any() else "median"
             label = "mean ± standard error" if part != "median" else known
             style = {"fmt": marker, "color": colour, "markersize": 5, "capsize": 3, "label": label}
             ax.errorbar(value, y + shift, xerr=whiskers, **style)
@@ -122,24 +113,16 @@ def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None
         label_axes(ax, x="number of readings", y="", title=title)
     # Half a row of margin at either end, also for a single row.
     axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
-    if own:
-        legend_below(axes)
-    else:
-        axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
+    legend_below(axes)
     return axes
 
 
-def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
-    """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases.
-
-    `bins`: from `challenge.reliability_bins`; `ax`: axes to draw on; a new figure without.
-    """
-    ax = axes_or_new(ax, size_in=(5.2, 5.0))
+def reliability_diagram(bins: Sequence[Bin]) -> Axes:
+    """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases."""
+    ax = grid_of_axes(1, 1, size_in=(5.2, 5.0))[0, 0]
     ax.plot([0, 1], [0, 1], color=GREY, linewidth=0.9, linestyle="--", label="honest")
+    value, whiskers = _value_and_whiskers([b.right for b in bins])
     stated = np.array([b.stated for b in bins])
-    value, low, high = (np.array([getattr(b.right, end) for b in bins]) for end in ("value", "low", "high"))
-    # Rounding may put an end of the interval slightly inside the value.
-    whiskers = np.maximum([value - low, high - value], 0.0)
     ax.errorbar(stated, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
     for b in bins:
         ax.annotate(
@@ -150,13 +133,9 @@ def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
     return label_axes(ax, x="probability stated", y="share that was right")
 
 
-def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray, *, ax: Axes | None = None) -> Axes:
-    """Draw the confusion matrix: the number of cases in each cell, shaded by its share of the row.
-
-    `truths`, `said`: names of the rows and of the columns; `counts`: number of cases, (n_truths, n_said); `ax`: axes to
-    draw on; a new figure without.
-    """
-    ax = axes_or_new(ax, size_in=(3.0 + 0.34 * len(said), 2.4 + 0.3 * len(truths)))
+def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray) -> Axes:
+    """Draw the number of cases by truth and answer, (n_truths, n_said), shaded by its share of the row."""
+    ax = grid_of_axes(1, 1, size_in=(3.0 + 0.34 * len(said), 2.4 + 0.3 * len(truths)))[0, 0]
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     ax.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
     for (row, column), n in np.ndenumerate(counts):
@@ -181,15 +160,13 @@ def effect_and_size_in_words(row: ConcealedRow) -> str:
     return name if row.size is None else f"{name}, {row.size:g}"
 
 
-def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None = None) -> AxesGrid:
+def doubt_against_trust(rows: Sequence[ConcealedRow]) -> AxesGrid:
     """Compare doubt in the sensor model with trust: runs sure and wrong, intervals that hold, median readings.
 
-    `rows`: from `study.concealed_rows`, drawn from the top in this order; `axes`: axes to draw on, (1, 3), with one y
-    axis; a new figure without. Returns axes, (1, 3).
+    `rows` are drawn from the top in this order. Returns axes, (1, 3).
     """
     names = list(dict.fromkeys(effect_and_size_in_words(row) for row in rows))
-    own = axes is None
-    axes = axes_or_grid(axes, 1, 3, size_in=(PAGE_IN, 1.7 + 0.32 * len(names)), sharey=True)
+    axes = grid_of_axes(1, 3, size_in=(PAGE_IN, 1.7 + 0.32 * len(names)), sharey=True)
     arms: Mapping[str, tuple[list[ConcealedRow], str, str, float]] = {
         "trusts its sensor": ([row for row in rows if row.trust == 1], VERMILLION, "s", 0.15),
         "doubts its sensor": ([row for row in rows if row.trust < 1], BLUE, "o", -0.15),
@@ -200,9 +177,8 @@ def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None =
             values = [getattr(row, field) for row in those]
             style = {"fmt": marker, "color": colour, "markersize": 4.5, "label": label}
             if all(isinstance(value, Estimate) for value in values):
-                value, low, high = (np.array([getattr(e, k) for e in values]) for k in ("value", "low", "high"))
-                # Rounding may put an end a hair inside the value.
-                ax.errorbar(value, y, xerr=np.maximum([value - low, high - value], 0.0), capsize=2.5, **style)
+                value, whiskers = _value_and_whiskers(values)
+                ax.errorbar(value, y, xerr=whiskers, capsize=2.5, **style)
             else:
                 ax.errorbar(values, y, **style)
         ax.set_xlim(*((0, None) if field == "readings" else (-0.03, 1.03)))
@@ -212,6 +188,5 @@ def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None =
         ax.set_yticks(np.arange(len(names)), names)
         label_axes(ax, x=x, y="", title=title)
     axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
-    if own:
-        legend_below(axes)
+    legend_below(axes)
     return axes

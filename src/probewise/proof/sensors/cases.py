@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -63,10 +63,17 @@ _STRIDE = 23  # coprime to the length of the cycle, so that successive cases dif
 
 def stratum_of(number: int) -> tuple[Stratum, int]:
     """Return the stratum of case `number`, and how many cases of that stratum have smaller numbers."""
-    cycle, slot = divmod(number, len(WHEEL))
-    order = [WHEEL[k * _STRIDE % len(WHEEL)] for k in range(len(WHEEL))]
-    stratum = order[slot]
-    return stratum, cycle * order.count(stratum) + order[:slot].count(stratum)
+    return stratum_in_wheel(number, WHEEL, _STRIDE)
+
+
+def stratum_in_wheel(
+    number: int, wheel: tuple[Stratum, ...], stride: int, like: Callable[[Stratum], object] = lambda stratum: stratum
+) -> tuple[Stratum, int]:
+    """Return the stratum of case `number` of a cycle, and how many earlier cases are `like` it."""
+    cycle, slot = divmod(number, len(wheel))
+    order = [wheel[k * stride % len(wheel)] for k in range(len(wheel))]
+    kinds = [like(stratum) for stratum in order]
+    return order[slot], cycle * kinds.count(kinds[slot]) + kinds[:slot].count(kinds[slot])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from probewise.proof.systems.fit import (
     AddedForm,
     LeastSquaresFit,
     ModelWithForms,
-    names_of_fitted_parameters,
     project_out,
 )
 from probewise.proof.systems.form import Form, Numbers
@@ -33,7 +32,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     are drawn from the prior. Raises NotConvergedError if the fit diverges.
     """
     drawn, kind = case.drawn, case.drawn.kind
-    beside = [AddedForm(e.form, e.values, names_of_fitted_parameters(e.form)) for e in case.effects]
+    beside = [AddedForm(e.form, e.values) for e in case.effects]
     model = ModelWithForms(kind, drawn.diagnosed_table, beside)
     fitted = model.fit(case.readings[drawn.diagnosed_row_numbers], model.coordinates_of(drawn.shared, drawn.by_run))
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)

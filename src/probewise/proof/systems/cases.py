@@ -15,13 +15,12 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.cases import Stratum
+from probewise.proof.sensors.cases import Stratum, stratum_in_wheel
 from probewise.proof.sensors.sizing import amplitude_of_size
 from probewise.proof.systems.fit import (
     AddedForm,
     LeastSquaresFit,
     ModelWithForms,
-    names_of_fitted_parameters,
     project_out,
 )
 from probewise.proof.systems.form import Form, FormWithParameters, TrueSystem, parameter_arrays
@@ -52,16 +51,7 @@ _STRIDE = 7  # coprime to the length of the cycle, so that successive cases diff
 
 def system_stratum_of(number: int) -> tuple[Stratum, int]:
     """Return the stratum of case `number`, and how many earlier cases have its kind and `other_noise`, at any size."""
-    order = [SYSTEMS_WHEEL[k * _STRIDE % len(SYSTEMS_WHEEL)] for k in range(len(SYSTEMS_WHEEL))]
-
-    def have_same_kind_and_noise(a: Stratum, b: Stratum) -> bool:
-        return (a.kind, a.other_noise) == (b.kind, b.other_noise)
-
-    turn, slot = divmod(number, len(order))
-    own = order[slot]
-    return own, turn * sum(have_same_kind_and_noise(s, own) for s in order) + sum(
-        have_same_kind_and_noise(s, own) for s in order[:slot]
-    )
+    return stratum_in_wheel(number, SYSTEMS_WHEEL, _STRIDE, lambda stratum: (stratum.kind, stratum.other_noise))
 
 
 KINDS: tuple[SystemKind, ...] = (*FORMULAS, *LAWS)
@@ -127,27 +117,24 @@ class DrawnSystem:
 
     def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
         """Return noise-free readings with these effects at all rows of `table`, (n_points,); not finite if diverged."""
-        whole = ModelWithForms(self.kind, self.table)
-        with np.errstate(all="ignore"):
-            at = whole.coordinates_of(self.shared, self.by_run)
-            trace = simulate_noise_free(self.kind, self.table, whole.parameters_at(at[None, :]), effects)
-        return np.asarray(trace.readings[0])
+        return self._simulate(self.table, effects)
 
     def simulate_diagnosed_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
         """Return noise-free readings with these effects at the rows that are not held out, (n_points,).
 
         Raises NotConvergedError if a reading is not finite.
         """
-        with np.errstate(all="ignore"):
-            readings: FloatArray = simulate_noise_free(
-                self.kind,
-                self.diagnosed_table,
-                self.nominal_model.parameters_at(self.true_coordinates[None, :]),
-                effects,
-            ).readings[0]
+        readings = self._simulate(self.diagnosed_table, effects)
         if not np.isfinite(readings).all():
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
+
+    def _simulate(self, table: SystemTable, effects: Sequence[FormWithParameters]) -> FloatArray:
+        model = ModelWithForms(self.kind, table)
+        with np.errstate(all="ignore"):
+            at = model.coordinates_of(self.shared, self.by_run)
+            found = simulate_noise_free(self.kind, table, model.parameters_at(at[None, :]), effects)
+        return np.asarray(found.readings[0])
 
     def size_of_effects(self, effects: Sequence[FormWithParameters]) -> float:
         """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
@@ -232,7 +219,7 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
     Raises NotConvergedError if in none of 16 systems the effects can have the requested size (a pair: cosine in +-0.5).
     """
     stratum, n_earlier = system_stratum_of(number)
-    drawing, noise = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
+    drawing, noising = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
     shuffled = [*np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES), *ADDED_FAMILIES]
     failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):
@@ -246,52 +233,25 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         except NotConvergedError as error:
             failure = error
             continue
-        return _recorded_case(
-            seed,
-            number,
-            stratum=stratum,
-            n_earlier=n_earlier,
-            drawn=drawn,
-            effects=effects,
-            cosine=cosine,
-            noise_free=everywhere,
-            rng=noise,
-        )
-    raise failure
-
-
-def _recorded_case(
-    seed: int,
-    number: int,
-    stratum: Stratum,
-    n_earlier: int,
-    drawn: DrawnSystem,
-    effects: tuple[SystemEffect, ...],
-    cosine: float | None,
-    noise_free: FloatArray,
-    rng: np.random.Generator,
-) -> SystemCase:
-    """Build the case: add noise, round the readings, and choose what the simulator file states on noise."""
+        break
+    else:
+        raise failure
     kind = drawn.kind
     name = OTHER_NOISE[n_earlier % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
         name = "correlated_noise"  # the table has no column of runs
-    noise = noise_of_size(name, 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_table, kind.sd, rng=rng)
-    readings = noise.draw(noise_free, drawn.table, rng)
-    knows = str(rng.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
+    diagnosed = everywhere[drawn.diagnosed_row_numbers]
+    noise = noise_of_size(name, 12.0, diagnosed, drawn.diagnosed_table, kind.sd, rng=noising)
+    readings = noise.draw(everywhere, drawn.table, noising)
+    knows = str(noising.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
     step = noise.step
     if step is None and knows == "step" and name == "white":
         step = 10.0 ** math.floor(math.log10(kind.sd))
     said = {"sd": kind.sd} if knows != "nothing" else {}
     if step is not None:
         readings, said = np.round(readings / step) * step, {**said, "step": step}
-    text = (
-        f"noise = {{{', '.join(f'{key!r}: {value:g}' for key, value in said.items())}}}".replace("'", '"')
-        if said
-        else ""
-    )
-    plain = bool(rng.random() < 0.5)
-    labels = tuple(str(k + 1) if plain else f"{kind.run}{k + 1:02d}" for k in range(drawn.table.n_runs))
+    stated = ", ".join(f'"{key}": {value:g}' for key, value in said.items())
+    plain = bool(noising.random() < 0.5)
     return SystemCase(
         seed,
         number,
@@ -299,9 +259,9 @@ def _recorded_case(
         drawn=drawn,
         effects=effects,
         noise=noise,
-        noise_text=text,
-        labels=labels,
-        noise_free=noise_free,
+        noise_text=f"noise = {{{stated}}}" if said else "",
+        labels=tuple(str(k + 1) if plain else f"{kind.run}{k + 1:02d}" for k in range(drawn.table.n_runs)),
+        noise_free=everywhere,
         readings=np.round(readings, kind.reading_decimals),
         cosine=cosine,
     )
@@ -314,17 +274,13 @@ def _draw_effects(
     if stratum.kind == "clean":
         return (), None
     forms = forms_of(drawn.true_system)
-    if stratum.kind == "outside":
-        wanted = OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]
-        own = [
-            f
-            for f in forms_out_of_vocabulary(drawn.true_system, rng)
-            if f.name.removeprefix("strange_").split(":")[0] == wanted
-        ]
-        one = _draw_effect_of_size(_draw_form(own, wanted, rng), stratum.size, drawn, rng)
-        return (_effect_with_rivals(one, forms, drawn, ()),), None
-    if stratum.kind == "single":
-        own = [f for f in forms if family_of(f) == family]
+    if stratum.kind in ("outside", "single"):
+        if stratum.kind == "outside":
+            family = OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]
+            strange = forms_out_of_vocabulary(drawn.true_system, rng)
+            own = [f for f in strange if f.name.removeprefix("strange_").split(":")[0] == family]
+        else:
+            own = [f for f in forms if family_of(f) == family]
         one = _draw_effect_of_size(_draw_form(own, family, rng), stratum.size, drawn, rng)
         return (_effect_with_rivals(one, forms, drawn, ()),), None
     names = rng.choice(FAMILIES, 2, replace=False)
@@ -333,10 +289,8 @@ def _draw_effects(
     cosine = _cosine_of_effects(drawn, first, second)
     if abs(cosine) >= _APART:
         raise NotConvergedError(f"{first.name} and {second.name} are alike: cosine {cosine:.2f}")
-    return (
-        _effect_with_rivals(first, forms, drawn, (second,)),
-        _effect_with_rivals(second, forms, drawn, (first,)),
-    ), cosine
+    pair = (first, second), (second, first)
+    return tuple(_effect_with_rivals(one, forms, drawn, (other,)) for one, other in pair), cosine
 
 
 def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
@@ -382,13 +336,11 @@ def _form_with_true_step_time_in_bank(form: Form, values: Mapping[str, float]) -
 
 
 def _cosine_of_effects(drawn: DrawnSystem, one: SystemEffect, other: SystemEffect) -> float:
-    a, b = (
-        project_out(
-            drawn.simulate_diagnosed_rows([e.form_with_parameters]) - drawn.fit_without_effects.readings,
-            drawn.fit_without_effects.slopes,
-        )
-        for e in (one, other)
-    )
+    plain, changes = drawn.fit_without_effects, []
+    for effect in (one, other):
+        change = drawn.simulate_diagnosed_rows([effect.form_with_parameters]) - plain.readings
+        changes.append(project_out(change, plain.slopes))
+    a, b = changes
     return float(a @ b / np.sqrt((a @ a) * (b @ b)))
 
 
@@ -397,7 +349,7 @@ def _effect_with_rivals(
 ) -> SystemEffect:
     """Return the effect with its rivals and covariates, found in a model that has the other concealed effects."""
     target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
-    beside = [AddedForm(e.form, e.values, names_of_fitted_parameters(e.form)) for e in others]
+    beside = [AddedForm(e.form, e.values) for e in others]
     model = ModelWithForms(drawn.kind, drawn.diagnosed_table, beside)
     start = model.coordinates_of(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
@@ -484,9 +436,8 @@ def truth_json(case: SystemCase) -> dict[str, Any]:
 
 def _effect_json(effect: SystemEffect) -> dict[str, Any]:
     own = {"name": effect.name, "side": effect.form.side, "parameters": effect.parameters, "lambda": effect.size_lambda}
-    return (
-        own if effect.in_vocabulary else {**own, "side": "strange", "on_the_list": False, "formula": effect.form.shape}
-    )
+    outside = {"side": "strange", "on_the_list": False, "formula": effect.form.shape}
+    return own if effect.in_vocabulary else own | outside
 
 
 def _alias_name_and_nats_rows(effect: SystemEffect) -> list[list[Any]]:

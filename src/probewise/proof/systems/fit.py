@@ -20,18 +20,17 @@ _FORM_STEP = 0.1  # of the form's own step
 _FAR = 1e9  # residual in sds where a law diverges
 
 
-def names_of_fitted_parameters(form: Form) -> tuple[str, ...]:
-    """Return the names of a form's fitted parameters: not a step's time, nor values of runs without rows."""
-    return tuple(name for name, step in form.steps.items() if step > 0)
-
-
 @dataclass(frozen=True, eq=False)
 class AddedForm:
-    """A form in a model: start values of its parameters by name, and the names of the fitted ones."""
+    """A form in a model, and start values of its parameters by name."""
 
     form: Form
     start: Mapping[str, float]
-    free: tuple[str, ...]
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the fitted parameters: not a step's time, nor values of runs without rows."""
+        return tuple(name for name, step in self.form.steps.items() if step > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +73,9 @@ class ModelWithForms:
 
     def with_form(self, form: Form, start: Mapping[str, float], x: FloatArray) -> tuple[ModelWithForms, FloatArray]:
         """Return the model with one more form, and the coordinates `x` (n_coordinates,) with that form at its start."""
-        free = names_of_fitted_parameters(form)
-        own = [start[name] / (form.steps[name] * _FORM_STEP) for name in free]
-        return replace(self, added=[*self.added, AddedForm(form, start, free)]), np.concatenate([x, own])
+        more = AddedForm(form, start)
+        own = [start[name] / (form.steps[name] * _FORM_STEP) for name in more.free]
+        return replace(self, added=[*self.added, more]), np.concatenate([x, own])
 
     def parameters_at(self, x: FloatArray) -> dict[str, FloatArray]:
         """Return parameters by name at coordinates (n_samples, n_coordinates), (n_samples, 1 or, per run, n_points)."""

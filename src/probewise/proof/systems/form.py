@@ -203,6 +203,36 @@ class Modulation:
     breaks: Callable[[Numbers], FloatArray] | None = None
     signed: bool = True
 
+    def form(
+        self,
+        name: str,
+        side: Side,
+        first: float,
+        *,
+        limit: float,
+        bank: float = 1.0,
+        act: Callable[..., Any] | None = None,
+        **more: Any,
+    ) -> Form:
+        """Return the form that varies so, by default a term added; `limit` and `bank` are in the first amplitude."""
+        return Form(
+            name,
+            side,
+            act=act or self.value_at,
+            of_amplitude=self.of_amplitude,
+            draw=self.draw,
+            bank=self.bank(bank * first),
+            start_values=self.start_values,
+            steps=self.steps(first),
+            first=first,
+            limit=limit * first,
+            covariates=self.covariates,
+            signed=self.signed,
+            uses=self.uses,
+            breaks=self.breaks,
+            **more,
+        )
+
 
 def _amplitude_only_modulation(
     value_at: Callable[[Instants, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()

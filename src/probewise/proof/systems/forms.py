@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -14,6 +15,7 @@ from probewise.proof.systems.form import (
     Instants,
     Modulation,
     Numbers,
+    Side,
     TrueSystem,
     draw_log_uniform,
     linear_drift,
@@ -47,21 +49,7 @@ def modulated_reading_form(true: TrueSystem, name: str, how: Modulation, *, gain
 
     typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
     first = true.noise_sd / typical / how.reach
-    return Form(
-        name,
-        "reading",
-        act=act,
-        of_amplitude=how.of_amplitude,
-        draw=how.draw,
-        bank=how.bank(first),
-        start_values=how.start_values,
-        steps=how.steps(first),
-        first=first,
-        limit=1e4 * first,
-        covariates=how.covariates,
-        signed=how.signed,
-        order=GAIN if gain else OFFSET,
-    )
+    return how.form(name, "reading", first, limit=1e4, act=act, order=GAIN if gain else OFFSET)
 
 
 def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
@@ -148,25 +136,24 @@ def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
 
 def _hysteresis_bend_and_saturation_forms(true: TrueSystem) -> Iterator[Form]:
     low, high, sd = float(true.readings.min()), float(true.readings.max()), true.noise_sd
-    yield Form(
+    span = high - low
+    yield form_of_amplitude(
         "hysteresis",
         "reading",
-        act=lambda y, rows, v: y + v["a"] * direction_of_change(y, rows),
-        bank=[[{"a": sd}]],
-        steps={"a": sd},
-        first=sd,
+        lambda y, rows, v: y + v["a"] * direction_of_change(y, rows),
+        sd,
         limit=1e3 * sd,
         covariates=("previous",),
         order=_HYSTERESIS,
     )
 
     def bend(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        z = (y - low) / (high - low)
-        return np.asarray(y + v["a"] * (high - low) * (np.sign(z) * np.abs(z) ** v["power"] - z))
+        z = (y - low) / span
+        return np.asarray(y + v["a"] * span * (np.sign(z) * np.abs(z) ** v["power"] - z))
 
     if not high > low:
         return
-    first = sd / (high - low)
+    first = sd / span
     yield Form(
         "nonlinearity",
         "reading",
@@ -180,33 +167,63 @@ def _hysteresis_bend_and_saturation_forms(true: TrueSystem) -> Iterator[Form]:
         order=_BEND,
         also_in_truth={"lo": low, "hi": high},
     )
-    for upper in (True, False):
-        end, sign = (high, -1.0) if upper else (low, 1.0)
-        levels = end + sign * (high - low) * np.geomspace(0.004, 0.5, 14)
-        yield Form(
-            "saturation" if upper else "saturation (floor)",
+    ends: tuple[tuple[str, Any, float, float], ...] = (
+        ("saturation", np.minimum, high, -1.0),
+        ("saturation (floor)", np.maximum, low, 1.0),
+    )
+    for name, bound, end, sign in ends:
+        yield _form_of_number(
+            name,
             "reading",
-            act=_make_clip(upper),
-            of_amplitude=_make_clip_level_of_amplitude(end, sign),
-            bank=[[{"level": float(level)}] for level in levels],
-            steps={"level": 0.01 * (high - low)},
+            "level",
+            _clip(bound),
+            end + sign * span * np.geomspace(0.004, 0.5, 14),
+            at=partial(_away_from, end, sign),
+            step=0.01 * span,
             first=2 * sd,
-            limit=0.5 * (high - low),
+            limit=0.5 * span,
             covariates=("level",),
-            signed=False,
             order=_CEILING,
         )
 
 
-def _make_clip(upper: bool) -> Callable[[FloatArray, SystemTable, Numbers], FloatArray]:
-    """Return a `Form.act` that limits readings to the parameter "level": at most this if `upper`, else at least."""
-    bound = np.minimum if upper else np.maximum
-    return lambda y, rows, v: np.asarray(bound(y, v["level"]))
+def _clip(bound: Callable[[FloatArray, Any], FloatArray]) -> Callable[..., FloatArray]:
+    return lambda y, rows, v: bound(y, v["level"])
 
 
-def _make_clip_level_of_amplitude(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
-    """Return a `Form.of_amplitude`: the clip level is `end` + `sign` times the amplitude."""
-    return lambda a, drawn: {"level": end + sign * a}
+def _away_from(end: float, sign: float, a: float) -> float:
+    return end + sign * a
+
+
+def form_of_amplitude(
+    name: str, side: Side, act: Callable[..., Any], first: float, *, bank: float = 1.0, **more: Any
+) -> Form:
+    """Return a form of an amplitude alone, in whose bank it is `bank` times the `first` tried."""
+    return Form(name, side, act=act, bank=[[{"a": bank * first}]], steps={"a": first}, first=first, **more)
+
+
+def _form_of_number(
+    name: str,
+    side: Side,
+    number: str,
+    act: Callable[..., Any],
+    tried: FloatArray,
+    *,
+    step: float,
+    at: Callable[[float], float] = lambda a: a,
+    **more: Any,
+) -> Form:
+    """Return a form of one parameter, the `number`, which is `at(amplitude)`; its bank has those `tried`."""
+    return Form(
+        name,
+        side,
+        act=act,
+        of_amplitude=lambda a, drawn: {number: at(a)},
+        bank=[[{number: float(size)}] for size in tried],
+        steps={number: step},
+        signed=False,
+        **more,
+    )
 
 
 def delayed_values(values: FloatArray, rows: SystemTable, tau: FloatArray) -> FloatArray:
@@ -240,22 +257,18 @@ def _lag_and_delay_forms(true: TrueSystem) -> Iterator[Form]:
         "delay": (lambda y, rows, v: delayed_values(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02),
     }
     for name, (act, least) in acts.items():
-        yield Form(
+        yield _form_of_number(
             name,
             "reading",
-            act=act,
-            of_amplitude=lambda a, drawn: {"tau_s": a},
-            bank=[[{"tau_s": float(tau)}] for tau in gap * np.geomspace(least, 12, 10)],
-            steps={"tau_s": 0.02 * gap},
+            "tau_s",
+            act,
+            gap * np.geomspace(least, 12, 10),
+            step=0.02 * gap,
             first=0.45 * gap,
             limit=15 * gap,
             covariates=("previous",),
-            signed=False,
             order=_LAG,
         )
-
-
-Change = Callable[[FloatArray, SystemTable, Numbers], Any]
 
 
 def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
@@ -265,110 +278,68 @@ def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
     time = true.table.time
     # A clock error is detectable only if the law or the formula uses time.
     if time is not None and (true.kind.law is not None or true.kind.restarts_time):
-        yield _linear_one_parameter_form(
-            "clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time)
-        )
+        scaled = _act_on_column(time, lambda c, rows, v: c * (1 + v["a"]))
+        yield form_of_amplitude("clock_drift", "input", scaled, 1e-3, limit=0.5, covariates=("time", time))
 
 
-def _make_act_on_column(
-    column: str, change: Change
-) -> Callable[[Mapping[str, FloatArray], SystemTable, Numbers], dict[str, Any]]:
+def _act_on_column(column: str, change: Callable[[FloatArray, SystemTable, Numbers], Any]) -> Callable[..., Any]:
     """Return a `Form.act` that replaces one column by `change(column, rows, parameters)`."""
     return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
-
-
-def _linear_one_parameter_form(
-    name: str, column: str, change: Change, first: float, limit: float, covariates: tuple[str, ...]
-) -> Form:
-    return Form(
-        name,
-        "input",
-        act=_make_act_on_column(column, change),
-        bank=[[{"a": first}]],
-        steps={"a": first},
-        first=first,
-        limit=limit,
-        covariates=covariates,
-    )
-
-
-def _nonlinear_one_parameter_form(
-    name: str, number: str, change: Change, column: str, tried: FloatArray, covariates: tuple[str, ...], late: str = ""
-) -> Form:
-    return Form(
-        name,
-        "input",
-        act=_make_act_on_column(column, change),
-        of_amplitude=lambda a, drawn: {number: a},
-        bank=[[{number: float(size)}] for size in tried],
-        steps={number: 0.02 * float(tried[len(tried) // 2])},
-        first=float(tried[len(tried) // 2]),
-        limit=float(tried[-1]),
-        covariates=covariates,
-        signed=False,
-        late=late,
-    )
 
 
 def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
     values, spread = true.table.columns[column], true.sd_of(column)
     low, high = float(values.min()), float(values.max())
-    span, own = high - low, (column, "level")
+    span, own, n_values = high - low, (column, "level"), len(np.unique(values))
     if not span > 0:
         return
-    yield _linear_one_parameter_form(
-        f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own
-    )
-    yield _linear_one_parameter_form(
-        f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own
-    )
-    levels = high - span * np.geomspace(0.004, 0.5, 12)
-    yield Form(
+    offset = _act_on_column(column, lambda c, rows, v: c + v["a"])
+    yield form_of_amplitude(f"input_offset:{column}", "input", offset, 0.01 * spread, limit=5 * span, covariates=own)
+    scaled = _act_on_column(column, lambda c, rows, v: c * (1 + v["a"]))
+    yield form_of_amplitude(f"input_gain:{column}", "input", scaled, 0.01, limit=0.9, covariates=own)
+    yield _form_of_number(
         f"input_saturation:{column}",
         "input",
-        act=_make_act_on_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
-        of_amplitude=lambda a, drawn: {"level": high - a},
-        bank=[[{"level": float(level)}] for level in levels],
-        steps={"level": 0.01 * span},
+        "level",
+        _act_on_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
+        high - span * np.geomspace(0.004, 0.5, 12),
+        at=lambda a: high - a,
+        step=0.01 * span,
         first=0.05 * span,
         limit=0.6 * span,
         covariates=own,
-        signed=False,
     )
+
+    def of_size(name: str, number: str, change: Callable[..., Any], tried: FloatArray, **more: Any) -> Form:
+        middle = float(tried[len(tried) // 2])
+        act = _act_on_column(column, change)
+        sizes: dict[str, Any] = {"first": middle, "limit": float(tried[-1])}
+        return _form_of_number(f"{name}:{column}", "input", number, act, tried, step=0.02 * middle, **sizes, **more)
+
     sizes = span * np.geomspace(1e-4, 0.3, 10)
     if low <= 0.1 * span:
-        yield _nonlinear_one_parameter_form(
-            f"dead_zone:{column}",
-            "width",
-            lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0),
-            column,
-            sizes,
-            own,
-        )
+
+        def narrowed(c: FloatArray, rows: SystemTable, v: Numbers) -> Any:
+            return np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0)
+
+        yield of_size("dead_zone", "width", narrowed, sizes, covariates=own)
     moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
-        yield _nonlinear_one_parameter_form(
-            f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column)
-        )
-    if len(np.unique(values)) > 20:
-        waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
-
-        def column_plus_sine_error(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-            return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
-
+        yield of_size("backlash", "width", behind_gear_play, sizes, covariates=("previous", column))
+    if n_values > 20:
         first = 0.01 * spread
-        bank = [
-            [{**each, "period": 1 / each["period"]} for each in group] for group in wave_bank(first, waves, "period")
-        ]
+        waves = wave_bank(first, np.linspace(0.4, min(n_values / 4, 60), 60) / span, "period")
         yield Form(
             f"periodic_error:{column}",
             "input",
-            act=_make_act_on_column(column, column_plus_sine_error),
+            act=_act_on_column(
+                column, lambda c, rows, v: c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"])
+            ),
             draw=lambda rng: {
-                "period": span / draw_log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
+                "period": span / draw_log_uniform(rng, 1.5, min(n_values / 6, 25)),
                 "phase": float(rng.uniform(0, 2 * np.pi)),
             },
-            bank=bank,
+            bank=[[{**each, "period": 1 / each["period"]} for each in group] for group in waves],
             start_values=start_values_of_wave,
             steps={"a": first, "period": 0.002 * span, "phase": 0.05},
             first=first,
@@ -378,15 +349,11 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
     if true.table.time is not None:
         taus = true.table.median_gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
-        yield _nonlinear_one_parameter_form(
-            f"input_delay:{column}",
-            "tau_s",
-            lambda c, rows, v: delayed_values(c, rows, np.maximum(v["tau_s"], 0.0)),
-            column,
-            taus,
-            ("previous", column),
-            late=column,
-        )
+
+        def delayed(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+            return delayed_values(c, rows, np.maximum(v["tau_s"], 0.0))
+
+        yield of_size("input_delay", "tau_s", delayed, taus, covariates=("previous", column), late=column)
 
 
 def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
@@ -432,108 +399,53 @@ def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
 def varying_parameter_form(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
     """Return the form `name` by which the parameter `target` varies as the modulation `how`, e.g. a step."""
     first = 0.003 * float(np.abs(true.parameters[target]).mean()) / how.reach
-    return Form(
-        name,
-        "parameter",
-        act=how.value_at,
-        of_amplitude=how.of_amplitude,
-        draw=how.draw,
-        bank=how.bank(0.1 * first),
-        start_values=how.start_values,
-        steps=how.steps(first),
-        first=first,
-        limit=200 * first,
-        covariates=how.covariates,
-        target=target,
-        uses=how.uses,
-        breaks=how.breaks,
-    )
+    return how.form(name, "parameter", first, bank=0.1, limit=200, target=target)
 
 
 def rate_term_form(
-    true: TrueSystem,
-    name: str,
-    state: str,
-    push: Callable[[Any, Any, Any], Any],
-    size: float,
-    covariates: tuple[str, ...],
-    uses: tuple[str, ...] = (),
-    shape: str = "",
-    signed: bool = True,
+    true: TrueSystem, name: str, state: str, push: Callable[[Any, Any, Any], Any], size: float, **more: Any
 ) -> Form:
     """Return the form of a term a push(states, now, parameters) in the rate of a state; `size`: push's magnitude."""
     first = 0.01 * true.rms_rate(state) / size
-    return Form(
-        name,
-        "rate",
-        act=lambda s, now, v: v["a"] * push(s, now, v),
-        bank=[[{"a": 0.1 * first}]],
-        steps={"a": first},
-        first=first,
-        limit=300 * first,
-        covariates=covariates,
-        target=state,
-        uses=uses,
-        shape=shape,
-        signed=signed,
-    )
+
+    def act(s: Any, now: Any, v: Numbers) -> Any:
+        return v["a"] * push(s, now, v)
+
+    return form_of_amplitude(name, "rate", act, first, bank=0.1, limit=300 * first, target=state, **more)
 
 
 def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
     """Yield the terms that may be missing from the rate of each state, dry friction and an upper bound included."""
-    if true.kind.law is None:
-        return
-    for state, values in true.states.items():
-        size = float(np.abs(values).max())
-        own = (f"state:{state}", "time")
-        yield rate_term_form(
-            true, f"damping:{state}", state, _make_term_of_state(state, lambda r: -r), size, own, signed=False
+    for state in true.states:
+        yield from _terms_in_rate(true, state)
+        waves, first = sinusoid_in_time(true, _N_FORCING_WAVES), 0.02 * true.rms_rate(state)
+        yield waves.form(
+            f"periodic_forcing:{state}",
+            "rate",
+            first,
+            bank=0.1,
+            limit=100,
+            act=lambda s, now, v, waves=waves: waves.value_at(now, v),
+            target=state,
         )
-        drags = _make_term_of_state(state, lambda r: -np.abs(r) * r)
-        yield rate_term_form(true, f"drag:{state}", state, drags, size**2, own, signed=False)
-        yield rate_term_form(
-            true, f"forcing:{state}", state, _make_term_of_state(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
-        )
-        for other, there in true.states.items():
-            most = float(np.abs(there).max())
-            seen = (f"state:{other}", "time")
-            yield rate_term_form(
-                true, f"cubic:{state}:{other}", state, _make_term_of_state(other, lambda r: -(r**3)), most**3, seen
-            )
-            yield rate_term_form(
-                true, f"quadratic:{state}:{other}", state, _make_term_of_state(other, lambda r: -(r**2)), most**2, seen
-            )
-            if other != state:
-                yield rate_term_form(
-                    true, f"coupling:{state}:{other}", state, _make_term_of_state(other, lambda r: -r), most, seen
-                )
-        yield _periodic_forcing_form(true, state)
         yield from _friction_and_bound_forms(true, state)
 
 
-def _make_term_of_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
-    """Return a `push` for `rate_term_form` that is a function `term` of one state."""
-    return lambda s, now, v: term(s[state])
+def _terms_in_rate(true: TrueSystem, state: str) -> Iterator[Form]:
+    def term(name: str, of: str, change: Callable[[Any], Any], size: float, seen: tuple[str, ...], **more: Any) -> Form:
+        """Return a term that is a function `change` of the state `of`."""
+        return rate_term_form(true, name, state, lambda s, now, v: change(s[of]), size, covariates=seen, **more)
 
-
-def _periodic_forcing_form(true: TrueSystem, state: str) -> Form:
-    how = sinusoid_in_time(true, _N_FORCING_WAVES)
-    first = 0.02 * true.rms_rate(state)
-    return Form(
-        f"periodic_forcing:{state}",
-        "rate",
-        act=lambda s, now, v: how.value_at(now, v),
-        of_amplitude=how.of_amplitude,
-        draw=how.draw,
-        bank=how.bank(0.1 * first),
-        start_values=how.start_values,
-        steps=how.steps(first),
-        first=first,
-        limit=100 * first,
-        covariates=how.covariates,
-        signed=False,
-        target=state,
-    )
+    size, own = float(np.abs(true.states[state]).max()), (f"state:{state}", "time")
+    yield term(f"damping:{state}", state, lambda r: -r, size, own, signed=False)
+    yield term(f"drag:{state}", state, lambda r: -np.abs(r) * r, size**2, own, signed=False)
+    yield term(f"forcing:{state}", state, lambda r: 1.0 + 0.0 * r, 1.0, ("time", *own))
+    for other, there in true.states.items():
+        most, seen = float(np.abs(there).max()), (f"state:{other}", "time")
+        yield term(f"cubic:{state}:{other}", other, lambda r: -(r**3), most**3, seen)
+        yield term(f"quadratic:{state}:{other}", other, lambda r: -(r**2), most**2, seen)
+        if other != state:
+            yield term(f"coupling:{state}:{other}", other, lambda r: -r, most, seen)
 
 
 def _friction_and_bound_forms(true: TrueSystem, state: str) -> Iterator[Form]:
@@ -554,18 +466,17 @@ def _friction_and_bound_forms(true: TrueSystem, state: str) -> Iterator[Form]:
         sticks=True,
     )
     low, high = float(values.min()), float(values.max())
-    levels = high - (high - low) * np.array([0.01, 0.04, 0.12, 0.3])
-    yield Form(
+    yield _form_of_number(
         f"limit:{state}",
         "rate",
-        act=lambda s, now, v: 0.0,
-        of_amplitude=lambda a, drawn: {"level": high - a},
-        bank=[[{"level": float(level)}] for level in levels],
-        steps={"level": 0.01 * (high - low)},
+        "level",
+        lambda s, now, v: 0.0,
+        high - (high - low) * np.array([0.01, 0.04, 0.12, 0.3]),
+        at=lambda a: high - a,
+        step=0.01 * (high - low),
         first=0.05 * (high - low),
         limit=0.6 * (high - low),
         covariates=(f"state:{state}", "level"),
-        signed=False,
         target=state,
         stops=True,
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from probewise.proof.systems.form import (
     TrueSystem,
     draw_log_uniform,
 )
-from probewise.proof.systems.forms import OFFSET, rate_term_form
+from probewise.proof.systems.forms import OFFSET, form_of_amplitude, rate_term_form
 from probewise.proof.systems.kind import SystemTable
 
 OUT_OF_VOCABULARY = (
@@ -56,27 +57,16 @@ def _form_added_to_reading(
     true: TrueSystem,
     name: str,
     shape: str,
-    addition: object,
+    addition: Callable[..., Any],
     covariates: tuple[str, ...],
     drawn: dict[str, float] | None = None,
 ) -> Form:
     def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        return np.asarray(y + v["a"] * addition(y, rows, v))  # type: ignore[operator]
+        return np.asarray(y + v["a"] * addition(y, rows, v))
 
     sd = true.noise_sd
-    return Form(
-        f"strange_{name}",
-        "reading",
-        act=act,
-        draw=lambda rng: dict(drawn or {}),
-        bank=[[{"a": sd}]],
-        steps={"a": sd},
-        first=sd,
-        limit=1e4 * sd,
-        covariates=covariates,
-        order=OFFSET,
-        shape=shape,
-    )
+    more: dict[str, Any] = {"draw": lambda rng: dict(drawn or {}), "order": OFFSET, "shape": shape}
+    return form_of_amplitude(f"strange_{name}", "reading", act, sd, limit=1e4 * sd, covariates=covariates, **more)
 
 
 def _product_form(true: TrueSystem, one: str, other: str) -> Form:
@@ -190,7 +180,7 @@ def _one_sided_spring_form(true: TrueSystem, state: str) -> Form:
         state,
         lambda s, now, v: -np.maximum(s[state] - at, 0.0),
         size,
-        (f"state:{state}", "level", "time"),
+        covariates=(f"state:{state}", "level", "time"),
         shape="-a max(S - s, 0) in the rate of S",
     )
 
@@ -207,7 +197,7 @@ def _leak_form(true: TrueSystem, state: str) -> Form:
         state,
         leak_rate,
         20.0,
-        (f"state:{state}", "level", "time"),
+        covariates=(f"state:{state}", "level", "time"),
         shape="-a (exp(S / s) - 1) in the rate of S",
     )
 
@@ -220,7 +210,7 @@ def _column_times_state_form(true: TrueSystem, state: str, column: str) -> Form:
         state,
         lambda s, now, v: -(now.u[column] - middle) / spread * s[state] ** 2 / most**2,
         1.0,
-        (column, f"state:{state}", "time", "run", "level"),
+        covariates=(column, f"state:{state}", "time", "run", "level"),
         uses=(column,),
         shape="-a (C - mean C) S^2 in the rate of S",
     )

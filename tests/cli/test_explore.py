@@ -292,3 +292,15 @@ def test_what_does_not_go_with_a_method_is_refused_before_anything_is_written(
     assert main(["explore", "--sensor", str(sensor_file), "--out", str(out), *options]) == 2
     assert named in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships(tmp_path, capsys):
+    out = tmp_path / "out"
+    given = ["explore", "--out", str(out), "--trust", "1", "--quiet", "--max-readings"]
+    assert main([*given, "2"]) == 0
+    assert json.loads((out / "journal.jsonl").read_text().splitlines()[0])["sensor_file"] == "shipped_sensor.json"
+    assert main([*given, "3", "--resume"]) == 0
+    assert json.loads((out / "result.json").read_text())["readings"] == 3
+    assert main(["explore", "--out", str(tmp_path / "other"), "--arm", "nxt:none"]) == 2
+    assert "--sensor is 'none'" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

@@ -19,6 +19,9 @@ DEFAULT_SEED = 2013  # year of the paper; printed with every run
 MOST = 100_000
 """Largest count that an option takes unless it says otherwise: of more readings, runs or live points the time, days at
 least, and the memory have no bound."""
+SHIPPED_RECORDINGS = {
+    name: Path(__file__).parents[1] / "data" / f"{name}.csv" for name in ("paper", "concealed")
+}  # as `recordings.shipped` has them, which takes NumPy to import
 MOST_BATCH = 100  # readings chosen at a time, each given those before it
 
 
@@ -55,6 +58,14 @@ class OneLineParser(argparse.ArgumentParser):
             )
 
 
+def parse_path(text: str) -> Path:
+    """Parse a path, for argparse; the empty string, such as an unset shell variable, and NUL are refused."""
+    if not text or "\0" in text:
+        kind = "a text with a NUL" if text else "an empty text"
+        raise argparse.ArgumentTypeError(f"{kind} names no file or directory")
+    return Path(text)
+
+
 def add_seed_and_quiet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed",
@@ -78,10 +89,16 @@ def add_count_option(
 
 
 def add_path(
-    parser: argparse._ActionsContainer, name: str, metavar: str, about: str, *, required: bool = False
+    parser: argparse._ActionsContainer,
+    name: str,
+    metavar: str,
+    about: str,
+    *,
+    required: bool = False,
+    parse: Callable[[str], Path] = parse_path,
 ) -> None:
     """Add an argument or option that takes the name of a file or directory; an option may be `required`."""
-    action = parser.add_argument(name, type=parse_path, metavar=metavar, help=about)
+    action = parser.add_argument(name, type=parse, metavar=metavar, help=about)
     action.required |= required
 
 
@@ -91,12 +108,10 @@ def add_out_directory(parser: argparse.ArgumentParser) -> None:
     add_path(parser, "--out", "DIR", about, required=True)
 
 
-def parse_path(text: str) -> Path:
-    """Parse a path, for argparse; the empty string, such as an unset shell variable, and NUL are refused."""
-    if not text or "\0" in text:
-        kind = "a text with a NUL" if text else "an empty text"
-        raise argparse.ArgumentTypeError(f"{kind} names no file or directory")
-    return Path(text)
+def parse_recording(text: str) -> Path:
+    """Parse the path of a recording, or the name of one that ships, unless a file has that name."""
+    path = parse_path(text)
+    return SHIPPED_RECORDINGS.get(text, path) if not path.exists() else path
 
 
 def parse_positive_int(text: str, *, most: int = MOST) -> int:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probewise._progress import progress_shown
-from probewise.calibration import FittedSensor, read_sensor
+from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli._arm import ArmName, parse_arm, read_or_shipped_geometry
 from probewise.cli._bench import (
     InstrumentWithCallbacks,
@@ -26,7 +26,7 @@ from probewise.cli._bench import (
     warn_and_confirm_lowering,
     warn_if_place_sd_large,
 )
-from probewise.cli._common import message_to_resume, parse_numbers, print_result
+from probewise.cli._common import DEFAULT_SEED, message_to_resume, parse_numbers, print_result
 from probewise.cli._output import Drawings, StagedFiles, checked_output_directory, tables_and_descriptions
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, ParameterError, did_you_mean
@@ -54,10 +54,11 @@ from probewise.experiment import (
     world_like,
 )
 from probewise.experiment import explore as explore_step_by_step
-from probewise.recordings import read_recording, write_bytes_atomically
+from probewise.recordings import read_recording, shipped, write_bytes_atomically
 from probewise.report import exploration as report
 from probewise.report.pictures import animated_gif
 from probewise.scene import SHAPES, Card, Field
+from probewise.verbs import calibrate
 
 if TYPE_CHECKING:
     from probewise._arrays import FloatArray
@@ -99,7 +100,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
         raise ParameterError("--geometry", str(arguments.geometry), "none with FILE.py, which defines its own reach")
     geometry = read_or_shipped_geometry(arguments) if chosen.is_lego or arguments.geometry is not None else None
     field = _checked_field(arguments.field, geometry)
-    sensor = read_sensor(arguments.sensor)
+    sensor = _shipped_sensor(arguments, chosen) if arguments.sensor is None else read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
     streams = RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
@@ -140,6 +141,15 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
     return Inputs(
         chosen, geometry, sensor, field, cards, experiment, arguments.model, other, other_model, streams=streams
     )
+
+
+def _shipped_sensor(arguments: argparse.Namespace, chosen: ArmName) -> FittedSensor:
+    """Calibrate the sensor of the recording that ships, and say so; ParameterError for a real arm."""
+    if chosen.is_real:
+        raise ParameterError("--sensor", "none", "the sensor model of this arm, as `probewise calibrate` writes it")
+    print_result("no --sensor: that of the recording that ships is calibrated", quiet=arguments.quiet)
+    rng = np.random.default_rng(DEFAULT_SEED)
+    return calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False).sensor
 
 
 def _refuse_settings_that_the_arm_lacks(arguments: argparse.Namespace, geometry: Geometry | None) -> None:
@@ -387,6 +397,10 @@ def explore(arguments: argparse.Namespace) -> int:
     before = _journal_to_resume(journal, resume=arguments.resume)
     site = _open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
     print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
+    if arguments.sensor is None:
+        arguments.sensor = out / "shipped_sensor.json"
+        out.mkdir(parents=True, exist_ok=True)
+        write_sensor(inputs.sensor, arguments.sensor)
     warn_and_confirm_lowering(inputs.arm, site.arm, inputs.geometry)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
         warn_if_place_sd_large(inputs.geometry, inputs.experiment.stop_sd_mm)

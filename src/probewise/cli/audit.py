@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise.cli._arm import SHIPPED
 from probewise.cli._common import add_path, add_quiet, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import Drawings, checked_output_directory, inputs_and_filled_in_plan
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise audit`."""
-    add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
+    about = f"plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship; with --simulator any table"
+    add_path(parser, "plan", "PLAN.csv", about)
     add_path(parser, "--sensor", "S.json", "the calibrated sensor (default: a typical one)")
     add_simulator(parser)
     add_path(
@@ -35,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise import diagnosis
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
+    from probewise.cli._bench import read_or_shipped_plan
     from probewise.diagnosis import CURE_PLAN, audit_json
     from probewise.recordings import read_plan, write_plan
     from probewise.report import audit as report
@@ -50,7 +53,9 @@ def run(arguments: argparse.Namespace) -> int:
             progress("building the effects")
             audit = diagnosis.audit_system(simulator, table)
         else:
-            plan = read_plan(arguments.plan, progress=progress)
+            named = str(arguments.plan)
+            is_shipped = named in SHIPPED and not arguments.plan.exists()
+            plan = read_or_shipped_plan(named) if is_shipped else read_plan(arguments.plan, progress=progress)
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
             audit = diagnosis.audit_plan(plan, sensor=sensor, progress=progress)
 

@@ -11,6 +11,7 @@ from probewise.cli._common import (
     add_path,
     add_seed_and_quiet,
     parse_positive_int,
+    parse_recording,
 )
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import Drawings, checked_output_directory, tables_and_descriptions
@@ -20,7 +21,8 @@ from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise calibrate`."""
-    add_path(parser, "recording", "REC.csv", "recording, its JSON beside it")
+    about = "recording, its JSON beside it; or paper or concealed, which ship"
+    add_path(parser, "recording", "REC.csv", about, parse=parse_recording)
     add_out_directory(parser)
     parser.add_argument(
         "--orders",

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from probewise.cli._common import add_out_directory, add_path, add_seed_and_quiet, parse_path
+from probewise.cli._common import add_out_directory, add_path, add_seed_and_quiet, parse_recording
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
 from probewise.cli._output import Drawings, StagedFiles, checked_output_directory, inputs_and_filled_in_plan
 from probewise.cli._simulator import add_simulator, read_joined_table, refuse_sensor
@@ -31,11 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise diagnose`."""
     parser.add_argument(
         "recordings",
-        type=parse_path,
+        type=parse_recording,
         nargs="+",
         metavar="REC.csv",
-        help="recording, its JSON beside it, or the journal.jsonl of an explore run; with --simulator any table; "
-        "several are diagnosed together",
+        help="recording, its JSON beside it, or paper or concealed, which ship, or the journal.jsonl of an explore "
+        "run; with --simulator any table; several are diagnosed together",
     )
     add_path(
         parser,

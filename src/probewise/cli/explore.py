@@ -21,7 +21,9 @@ from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, SHAPES, UTILITY
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise explore`."""
-    add_path(parser, "--sensor", "S.json", "sensor model", required=True)
+    add_path(
+        parser, "--sensor", "S.json", "sensor model (default in a simulated run: that of the recording that ships)"
+    )
     add_out_directory(parser)
     parser.add_argument("--model", choices=("ssf", "naive"), default=MODEL, help="the robot's sensor model")
     parser.add_argument(

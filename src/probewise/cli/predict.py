@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import add_path, add_seed_and_quiet, print_result
+from probewise.cli._common import add_path, add_seed_and_quiet, parse_recording, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import checked_output_file, tables_and_descriptions
 from probewise.cli._simulator import add_simulator
@@ -19,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json, calibrated.json or "
         "fitted.json",
     )
-    add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
+    about = "plan or recording, its JSON beside it; or paper or concealed, which ship; with --simulator any table"
+    add_path(parser, "plan", "PLAN.csv", about, parse=parse_recording)
     add_path(parser, "--out", "P.csv", "where the prediction goes", required=True)
     add_simulator(parser)
     add_seed_and_quiet(parser)

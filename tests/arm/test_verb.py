@@ -71,7 +71,28 @@ def test_check_of_a_simulated_arm_is_refused_before_anything_is_drawn(tmp_path, 
 def test_an_arm_that_reaches_no_place_of_its_field_is_no_arm(tmp_path, capsys):
     path = tmp_path / "far.toml"
     path.write_text(shipped_geometry_path().read_text().replace("y_mm = 580", "y_mm = 5800"))
-    assert "nowhere on the field" in said(capsys, "arm", "check", "--geometry", path, status=2).err
+    refused = said(capsys, "arm", "check", "--geometry", path, status=2)
+    assert "nowhere on the field" in refused.err
+    assert refused.out == ""
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--out", ["arm", "check", "--geometry"]),
+        ("--drawing", ["arm", "check", "--geometry"]),
+        ("--out", ["arm", "fit-geometry", "--marks", "marks.csv", "--geometry"]),
+        ("--marks", ["arm", "fit-geometry", "--arm", "nxt:none", "--out", "new.toml", "--geometry"]),
+        ("--log", ["emulate-nxt", "--geometry"]),
+        ("--log", ["emulate-nxt", "--sensor"]),
+    ],
+)
+def test_a_file_that_is_read_is_not_written(option, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "own"
+    path.write_text(shipped_geometry_path().read_text())
+    assert f"{option} is" in said(capsys, *words, path, option, path, status=2).err
+    assert path.read_text() == shipped_geometry_path().read_text()
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task[0])

@@ -8,9 +8,9 @@ from heater import FILE, runs
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from probewise._signals import Stopped
+from probewise._writing import Drawings, NotDrawnError
 from probewise.cli import demo, main
-from probewise.cli._output import Drawings, NotDrawnError
-from probewise.cli._stopping import Stopped
 from probewise.report.html import figure
 from probewise.systems import run_table_csv
 
@@ -22,14 +22,15 @@ COMMANDS = {
     "audit data.csv --simulator heater.py": ("audit.json", "report.html"),
     "fit data.csv --simulator heater.py": ("fit.json", "fitted.json", "samples.csv", "report.html"),
     "explore --sensor sensor.json --truth 500,250,90 --max-readings 2 --live": (
-        *("journal.jsonl", "result.json", "samples.csv", "sensor.json"),
+        *("journal.jsonl", "result.json", "samples.csv", "sensor.json", "live.html", "report.html"),
     ),
-    "study --circles 2 --max-readings 2 --model naive --workers 1": ("trials.jsonl", "table.csv"),
+    "study --circles 2 --max-readings 2 --model naive --workers 1": ("trials.jsonl", "table.csv", "report.html"),
     "study --concealed --circles 1 --clean 1 --size gross --max-readings 2 --workers 1": (
         "concealed.jsonl",
         "concealed.csv",
+        "report.html",
     ),
-    "challenge --cases 1 --workers 1": ("cases.jsonl", "table.csv"),
+    "challenge --cases 1 --workers 1": ("cases.jsonl", "table.csv", "report.html"),
     "calibrate small.csv --orders 1 --live 16": ("sensor.json", "report.html"),
     "diagnose small.csv": DIAGNOSIS,
     "diagnose data.csv --simulator heater.py": (

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from heater import fitted
 
+from probewise._writing import staged_output
 from probewise.cli import main
-from probewise.cli._output import staged_output
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_bytes_atomically, write_recording
 

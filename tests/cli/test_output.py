@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from probewise._writing import staged_output
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.cli._output import holds_readings, staged_output
+from probewise.cli._common import holds_readings
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_recording, write_text_atomically
 

@@ -10,12 +10,19 @@ import time
 import numpy as np
 import pytest
 
-from probewise._signals import ENDING, SAME_S, defer_signals
+from probewise._signals import (
+    ENDING,
+    SAME_S,
+    Stopped,
+    defer_signals,
+    raise_if_stopped,
+    reporting_what_is_kept,
+    stoppable,
+)
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.cli import _stopping, main
+from probewise.cli import main
 from probewise.cli._explore import remove_earlier_results
-from probewise.cli._stopping import Stopped, raise_if_stopped, reporting_what_is_kept, stoppable
 from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
@@ -48,7 +55,7 @@ def test_a_signal_that_is_ignored_stays_ignored():
 
 def test_signals_within_a_second_are_one_request_and_a_later_one_forces(monkeypatch):
     now_s = [0.0]
-    monkeypatch.setattr(_stopping.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     with stoppable():
         with pytest.raises(Stopped):
             signal.raise_signal(signal.SIGTERM)

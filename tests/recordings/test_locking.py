@@ -13,7 +13,7 @@ from probewise.recordings import hold_lock, write_bytes_atomically
 
 HOLD = """
 import sys, time
-from probewise.recordings.locking import hold_lock
+from probewise._writing import hold_lock
 with hold_lock(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)

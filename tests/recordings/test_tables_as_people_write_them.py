@@ -105,7 +105,9 @@ def test_numbers_are_read_as_people_write_them(tmp_path, cells, expected):
     np.testing.assert_array_equal(read_run_table(path, time=None, run=None).columns["y"], expected)
 
 
-@pytest.mark.parametrize("cells", [["1 V", "5 mV"], ["OL", "2"], ["0x1F", "2"], ["1.5", "2,5"], ["1_000", "2"]])
+@pytest.mark.parametrize(
+    "cells", [["1 V", "5 mV"], ["2.0D+01", "3.0D+01"], ["OL", "2"], ["0x1F", "2"], ["1.5", "2,5"], ["1_000", "2"]]
+)
 def test_cells_that_are_no_numbers_of_one_kind_stay_texts(tmp_path, cells):
     path = put(tmp_path, "x;y\n" + "".join(f"{k};{cell}\n" for k, cell in enumerate(cells)))
     assert read_run_table(path, time=None, run=None).columns["y"].tolist() == cells

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, floats
+from probewise._writing import write_text_atomically
 from probewise.arm.geometry import (
     FITTED,
     JOINTS,
@@ -26,7 +27,6 @@ from probewise.arm.geometry import (
     places_at_parameters,
 )
 from probewise.errors import ParameterError, ProbewiseError, ReachError, ShapeError
-from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.table import csv_text, number_text, read_table
 
 LEAST_MARKS = 5

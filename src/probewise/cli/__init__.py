@@ -21,9 +21,9 @@ import warnings
 from collections.abc import Mapping, Sequence
 from types import ModuleType
 
+from probewise._signals import Stopped, stoppable
+from probewise._writing import NotDrawnError
 from probewise.cli._common import OneLineParser, print_complaint, print_warning
-from probewise.cli._output import NotDrawnError
-from probewise.cli._stopping import Stopped, stoppable
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]

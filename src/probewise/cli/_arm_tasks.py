@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from probewise._writing import checked_output_file
 from probewise.arm import (
     DryRun,
     Geometry,
@@ -35,7 +36,6 @@ from probewise.cli._bench import (
     warn_if_clearance_doubtful,
 )
 from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_result, print_warning
-from probewise.cli._output import checked_output_file
 from probewise.errors import LinkError, ParameterError
 from probewise.recordings import write_bytes_atomically
 
@@ -132,12 +132,15 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
     def say(text: str) -> None:
         print_result(text, quiet=arguments.quiet)
 
-    out = None if arguments.out is None else checked_output_file(arguments.out)
-    drawing = None if arguments.drawing is None else checked_output_file(arguments.drawing)
+    out, drawing, own = arguments.out, arguments.drawing, arguments.geometry
+    out = out and checked_output_file(out, own)
+    drawing = drawing and checked_output_file(drawing, own, option="--drawing")
     port = None if arguments.arm is None else nxt_port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
     reached = geometry.contains(places)
+    if not reached.any():
+        raise ParameterError("reach", "nowhere on the field", "links, heights and limits that reach the field")
     say(f"reach        {geometry.sentence()}")
     say(f"field        {reached.mean():.1%} of it within reach")
     for name, joint in zip(JOINTS, geometry.joints, strict=True):
@@ -153,8 +156,6 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
     else:
         known = f"fitted to {geometry.accuracy.marks} marks; by 2 sds the sensor may hang"
     say(f"height       reads {geometry.read_height_mm:g} mm up; {known} {geometry.max_height_error_mm:.1f} mm lower")
-    if not reached.any():
-        raise ParameterError("reach", "nowhere on the field", "links, heights and limits that reach the field")
     if out is not None:
         standing = np.where(reached, geometry.orientation_rad(places), np.nan).reshape(y_mm.size, x_mm.size)
         write_bytes_atomically(out, png(reach_map(standing, x_mm, y_mm, axis_mm=geometry.axis_mm)))

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from tqdm import tqdm
 
+from probewise._signals import raise_if_stopped
 from probewise.arm import (
     Geometry,
     Instrument,
@@ -37,7 +38,6 @@ from probewise.cli._common import (
     print_warning,
     write_to_terminal,
 )
-from probewise.cli._stopping import raise_if_stopped
 from probewise.emulator import (
     EmulatedBench,
     SensorPose,

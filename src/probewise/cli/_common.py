@@ -11,9 +11,12 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
-from probewise.errors import ProbewiseError, did_you_mean, printable, shortened, shown
+from probewise.errors import FileError, ProbewiseError, did_you_mean, printable, shortened, shown
+
+if TYPE_CHECKING:
+    from probewise._writing import Drawings
 
 DEFAULT_SEED = 2013  # year of the paper; printed with every run
 MOST = 100_000
@@ -190,3 +193,35 @@ def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespa
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
     count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"
     return f"{path} keeps {count}; go on with: {command}"
+
+
+def finish(drawings: Drawings, *lines: str, quiet: bool) -> int:
+    """Print lines unless `quiet`; return the exit status, 0. Raises NotDrawnError if something was not drawn."""
+    for line in lines:
+        print_result(line, quiet=quiet)
+    drawings.raise_if_any_failed()
+    return 0
+
+
+def tables_and_descriptions(tables: Sequence[Path]) -> list[Path]:
+    """Return each file of a table followed by its description, the JSON beside it."""
+    named = [table for table in tables if table.name]  # not "." and "/"
+    return [path for table in named for path in (table, table.with_suffix(".json"))]
+
+
+def inputs_and_filled_in_plan(inputs: Sequence[Path], plan: Path, column: str = "reading") -> list[Path]:
+    """List files that results must not replace: inputs, and an earlier advised plan with readings in a column."""
+    return tables_and_descriptions([*inputs, *([plan] if holds_readings(plan, column) else [])])
+
+
+def holds_readings(table: Path, column: str) -> bool:
+    """Return whether a table has readings in this column, or cannot be read, so that it must not be replaced."""
+    from probewise.recordings.table import read_table  # imported here, since the help does not need it
+
+    if not table.is_file():  # a named pipe would be waited for
+        return False
+    try:
+        rows = read_table(table, wanted=(column,))
+    except FileError:
+        return True
+    return column in rows.columns and any(rows.cells(column))

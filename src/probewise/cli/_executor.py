@@ -10,8 +10,8 @@ from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 
+from probewise._signals import reporting_what_is_kept
 from probewise.cli._common import message_to_resume, parse_positive_int
-from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError
 from probewise.progress import Progress
 

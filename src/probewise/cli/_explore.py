@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probewise._progress import progress_shown
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli._arm import ArmName, parse_arm, read_or_shipped_geometry
 from probewise.cli._bench import (
@@ -26,9 +28,14 @@ from probewise.cli._bench import (
     warn_and_confirm_lowering,
     warn_if_place_sd_large,
 )
-from probewise.cli._common import DEFAULT_SEED, message_to_resume, parse_numbers, print_result
-from probewise.cli._output import Drawings, StagedFiles, checked_output_directory, tables_and_descriptions
-from probewise.cli._stopping import reporting_what_is_kept
+from probewise.cli._common import (
+    DEFAULT_SEED,
+    finish,
+    message_to_resume,
+    parse_numbers,
+    print_result,
+    tables_and_descriptions,
+)
 from probewise.errors import FileError, ParameterError, did_you_mean
 from probewise.experiment import (
     CLEAN,
@@ -331,7 +338,9 @@ class Pictures:
 
     def _live_page(self, step: Step) -> bytes:
         trust = self.inputs.experiment.trust
-        page = report.live_page_html(step, self.frames[-1], earlier=self.steps[:-1], trust=trust)
+        page = report.live_page_html(
+            step, self.frames[-1], earlier=self.steps[:-1], trust=trust, draw=self.drawings.draw
+        )
         return page.encode("utf-8", "backslashreplace")
 
     def _draw_frame(self, step: Step, shadow: Step | None) -> bytes:
@@ -372,6 +381,7 @@ class Pictures:
                 truth=known,
                 beside=beside,
                 unit=self.inputs.sensor.instrumentation.unit,
+                draw=self.drawings.draw,
             ),
             inputs=self.files,
             progress=progress,
@@ -457,7 +467,7 @@ def explore(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept_message, results=True), progress_shown(quiet=arguments.quiet) as progress:
         renamed = pictures.write_results(result, seed=arguments.seed, known=site.known, progress=progress)
     lines = _closing_lines(result, inputs, site, journal)
-    return pictures.drawings.finish(*lines, *renamed, f"written to {out}", quiet=arguments.quiet)
+    return finish(pictures.drawings, *lines, *renamed, f"written to {out}", quiet=arguments.quiet)
 
 
 def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journal: Path) -> Iterator[str]:

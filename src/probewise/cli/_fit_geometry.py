@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import Geometry, LegoArm, read_geometry, shipped_geometry_path
 from probewise.arm.fitting import TouchedMark, fit_geometry, read_turns_and_places, spread_mark_places, write_marks
 from probewise.arm.geometry_file import text_with_fitted_values
@@ -17,11 +19,8 @@ from probewise.cli._arm import parse_arm
 from probewise.cli._arm_tasks import open_instrument
 from probewise.cli._bench import MarkQuestion, prompter, prompter_for_answer
 from probewise.cli._common import CommandError, message_to_resume, print_result
-from probewise.cli._output import checked_output_file
-from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, ParameterError, ReachError
 from probewise.recordings import write_text_atomically
-from probewise.recordings.atomic import is_device_or_pipe
 
 STEP_MM = 5.0
 _MOST_MM = 60.0  # largest step
@@ -35,7 +34,7 @@ _MOVES = {"x": (1, 0, 0), "y": (0, 1, 0), "up": (0, 0, 1), "down": (0, 0, -1)}
 def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> None:
     """Bring the sensor to marks, unless there is no --arm; fit the geometry to them, and write it."""
     source = arguments.geometry or shipped_geometry_path()
-    out = checked_output_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
+    out = checked_output_file(arguments.out, arguments.geometry)
     if arguments.dry_run:
         raise ParameterError("--dry-run", True, "none with fit-geometry: a person directs its moves")
     if arguments.arm is None and arguments.marks is None:
@@ -46,7 +45,7 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
         raise ParameterError("--out", str(out), "a file, beside which the marks are kept; or name them with --marks")
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
     if arguments.arm is not None:
-        _touch_and_save_marks(arguments, geometry, checked_output_file(kept))
+        _touch_and_save_marks(arguments, geometry, checked_output_file(kept, arguments.geometry, option="--marks"))
     turned, marks = read_turns_and_places(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
     print_result(fitted.summary(), quiet=arguments.quiet)

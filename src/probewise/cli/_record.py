@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probewise._progress import progress_shown
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import (
     Geometry,
     LegoArm,
@@ -46,12 +48,9 @@ from probewise.cli._bench import (
     without_measured_covariates,
 )
 from probewise.cli._common import message_to_resume, print_result, print_warning
-from probewise.cli._output import checked_output_file
-from probewise.cli._stopping import reporting_what_is_kept
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
-from probewise.recordings.atomic import is_device_or_pipe
 from probewise.recordings.patterns import have_same_albedo
 from probewise.scene import region_of
 

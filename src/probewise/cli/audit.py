@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._arm import SHIPPED
-from probewise.cli._common import add_path, add_quiet, print_result
+from probewise.cli._common import add_path, add_quiet, finish, inputs_and_filled_in_plan, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import Drawings, checked_output_directory, inputs_and_filled_in_plan
 from probewise.cli._simulator import add_simulator, refuse_sensor
 
 if TYPE_CHECKING:
-    from probewise.cli._output import StagedFiles
+    from probewise._writing import StagedFiles
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
     lines = [audit.summary(), *(f"note: {note}" for note in getattr(audit.plan, "notes", ())), *renamed]
     if drawings is not None:
-        return drawings.finish(*lines, f"written to {drawings.out}", quiet=arguments.quiet)
+        return finish(drawings, *lines, f"written to {drawings.out}", quiet=arguments.quiet)
     for line in lines:
         print_result(line, quiet=arguments.quiet)
     return 0

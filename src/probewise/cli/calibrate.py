@@ -5,16 +5,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import (
     add_count_option,
     add_out_directory,
     add_path,
     add_seed_and_quiet,
+    finish,
     parse_positive_int,
     parse_recording,
+    tables_and_descriptions,
 )
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import Drawings, checked_output_directory, tables_and_descriptions
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
@@ -90,7 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
             inputs=tables_and_descriptions([arguments.recording]),
             progress=progress,
         )
-    return drawings.finish(
+    return finish(
+        drawings,
         *(f"note: {note}" for note in recording.notes),
         *notes,
         f"{result.sensor.summary()}\nseed {arguments.seed}; written to {drawings.out}",

@@ -6,16 +6,16 @@ import argparse
 import shlex
 from functools import partial
 
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import (
     CommandError,
     add_count_option,
     add_out_directory,
     add_seed_and_quiet,
-    print_result,
+    finish,
 )
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
-from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
-from probewise.cli._stopping import reporting_what_is_kept
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,14 +81,11 @@ def run(arguments: argparse.Namespace) -> int:
     )
     drawings = Drawings(out)
     with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
-        with staged_output(out, outdated=(PAGE,)) as stage:
-            stage.write("table.csv", report.target_table_csv(rows))
-        drawings.write_report(
+        drawings.write_results(
+            lambda stage: stage.write("table.csv", report.target_table_csv(rows)),
             {},
-            lambda _: report.page_html(results, rows, command=command, systems=arguments.systems),
+            lambda _: report.page_html(results, rows, command=command, systems=arguments.systems, draw=drawings.draw),
             progress=progress,
         )
-    print_result(report.summary_sentence(rows, len(results)), quiet=arguments.quiet)
-    print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
-    drawings.raise_if_any_failed()
-    return 0
+    summary = report.summary_sentence(rows, len(results))
+    return finish(drawings, summary, f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)

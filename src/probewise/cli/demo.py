@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
 from probewise.cli._common import add_out_directory, add_seed_and_quiet, print_result
-from probewise.cli._output import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -7,9 +7,16 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from probewise.cli._common import add_out_directory, add_path, add_seed_and_quiet, parse_recording
+from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise.cli._common import (
+    add_out_directory,
+    add_path,
+    add_seed_and_quiet,
+    finish,
+    inputs_and_filled_in_plan,
+    parse_recording,
+)
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
-from probewise.cli._output import Drawings, StagedFiles, checked_output_directory, inputs_and_filled_in_plan
 from probewise.cli._simulator import add_simulator, read_joined_table, refuse_sensor
 from probewise.errors import ParameterError
 
@@ -149,7 +156,7 @@ def _diagnose_simulator(arguments: argparse.Namespace) -> int:
 
 def _finish(arguments: argparse.Namespace, drawings: Drawings, diagnosis: Diagnosis, notes: Sequence[str]) -> int:
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
-    return drawings.finish(*notes, summary, quiet=arguments.quiet)
+    return finish(drawings, *notes, summary, quiet=arguments.quiet)
 
 
 def _read_inputs(

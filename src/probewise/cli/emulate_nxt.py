@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import checked_output_file
 from probewise.cli._arm import SCENE, add_geometry
 from probewise.cli._common import add_path, add_seed_and_quiet, print_result
-from probewise.cli._output import checked_output_file
-from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -69,11 +69,12 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.emulator import Faults, parse_scene, read_geometry, set_up_bench, shipped_geometry_path
     from probewise.emulator.pty import Terminal, serve
 
+    log = arguments.log and checked_output_file(arguments.log, arguments.sensor, arguments.geometry, option="--log")
     geometry = read_geometry(shipped_geometry_path() if arguments.geometry is None else arguments.geometry)
     surface = parse_scene(arguments.scene)
     faults = Faults.parse(arguments.fault)
     world, _ = world_and_instrumentation(arguments.sensor)
-    with _telegram_log(arguments.log) as trace, Terminal(arguments.link) as terminal:
+    with _telegram_log(log) as trace, Terminal(arguments.link) as terminal:
         bench = set_up_bench(
             geometry,
             world,
@@ -151,7 +152,7 @@ def _telegram_log(path: Path | None) -> Iterator[Trace]:
         yield ignore_trace
         return
     began_s = time.monotonic()
-    with checked_output_file(path).open("w", encoding="utf-8", buffering=1) as file:
+    with path.open("w", encoding="utf-8", buffering=1) as file:
 
         def write_line(now_s: float, event: str, text: str) -> None:
             file.write(f"{now_s - began_s:10.3f} {event} {text}\n")

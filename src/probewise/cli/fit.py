@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import CommandError, add_out_directory, add_seed_and_quiet, parse_path
-from probewise.cli._output import Drawings, checked_output_directory
+from probewise._writing import Drawings, checked_output_directory
+from probewise.cli._common import CommandError, add_out_directory, add_seed_and_quiet, finish, parse_path
 from probewise.cli._simulator import add_simulator, read_joined_table
 
 if TYPE_CHECKING:
-    from probewise.cli._output import StagedFiles
+    from probewise._writing import StagedFiles
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
             inputs=[*arguments.tables, arguments.simulator],
             progress=progress,
         )
-    return drawings.finish(
+    return finish(
+        drawings,
         *(f"note: {note}" for note in fitted.recording.notes),
         *renamed,
         f"{fitted.summary()}\nseed {arguments.seed}; written to {drawings.out}",

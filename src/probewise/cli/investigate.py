@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._arm import ARMS, SHIPPED, ArmName, add_geometry, parse_arm, parse_place, read_or_shipped_geometry
 from probewise.cli._common import (
     CommandError,
@@ -17,19 +19,19 @@ from probewise.cli._common import (
     add_out_directory,
     add_path,
     add_seed_and_quiet,
+    finish,
+    inputs_and_filled_in_plan,
     message_to_resume,
     positive_number_parser,
     print_result,
 )
-from probewise.cli._output import Drawings, checked_output_directory, inputs_and_filled_in_plan
-from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from probewise._writing import StagedFiles
     from probewise.arm import Reading
-    from probewise.cli._output import StagedFiles
     from probewise.investigation import RoundsFolder, Take
     from probewise.recordings import Plan
     from probewise.world import World
@@ -174,7 +176,7 @@ def run(arguments: argparse.Namespace) -> int:
             progress=progress,
         )
     known = [] if concealed is None else [f"concealed    {', '.join(concealed) or 'nothing'}"]
-    return drawings.finish(found.summary(), *known, *renamed, f"written to {out}", quiet=arguments.quiet)
+    return finish(drawings, found.summary(), *known, *renamed, f"written to {out}", quiet=arguments.quiet)
 
 
 def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:

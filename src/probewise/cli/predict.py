@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import add_path, add_seed_and_quiet, parse_recording, print_result
+from probewise._writing import checked_output_file
+from probewise.cli._common import add_path, add_seed_and_quiet, parse_recording, print_result, tables_and_descriptions
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import checked_output_file, tables_and_descriptions
 from probewise.cli._simulator import add_simulator
 
 

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probewise._writing import checked_output_file
 from probewise.cli._arm import add_geometry, read_or_shipped_geometry
 from probewise.cli._common import CommandError, add_path, add_quiet, print_result
-from probewise.cli._output import checked_output_file
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:

@@ -7,17 +7,17 @@ import shlex
 from functools import partial
 from typing import TYPE_CHECKING
 
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import (
     MOST_BATCH,
     add_count_option,
     add_out_directory,
     add_quiet,
+    finish,
     parse_seed,
-    print_result,
 )
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
-from probewise.cli._output import PAGE, Drawings, checked_output_directory, staged_output
-from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -101,15 +101,13 @@ def run(arguments: argparse.Namespace) -> int:
         )
     drawings = Drawings(out)
     with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
-        with staged_output(out, outdated=(PAGE,)) as stage:
-            stage.write("table.csv", report.table_csv(study))
-        drawings.write_report(
-            {}, lambda _: report.page_html(study, command=_command_line(arguments)), progress=progress
+        drawings.write_results(
+            lambda stage: stage.write("table.csv", report.table_csv(study)),
+            {},
+            lambda _: report.page_html(study, command=_command_line(arguments), draw=drawings.draw),
+            progress=progress,
         )
-    print_result(report.summary_sentence(study), quiet=arguments.quiet)
-    print_result(f"written to {out}", quiet=arguments.quiet)
-    drawings.raise_if_any_failed()
-    return 0
+    return finish(drawings, report.summary_sentence(study), f"written to {out}", quiet=arguments.quiet)
 
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
@@ -137,13 +135,13 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
         )
     table = concealed_csv_rows(found)
     rows, drawings = concealed_rows(found), Drawings(out)
-    with staged_output(out, outdated=(PAGE,)) as stage:
-        stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
-    drawings.write_report({}, lambda _: report.concealed_page_html(rows, command=_concealed_command_line(arguments)))
-    print_result(report.concealed_summary_sentence(rows), quiet=arguments.quiet)
-    print_result(f"written to {out}", quiet=arguments.quiet)
-    drawings.raise_if_any_failed()
-    return 0
+    command = _concealed_command_line(arguments)
+    drawings.write_results(
+        lambda stage: stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table))),
+        {},
+        lambda _: report.concealed_page_html(rows, command=command, draw=drawings.draw),
+    )
+    return finish(drawings, report.concealed_summary_sentence(rows), f"written to {out}", quiet=arguments.quiet)
 
 
 def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:

@@ -29,11 +29,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
+from probewise._writing import hold_lock, write_and_sync, write_text_atomically
 from probewise.arm.instrument import Pose, Reading
 from probewise.effects import NamedEffect
 from probewise.errors import FileError, ParameterError, shown
-from probewise.recordings.atomic import write_and_sync, write_text_atomically
-from probewise.recordings.locking import hold_lock
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.strict_json import parse_json_file_text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 import io
@@ -16,15 +17,16 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray, frozen_int, own_arithmetic, read_only_floats
 from probewise._display import ShowsItself
 from probewise._kinds import checked_number, checked_path, checked_whole, require_rng
 from probewise._version import __version__
-from probewise.errors import FileError, ParameterError, ShapeError
+from probewise._writing import write_bytes_atomically
+from probewise.errors import FileError, ParameterError, ShapeError, message_of, shown
 from probewise.nested.evidence import birth_rows, log_volumes
 from probewise.nested.weights import resampled_rows, weighted_quantiles
-from probewise.recordings.atomic import write_bytes_atomically
 
 _FORMAT = "nested-result/4"
 _FLOATS = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
@@ -389,31 +391,16 @@ class NestedResult(Samples):
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         head["check"] = None if self.check is None else asdict(self.check)
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
-        text = np.array(json.dumps({"format": _FORMAT, **head}))
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, allow_pickle=False, head=text, **arrays)
-        write_bytes_atomically(path, buffer.getvalue())
+        write_bytes_atomically(path, archive_bytes({"format": _FORMAT, **head}, arrays, compressed=True))
 
     @classmethod
     def load(cls, path: str | Path) -> NestedResult:
         """Read a file written by `save`; FileError if there is none, or it is damaged or of another format."""
-        path, wanted = checked_path("path", path), "a file written by NestedResult.save"
-        try:
-            # Opened here, since np.load leaves a damaged file open.
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-                head = json.loads(str(file["head"]))
-                found = head.pop("format", None) if isinstance(head, dict) else None
-                # Check before reading the arrays, which another version may store under other names.
-                arrays = {name: file[name] for name in _ARRAYS} if found == _FORMAT else {}
-        except FileNotFoundError as error:
-            raise FileError(path, "there is no such file", wanted) from error
-        except Exception as error:  # a damaged archive can raise whatever its parts do
-            # NumPy takes any other file for a pickle, and its message would advise to load it.
-            why = "no NumPy archive" if "pickle" in str(error) else error
-            raise FileError(path, f"unreadable ({why})", wanted) from error
-        if found != _FORMAT:
-            raise FileError(path, f"format {found!r}", f"{_FORMAT!r}; make the file anew with this version")
-        odd = set(head) ^ ({f.name for f in fields(cls)} - set(_ARRAYS))
+        path = checked_path("path", path)
+        head, arrays = read_archive(path, "a file written by NestedResult.save")
+        if (found := head.pop("format", None)) != _FORMAT:
+            raise FileError(path, f"format {shown(found)}", f"{_FORMAT!r}; make the file anew with this version")
+        odd = {*head, *arrays} ^ {f.name for f in fields(cls)}
         if odd:
             names = ", ".join(sorted(odd))
             raise FileError(path, f"fields {names} missing or unknown", "the fields that NestedResult.save writes")
@@ -423,7 +410,51 @@ class NestedResult(Samples):
         if runs is not None:
             each = {name: tuple(runs[name]) for name in ("log_z", "log_z_error")}
             head["agreement"] = Agreement(**(runs | each))
-        return cls(**head, **arrays)
+        return cls(**(head | arrays))
+
+
+def archive_bytes(head: Mapping[str, object], arrays: Mapping[str, NDArray[Any]], *, compressed: bool = False) -> bytes:
+    """Return the bytes of an .npz of arrays and of a JSON object, `head`, with a digest of all."""
+    content = {**arrays, "head": np.array(json.dumps(head, default=as_json))}
+    buffer = io.BytesIO()
+    write = np.savez_compressed if compressed else np.savez
+    write(buffer, allow_pickle=False, sha256=np.array(_digest(content)), **content)
+    return buffer.getvalue()
+
+
+def read_archive(path: Path, wanted: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read the JSON object and the arrays of a file of `archive_bytes`; `wanted`, for messages, is what it should be.
+
+    FileError if it is missing or no such file, or holds anything but what was written.
+    """
+    try:
+        # Opened here, since np.load leaves a damaged file open.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            content = {name: file[name] for name in file.files}
+        written = content.pop("sha256", None)  # files of earlier versions have none
+        if written is not None and str(written) != _digest(content):
+            raise ValueError("it holds something else than was written")
+        head = json.loads(str(content.pop("head")))
+        return head if isinstance(head, dict) else {}, content
+    except FileNotFoundError as error:
+        raise FileError(path, "there is no such file", wanted) from error
+    except Exception as error:  # a damaged archive can raise whatever its parts do
+        # NumPy takes any other file for a pickle, and its message would advise to load it.
+        why = "no NumPy archive" if "pickle" in str(error) else message_of(error, kind=False)
+        raise FileError(path, f"unreadable ({why})", wanted) from error
+
+
+def _digest(content: Mapping[str, NDArray[Any]]) -> str:
+    parts = hashlib.sha256()
+    for name in sorted(content):
+        array = np.ascontiguousarray(content[name])
+        parts.update(f"{name} {array.dtype.str} {array.shape};".encode() + array.tobytes())
+    return parts.hexdigest()
+
+
+def as_json(value: object) -> object:
+    """Convert what `json` cannot: arrays to lists, anything else to text."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
 def software_versions() -> dict[str, str]:

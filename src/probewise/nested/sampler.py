@@ -46,14 +46,13 @@ from probewise.nested.evidence import (
 )
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.problem import AnyPrior, Bound, Evaluator, OutOfCallsError, Points, Samplable, as_problem
-from probewise.nested.result import NestedResult, software_versions
+from probewise.nested.result import NestedResult, as_json, software_versions
 from probewise.nested.save import (
     BirthRecords,
     CheckpointFile,
     DeadPointsOfRound,
     LivePoints,
     RunState,
-    as_json,
     settings_of_run,
 )
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
-import json
 import re
 import tempfile
 import time
 import warnings
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -17,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import FileError, NotSavedWarning, ParameterError
+from probewise._writing import write_bytes_atomically
+from probewise.errors import FileError, NotSavedWarning, ParameterError, shown
 from probewise.nested.moves import Move
 from probewise.nested.problem import Evaluator, Points, Rows
-from probewise.recordings.atomic import write_bytes_atomically
+from probewise.nested.result import archive_bytes, read_archive
 
 _FORMAT = "nested-checkpoint/3"
 _ROUNDING = 1e-6
@@ -198,9 +196,7 @@ class CheckpointFile:
             )
             arrays |= {f"dead_{name}": array for name, array in (vars(dead) | vars(births)).items()}
             arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=as_json)), **arrays)
-        return buffer.getvalue()
+        return archive_bytes(head, arrays)
 
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> RunState | None:
         """Read the state of the run and set `rng` and the count of `evaluate` to it; None where there is no file.
@@ -212,26 +208,12 @@ class CheckpointFile:
         """
         if not self.path.exists():
             return None
-        try:
-            with open(self.path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-                # np.load does not verify the checksum of an array that it reads partly.
-                damaged = file.zip.testzip()
-                if damaged is not None:
-                    raise zipfile.BadZipFile(f"{damaged} is damaged")
-                head = json.loads(str(file["head"]))
-                found, settings = head["format"], head["settings"]
-                now = None
-                # Read the state only then: another version or move may have stored other fields.
-                if found == _FORMAT and settings == self.settings:
-                    now = _run_state_from_file(head, {name: file[name] for name in file.files}, move)
-        except Exception as error:  # a damaged archive can raise whatever its parts do
-            raise FileError(
-                self.path, f"unreadable ({error})", "a checkpoint of this run; delete it to start anew"
-            ) from error
-        if found != _FORMAT:
-            raise FileError(self.path, f"format {found!r}", f"{_FORMAT!r}; delete the file to start anew")
-        if now is None:
-            raise self._error_for_other_settings(settings)
+        head, arrays = read_archive(self.path, "a checkpoint of this run; delete it to start anew")
+        if (found := head.get("format")) != _FORMAT:
+            raise FileError(self.path, f"format {shown(found)}", f"{_FORMAT!r}; delete the file to start anew")
+        if head["settings"] != self.settings:
+            raise self._error_for_other_settings(head["settings"])
+        now = _run_state_from_file(head, arrays, move)
         self._require_same_problem(now, evaluate)
         evaluate.n_calls = now.n_calls
         rng.bit_generator.state = now.rng_state
@@ -279,8 +261,7 @@ def _run_state_from_file(head: dict[str, Any], arrays: dict[str, np.ndarray], mo
     for end, size in zip(ends, np.diff(ends, prepend=0), strict=True):
         rows = slice(int(end - size), int(end))
         dead.append(DeadPointsOfRound(*rows_of("dead", rows), *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
-    if not is_dataclass(move) or not isinstance(head["moving"], dict):
-        raise ValueError("the move cannot be restored")
+    assert is_dataclass(move)  # as settings_of_run requires
     live = LivePoints(*rows_of("live", slice(None)), float(head["log_volume"]))
     plain = {name: head[name] for name in _PLAIN} | {"notes": tuple(head["notes"])}
     return RunState(live, tuple(dead), replace(move, **head["moving"]), rng_state=head["rng_state"], **plain)
@@ -297,8 +278,3 @@ def _numeric_fields_of_move(move: Move) -> dict[str, float]:
     if not is_dataclass(move):
         raise ParameterError("move", move, "a dataclass, whose numbers a checkpoint can keep")
     return {f.name: v for f in fields(move) if isinstance(v := getattr(move, f.name), int | float)}
-
-
-def as_json(value: object) -> object:
-    """Convert what `json` cannot: arrays to lists, anything else to text."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeAlias, TypeVar
 
+from probewise._writing import write_and_sync
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
-from probewise.recordings.atomic import write_and_sync
 
 __all__ = ["FORMAT", "CampaignContents", "read_campaign", "run_campaign"]
 

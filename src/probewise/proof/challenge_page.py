@@ -12,7 +12,7 @@ from probewise.proof.plots import confusion_matrix, reliability_diagram
 from probewise.proof.scoring import NOISE, are_names_right, confusion_counts, leading_hypothesis, reliability_bins
 from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, gains_on_held_out_runs, name_without_target
 from probewise.recordings.table import csv_text_of_rows
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Draw, Markup, Section, definition_list, draw_or_raise, figure, page, paragraph, table
 from probewise.report.plots.canvas import png
 from probewise.report.words import typeset_numbers
 
@@ -66,16 +66,27 @@ def target_table_csv(rows: Sequence[ScoreRow]) -> str:
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
-def page_html(results: Results, rows: Sequence[ScoreRow], *, command: str, systems: bool = False) -> str:
+def page_html(
+    results: Results,
+    rows: Sequence[ScoreRow],
+    *,
+    command: str,
+    systems: bool = False,
+    draw: Draw = draw_or_raise,
+) -> str:
     """Return the HTML of a challenge's page from the cases' results and the table's `rows`.
 
-    `command` is the command line that made the results; `systems`: the cases are simulators, not light sensors.
+    `command` is the command line that made the results; `systems`: the cases are simulators, not light sensors;
+    `draw` makes figures.
     """
     done = [r for r in results if "failed" not in r]
     sections = [Section("The table", (target_table(rows), _table_legend()))]
     if done:
         drawn = figure(
-            png(confusion_matrix(*confusion_counts(done, label=name_without_target if systems else str))),
+            draw(
+                "confusion matrix",
+                lambda: png(confusion_matrix(*confusion_counts(done, label=name_without_target if systems else str))),
+            ),
             "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
             "truth." + (" Targets are left out." if systems else ""),
         )
@@ -90,7 +101,7 @@ def page_html(results: Results, rows: Sequence[ScoreRow], *, command: str, syste
         sections.append(Section("Cases that failed", (definition_list(failures),)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
     honest = figure(
-        png(reliability_diagram(reliability_bins(done))),
+        draw("reliability", lambda: png(reliability_diagram(reliability_bins(done)))),
         "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
     )
     return page(

@@ -22,7 +22,18 @@ from probewise.proof.plots import (
 from probewise.proof.study import Study, Summary
 from probewise.proof.trial import experiment_of
 from probewise.recordings.table import csv_text_of_rows
-from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
+from probewise.report.html import (
+    Draw,
+    Markup,
+    Section,
+    definition_list,
+    draw_or_raise,
+    figure,
+    fragment,
+    page,
+    paragraph,
+    table,
+)
 from probewise.report.plots.canvas import png
 from probewise.report.words import number_text, value_with_error
 
@@ -121,8 +132,8 @@ def table_csv(study: Study) -> str:
     return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
 
 
-def page_html(study: Study, *, command: str) -> str:
-    """Return the HTML of a study's page; `command` is the command line that made the study."""
+def page_html(study: Study, *, command: str, draw: Draw = draw_or_raise) -> str:
+    """Return the HTML of a study's page; `command` is the command line that made the study, `draw` makes figures."""
     summaries = study.table()
     curves = {
         row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in study.trials[row]]
@@ -133,13 +144,13 @@ def page_html(study: Study, *, command: str) -> str:
         and row.batch == 1
     }
     needed = figure(
-        png(readings_needed({row.name: found for row, found in summaries.items()})),
+        draw("readings needed", lambda: png(readings_needed({row.name: found for row, found in summaries.items()}))),
         f"Readings until every length is known to 4 mm, of at most {study.max_readings}; a miss counts as that many.",
     )
     sections = [Section("The table", (result_tables(study), _table_legend()))]
     if curves:
         drawn = figure(
-            png(posterior_widths_of_runs(curves)),
+            draw("widths", lambda: png(posterior_widths_of_runs(curves))),
             "Widest posterior sd of a length against the number of readings; a run that has ended keeps its last "
             "width.",
         )
@@ -226,10 +237,10 @@ def concealed_summary_sentence(rows: Sequence[ConcealedRow]) -> str:
     )
 
 
-def concealed_page_html(rows: Sequence[ConcealedRow], *, command: str) -> str:
-    """Return the HTML of the page of a study of concealed effects; `command` is the command line that made it."""
+def concealed_page_html(rows: Sequence[ConcealedRow], *, command: str, draw: Draw = draw_or_raise) -> str:
+    """Return the HTML of the page of a study of concealed effects; parameters as in `page_html`."""
     drawn = figure(
-        png(doubt_against_trust(rows)),
+        draw("doubt against trust", lambda: png(doubt_against_trust(rows))),
         "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
         "the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals promise.",
     )

@@ -1,6 +1,6 @@
 """Plans, recordings and predictions, and their files (paper, "Data Collection for SSF Estimation")."""
 
-from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
+from probewise._writing import hold_lock, write_bytes_atomically, write_text_atomically
 from probewise.recordings.files import (
     read_plan,
     read_plan_and_readings,
@@ -9,7 +9,6 @@ from probewise.recordings.files import (
     write_recording,
 )
 from probewise.recordings.fingerprint import fingerprint
-from probewise.recordings.locking import hold_lock
 from probewise.recordings.patterns import (
     Disc,
     HalfPlane,

@@ -27,7 +27,7 @@ _ODD_SIGNS = str.maketrans(
 )
 _QUANTITY = re.compile(
     r"(?P<number>[+-]? ?(?:[0-9](?:[0-9.,' ]*[0-9.,])?|[.,][0-9]+)(?:[eE][+-]?[0-9]+)?)"
-    r" *(?P<unit>(?:[^\W\d_]|[%‰°])[^,;:]{0,15})?"
+    r" *(?P<unit>(?![DdXx][+-]?\d)(?:[^\W\d_]|[%‰°])[^,;:]{0,15})?"  # not Fortran's 1.5D+01, nor 0x1
 )
 _GROUPS = {".": (",", " ", "'"), ",": (".", " ", "'")}  # between thousands, by decimal mark
 

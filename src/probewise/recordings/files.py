@@ -13,9 +13,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import checked_path
+from probewise._writing import is_device_or_pipe, write_bytes_atomically, write_text_atomically
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
-from probewise.recordings.atomic import is_device_or_pipe, write_bytes_atomically, write_text_atomically
 from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.columns import (
     A_SCAN,

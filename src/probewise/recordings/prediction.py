@@ -10,8 +10,8 @@ import numpy as np
 from probewise._arrays import FloatArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_path
+from probewise._writing import write_text_atomically
 from probewise.errors import FileError, ParameterError, ShapeError
-from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.files import plan_columns
 from probewise.recordings.plan import Plan
 from probewise.recordings.table import csv_text, number_text, read_table

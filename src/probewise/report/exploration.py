@@ -22,7 +22,7 @@ from probewise.experiment import (
 )
 from probewise.experiment.result import stop_reason_with_checks
 from probewise.inquiry import UtilityMap
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Draw, Markup, Section, definition_list, draw_or_raise, figure, page, paragraph, table
 from probewise.report.plots.canvas import grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
@@ -119,22 +119,29 @@ def robot_views_by_model_png(
     return png(axes, dpi=75, tight=False)
 
 
-def live_page_html(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust: float = 1.0) -> str:
+def live_page_html(
+    step: Step,
+    picture: bytes,
+    *,
+    earlier: Sequence[Step] = (),
+    trust: float = 1.0,
+    draw: Draw = draw_or_raise,
+) -> str:
     """Return the HTML of a running exploration's page after `step`; it reloads every second until the run ends.
 
     `picture` is a PNG. If `trust` in the sensor model is below 1, the probabilities of its possible faults follow,
-    after each of the `earlier` steps and this one.
+    after each of the `earlier` steps and this one; `draw` makes their figure.
     """
     reason = stop_reason_with_checks((*earlier, step))
     state = "The robot works" if reason is None else f"The robot has stopped: {reason}"
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
     found = figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1
-    sections = (_fault_section((*earlier, step), trust),) if trust < 1 else ()
+    sections = (_fault_section((*earlier, step), trust, draw),) if trust < 1 else ()
     return page("The robot's search", answer=f"{state}.", key_figure=found, sections=sections, reload_s=every_s)
 
 
-def _fault_section(steps: Sequence[Step], trust: float) -> Section:
+def _fault_section(steps: Sequence[Step], trust: float, draw: Draw) -> Section:
     """Build the section on effects that the sensor model may leave out: their probabilities after each reading."""
     doubted = left_out_after_step(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
@@ -146,7 +153,7 @@ def _fault_section(steps: Sequence[Step], trust: float) -> Section:
         (
             paragraph(doubted.sentence),
             figure(
-                png(effect_probabilities_by_reading(beliefs)),
+                draw("probabilities of faults", lambda: png(effect_probabilities_by_reading(beliefs))),
                 f"Probabilities of the sensor's possible faults after each reading.{dashed}",
             ),
             table(
@@ -246,12 +253,13 @@ def page_html(
     truth: Mapping[str, float] | None = None,
     beside: Mapping[str, Sequence[Step]] | None = None,
     unit: str = "LEGO",
+    draw: Draw = draw_or_raise,
 ) -> str:
     """Return the HTML of an exploration's page.
 
     `frames` are PNGs of the steps; `model` is the name of the sensor model; `truth` are the parameters of the true
     shape by name, where known; `beside` are steps of other sensor models, updated with the same readings, by name of
-    the model; `unit` is the readings'.
+    the model; `unit` is the readings'; `draw` makes the curves.
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
@@ -286,15 +294,18 @@ def page_html(
     bits = {name: np.array([s.bits for s in steps]) for name, steps in runs.items()}
     sections = [
         Section("The shape and what it cost", (*shape, *(paragraph(f"Doubtful: {note}.") for note in run.notes))),
-        *((_fault_section(run.steps, run.experiment.trust),) if run.experiment.trust < 1 else ()),
+        *((_fault_section(run.steps, run.experiment.trust, draw),) if run.experiment.trust < 1 else ()),
         Section(
             "How fast",
             (
                 figure(
-                    png(posterior_widths(widths, target_mm=run.experiment.stop_sd_mm)),
+                    draw("widths", lambda: png(posterior_widths(widths, target_mm=run.experiment.stop_sd_mm))),
                     "Widest posterior sd of a length after each reading; dashed: the target precision.",
                 ),
-                figure(png(information_gained(bits)), _information_caption(run.experiment.trust)),
+                figure(
+                    draw("information", lambda: png(information_gained(bits))),
+                    _information_caption(run.experiment.trust),
+                ),
                 steps_table(run, unit),
             ),
         ),

@@ -6,9 +6,10 @@ import base64
 import html
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import TypeAlias
 
 from PIL import Image
 
@@ -83,6 +84,15 @@ def note_paragraphs(notes: Iterable[str]) -> tuple[Markup, ...]:
 def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
     """Build a list of terms, each with its value."""
     return element("dl", *(fragment(element("dt", term), element("dd", value)) for term, value in pairs))
+
+
+Draw: TypeAlias = Callable[[str, Callable[[], bytes]], bytes]
+"""Takes a figure's name and what draws it, and returns the figure; b"" if it could not be drawn."""
+
+
+def draw_or_raise(name: str, drawer: Callable[[], bytes]) -> bytes:
+    """Return what `drawer` returns; what it raises is raised."""
+    return drawer()
 
 
 def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:

@@ -107,12 +107,6 @@ def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
     return sheet
 
 
-def close_opened_figures() -> None:
-    """Close the figures that plot functions opened: what raised in one has left it open."""
-    for sheet in list(_OPENED):
-        plt.close(sheet)
-
-
 def figure_of(drawing: Axes | AxesGrid | Figure) -> Figure:
     """Return the figure that axes belong to; none of ours has subfigures."""
     first = drawing.flat[0] if isinstance(drawing, np.ndarray) else drawing

@@ -1,0 +1,375 @@
+"""What a command writes: files whole or not at all, results all or none, without losing an input; drawings last.
+
+The results of a command are written into a hidden folder inside `--out`. When all are complete, that folder is renamed;
+only then are they moved. A process killed before that has changed nothing; after that, the next command with the same
+`--out` moves the remaining files first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import itertools
+import json
+import os
+import secrets
+import shutil
+import stat
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from io import FileIO
+from pathlib import Path
+
+from probewise._signals import defer_signals, raise_if_stopped, reporting_what_is_kept
+from probewise.errors import FileError, ParameterError, ProbewiseError, message_of
+from probewise.progress import Progress, silent
+
+PAGE = "report.html"
+_STAGED, _COMPLETE = ".writing", ".complete"
+_OUTDATED = ".outdated"  # ends the name of an empty file: the file of that name without it is to be removed
+_MOST_FAILED = 3  # drawings that a message names
+_WRITABLE = "a file in an existing, writable folder, on a disk with room"
+_PATIENCE_S = 600.0  # timeout for another command that is writing its results
+_NO_LOCKS = "flock not supported"  # newer versions of the library warn so, and make a file that a killed process leaves
+
+
+def is_device_or_pipe(path: Path) -> bool:
+    """Return whether something is at `path`, or where a symbolic link leads, that is neither a file nor a folder."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, named: bool = True) -> None:
+    """Replace the file at `path` by `content` atomically; its permissions stay.
+
+    The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. Temporary
+    files that killed processes left are removed. If a person has `named` this very file, a symbolic link is followed,
+    and a device or a named pipe is written to; one that stands where a further file goes is replaced.
+
+    Raises FileError if the folder does not exist or cannot be written to, `path` is a folder, or the disk is full.
+    """
+    path = Path(path)
+    with _errors_of(path), contextlib.ExitStack() as stack:
+        if named and is_device_or_pipe(path):
+            _write_all(stack.enter_context(open(path, "wb", buffering=0)), content)
+            return
+        target = Path(os.path.realpath(path)) if named else path
+        for left in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
+            with contextlib.suppress(OSError), contextlib.ExitStack() as opened:
+                if left.is_file():  # a pipe would be waited for
+                    _lock(opened.enter_context(open(left, "rb")).fileno())
+                left.unlink()
+        temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+        stack.enter_context(defer_signals())
+        with open(temporary, "xb", buffering=0) as file:
+            stack.callback(temporary.unlink, missing_ok=True)
+            with contextlib.suppress(OSError):  # where files cannot be locked, nobody removes it
+                _lock(file.fileno())
+            write_and_sync(file, path, content)
+        if target.is_file() and not target.is_symlink():
+            os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
+        os.replace(temporary, target)
+
+
+def write_text_atomically(path: str | os.PathLike[str], text: str, *, named: bool = True) -> None:
+    """Replace the file at `path` by `text` in UTF-8, as `write_bytes_atomically` does, with line ends unchanged.
+
+    Bytes of a file's name that are no UTF-8, which Python reads as lone surrogates, are written as escapes.
+    """
+    write_bytes_atomically(path, text.encode("utf-8", "backslashreplace"), named=named)
+
+
+def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:
+    """Write all of `content` to an open, unbuffered file and sync it to disk; FileError, of `path`, if that fails."""
+    with _errors_of(path):
+        _write_all(file, content)
+        os.fsync(file.fileno())
+
+
+def _write_all(file: FileIO, content: bytes) -> None:
+    left_over = memoryview(content)
+    while left_over:
+        left_over = left_over[file.write(left_over) :]
+
+
+def _lock(handle: int) -> None:
+    """Lock an open file until it is closed; raise OSError if another process has a lock on it, or without locks."""
+    if sys.platform != "win32":  # where nobody can remove an open file
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextlib.contextmanager
+def _errors_of(path: Path, done: str = "written", allowed: str = _WRITABLE) -> Iterator[None]:
+    """Report in words that a path cannot be `done` something to."""
+    try:
+        yield
+    except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(path, f"cannot be {done} ({getattr(error, 'strerror', None) or error})", allowed) from error
+
+
+@contextlib.contextmanager
+def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator[None]:
+    """Hold an exclusive lock on a file or folder, which ends with the process, by way of a file .NAME.lock beside it.
+
+    The empty lock file stays, since another process may wait for it. `path` need not exist, but its folder must.
+    Raises FileError if another process holds the lock for longer than `patience_s`, the lock file is a symbolic link or
+    cannot be written, or the file system has no locks.
+    """
+    from filelock import FileLock, Timeout  # not needed by the help
+
+    path = Path(path)
+    file = path.with_name(f".{path.name}.lock")
+    if not path.parent.is_dir():  # the library would make it
+        raise FileError(path, "cannot be written (no such folder)", _WRITABLE)
+    lock = FileLock(file, timeout=patience_s, thread_local=False)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", _NO_LOCKS)
+            lock.acquire()
+    except (OSError, RuntimeError, UserWarning) as error:
+        within_process = isinstance(error, RuntimeError) and not isinstance(error, NotImplementedError)
+        if isinstance(error, Timeout) or within_process:
+            raise FileError(path, "another process is writing to it", "one process at a time") from error
+        found = "is a symbolic link" if file.is_symlink() else getattr(error, "strerror", None) or error
+        allowed = "none, or an ordinary file, where files can be locked"
+        raise FileError(file, f"cannot be locked ({found})", allowed) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def checked_output_directory(path: Path, *entries: str) -> Path:
+    """Check before any work that results can be written there, and return the path.
+
+    `entries` are files and folders of it that the run writes as it goes. Raises ParameterError if a file is in the way,
+    FileError if no directory can be made there, or one of the entries is a symbolic link, a device or a pipe.
+    """
+    nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
+    if not nearest.is_dir():
+        what = "is no directory" if nearest.is_symlink() else "is a file"
+        raise ParameterError(
+            "--out", str(path), f"a directory, existing or new; {'this' if nearest == path else nearest} {what}"
+        )
+    _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
+    try:  # permissions are not enough: /proc and read-only mounts cannot be written to
+        os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=nearest))
+    except OSError as error:
+        raise FileError(path, f"{nearest} cannot be written to", "a directory you may write to") from error
+    return path
+
+
+def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out") -> Path:
+    """Check before any work that a file, device or named pipe, given by an `option`, can be written; return the path.
+
+    Raises ParameterError if it is a directory, an input or below a file, FileError if its directory cannot be written
+    to.
+    """
+    if path.is_dir():
+        raise ParameterError(option, str(path), "a file name; this is a directory")
+    for taken in inputs:
+        if taken is not None and path.exists() and taken.exists() and path.samefile(taken):
+            raise ParameterError(option, str(path), f"another file than the input {taken}")
+    if not is_device_or_pipe(path):
+        checked_output_directory(Path(os.path.realpath(path)).parent)
+    return path
+
+
+class StagedFiles:
+    """Files written into an empty directory, `folder`; `kept` has the new path of each input file that they replace."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.kept: dict[Path, Path] = {}
+
+    def __truediv__(self, name: str) -> Path:
+        return self.folder / name
+
+    def write(self, name: str, content: str | bytes) -> None:
+        """Write a file into the directory: bytes, or a text in UTF-8."""
+        content = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+        write_bytes_atomically(self / name, content)
+
+    def write_json(self, name: str, document: object) -> None:
+        """Write a document as strict JSON."""
+        self.write(name, json.dumps(document, allow_nan=False, indent=1) + "\n")
+
+
+@contextlib.contextmanager
+def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[StagedFiles]:
+    """Yield an empty directory; move its files into `out`, made if missing, only if the block succeeds.
+
+    One of the `inputs` of this run that a result would replace is copied to another name. Files of an earlier run, of
+    the patterns `outdated`, are removed unless this run writes them.
+
+    Raises FileError if `out` cannot be made or written to, another process writes there for too long, a directory has
+    the name of a result, or a symbolic link that of a directory of results.
+    """
+    folder = out / _STAGED
+    with _errors_of(out, "made", "a directory you may write to"):
+        out.mkdir(parents=True, exist_ok=True)
+    with hold_lock(out / "results", patience_s=_PATIENCE_S):
+        _move_into_place(out)
+        _remove(folder)
+        folder.mkdir()
+        stage = StagedFiles(folder)
+        try:
+            yield stage
+            raise_if_stopped()
+            with defer_signals():
+                _complete(out, stage, {os.path.realpath(path) for path in inputs}, outdated)
+                os.rename(folder, out / _COMPLETE)
+                _move_into_place(out)
+        except FileError as error:
+            if not Path(error.path).is_relative_to(folder):
+                raise
+            name = out / Path(error.path).relative_to(folder)
+            raise FileError(name, error.found, error.allowed, row=error.row, column=error.column) from error
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _complete(out: Path, stage: StagedFiles, inputs: set[str], outdated: Sequence[str]) -> None:
+    """Add to the results copies of the inputs (real paths) that they replace, `kept`, and marks of outdated files.
+
+    Raises FileError if a directory has the name of a file, or a symbolic link that of a directory.
+    """
+    names = _files_in(stage.folder)
+    for name in names:
+        _require_ordinary((out / name).parents[: name.count("/")])
+        if (out / name).is_dir():
+            raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
+    replaced = [out / name for name in names if os.path.realpath(out / name) in inputs]
+    for ending in itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2))):
+        stage.kept = {path: path.with_stem(path.stem + ending) for path in replaced}
+        if not any(os.path.lexists(path) for path in stage.kept.values()):
+            break
+    for path, new in stage.kept.items():
+        name = new.relative_to(out).as_posix()
+        stage.write(name, path.read_bytes())
+        shutil.copystat(path, stage / name)
+    for path in itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated):
+        if os.path.realpath(path) not in inputs and path.name not in names and not path.is_dir():
+            (stage / (path.name + _OUTDATED)).touch()
+
+
+def _move_into_place(out: Path) -> None:
+    """Move complete results, if there are any, into `out`; a process killed here leaves the rest to the next one.
+
+    A stranger's folder may hold such results too: they can replace files of that folder only.
+    """
+    complete = out / _COMPLETE
+    cure = f"the next command with --out {out} puts the rest in place, or remove {complete} to drop it"
+    with _errors_of(complete, "moved", f"files in few folders; {cure}"):
+        names = [] if complete.is_symlink() else _files_in(complete)
+    for name in names:
+        _require_ordinary((out / name).parents[: name.count("/")])
+        with _errors_of(out / name.removesuffix(_OUTDATED), "replaced", f"a file that no other program holds; {cure}"):
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            if name.endswith(_OUTDATED):
+                (out / name.removesuffix(_OUTDATED)).unlink(missing_ok=True)
+            else:
+                os.replace(complete / name, out / name)
+    _remove(complete)
+
+
+def _files_in(folder: Path) -> list[str]:
+    """List the files in a directory and its directories, by relative name; symbolic links are not followed."""
+    files = (Path(at) / name for at, _, names in os.walk(folder) for name in names)
+    return sorted(file.relative_to(folder).as_posix() for file in files)
+
+
+def _require_ordinary(paths: Iterable[Path]) -> None:
+    """Raise FileError if one of these is neither a file nor a directory, nor missing."""
+    for path in paths:
+        if path.is_symlink() or is_device_or_pipe(path):
+            link = path.is_symlink()
+            found = "is a symbolic link, which may lead out of the folder" if link else "is a device or a pipe"
+            raise FileError(path, found, "another --out, or an ordinary file or folder there")
+
+
+def _remove(path: Path) -> None:
+    """Remove a directory with its content, or a file or symbolic link, if it is there."""
+    with _errors_of(path, "removed", "none"):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+class NotDrawnError(ProbewiseError):
+    """Report figures or pages that could not be drawn, beside results that are complete."""
+
+
+class Drawings:
+    """Figures and pages of a run, drawn after its results were written: if one fails, only that one is missing."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self._failed: dict[str, str] = {}
+
+    def draw(self, name: str, drawer: Callable[[], bytes]) -> bytes:
+        """Return what `drawer` returns; b"" if it raises, which `raise_if_any_failed` tells."""
+        try:
+            content = drawer()
+        except Exception as error:  # whatever it is, the results are more than their pictures
+            from matplotlib import pyplot
+
+            pyplot.close("all")  # those that the drawer has opened
+            self._failed[name], content = message_of(error), b""
+        raise_if_stopped()  # a signal may have damaged the picture
+        return content
+
+    def write_report(
+        self,
+        drawers: Mapping[str, Callable[[], bytes]],
+        page: Callable[[Mapping[str, bytes]], str],
+        *,
+        inputs: Sequence[Path] = (),
+        progress: Progress = silent,
+    ) -> None:
+        """Draw figures, by name, and the page report.html into the directory of results, which are complete there.
+
+        `page` builds the HTML from the figures by name; b"" stands for one that could not be drawn.
+        """
+        kept = f"the results are in {self.out}, without figures and report"
+        drawn: dict[str, bytes] = {}
+        every = {**drawers, PAGE: lambda: page(drawn).encode("utf-8", "backslashreplace")}
+        with reporting_what_is_kept(lambda: kept, results=True), staged_output(self.out, inputs=inputs) as stage:
+            for name, drawer in every.items():
+                progress("drawing the report", len(drawn), len(every), name)
+                drawn[name] = self.draw(name, drawer)
+                if drawn[name]:
+                    stage.write(name, drawn[name])
+
+    def write_results(
+        self,
+        files: Callable[[StagedFiles], None],
+        drawers: Mapping[str, Callable[[], bytes]],
+        page: Callable[[Mapping[str, bytes]], str],
+        *,
+        inputs: Sequence[Path] = (),
+        outdated: Sequence[str] = (),
+        progress: Progress = silent,
+    ) -> list[str]:
+        """Write the files of a run, all or none, by a function of the `StagedFiles`; then figures and page.
+
+        Files of an earlier run, of the patterns `outdated`, are removed. Return lines on inputs that got another name.
+        """
+        with staged_output(self.out, inputs=inputs, outdated=(*outdated, *drawers, PAGE)) as stage:
+            files(stage)
+        self.write_report(drawers, page, inputs=inputs, progress=progress)
+        return [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
+
+    def raise_if_any_failed(self) -> None:
+        """Raise NotDrawnError, in one line, if something could not be drawn."""
+        if self._failed:
+            first = ", ".join(f"{name} ({error})" for name, error in list(self._failed.items())[:_MOST_FAILED])
+            more = len(self._failed) - _MOST_FAILED
+            rest = f" and {more} more" if more > 0 else ""
+            raise NotDrawnError(f"could not draw {first}{rest}; everything else is complete in {self.out}")

@@ -292,4 +292,4 @@ def test_texts_that_a_spreadsheet_would_compute_are_written_so_that_it_does_not_
     assert {row[1] for row in written[1:]} == {"-1.5"}
     table = read_table(path)
     assert list(table.columns) == ["=column", "n"]
-    assert table.cells("=column") == list(cells)
+    assert table.columns["=column"] == list(cells)

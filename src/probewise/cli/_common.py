@@ -224,4 +224,4 @@ def holds_readings(table: Path, column: str) -> bool:
         rows = read_table(table, wanted=(column,))
     except FileError:
         return True
-    return column in rows.columns and any(rows.cells(column))
+    return column in rows.columns and any(rows.columns[column])

@@ -231,11 +231,11 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     time_s = table.column_of_numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     for k, name in enumerate(scan_names):
         if not name.isprintable():
-            row = table.row_number(int(np.argmax(scan == k)))
+            row = table.rows[int(np.argmax(scan == k))]
             raise FileError(path, shown(name), _A_NAME, row=row, column="scan")
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
-        notes.append(f"time_s runs backwards at row {table.row_number(int(back[0]) + 1)}")
+        notes.append(f"time_s runs backwards at row {table.rows[int(back[0]) + 1]}")
     if "orientation_rad" in table.columns:
         raise FileError(path, "it is in radians", "orientation_deg, in degrees", row=1, column="orientation_rad")
     orientation_deg = (
@@ -245,7 +245,7 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     session = covariates.pop(SESSION, np.zeros(len(table)))
     if (wrong := no_session_mask(session, scan)).any():
         k = int(np.argmax(wrong))
-        raise FileError(path, shown(table.cells(SESSION)[k]), A_SESSION, row=table.row_number(k), column=SESSION)
+        raise FileError(path, shown(table.columns[SESSION][k]), A_SESSION, row=table.rows[k], column=SESSION)
     plan = Plan(
         x_mm=table.column_of_numbers("x_mm", largest=_LARGEST_PLACE_MM),
         y_mm=table.column_of_numbers("y_mm", largest=_LARGEST_PLACE_MM),
@@ -272,8 +272,7 @@ def _notes_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> li
     if abs(places_mm[k] - middle) <= _FAR_AWAY * max(high - low, 1.0):
         return []
     return [
-        f"row {table.row_number(k)}: {name} is {places_mm[k]:g}, "
-        f"nine in ten of the others {low:g} to {high:g}: mistyped?"
+        f"row {table.rows[k]}: {name} is {places_mm[k]:g}, nine in ten of the others {low:g} to {high:g}: mistyped?"
     ]
 
 
@@ -291,9 +290,9 @@ def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str,
     """
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)
-    cells = table.cells("scan")
+    cells = table.columns["scan"]
     if "" in cells and any(cells):
-        raise FileError(table.path, "the cell is empty", A_SCAN, row=table.row_number(cells.index("")), column="scan")
+        raise FileError(table.path, "the cell is empty", A_SCAN, row=table.rows[cells.index("")], column="scan")
     changes = np.fromiter(map(operator.ne, cells[1:], cells), dtype=np.int64, count=len(cells) - 1)
     scan = np.concatenate([[0], np.cumsum(changes)])
     return scan, tuple(cells[k] for k in (0, *(np.flatnonzero(changes) + 1)))
@@ -311,13 +310,13 @@ def _pattern_codes_in_file(table: CSVTable, description: Description) -> IntArra
             )  # fmt: skip
         return np.zeros(len(table), dtype=np.int64)
     code = {name: k for k, name in enumerate(names)}
-    cells = table.cells("pattern")
+    cells = table.columns["pattern"]
     unknown = set(cells).difference(code)
     if unknown:
         k = next(k for k, cell in enumerate(cells) if cell in unknown)
         raise FileError(
             table.path, f"the pattern {shown(cells[k])} is not in {json_name}", f"one of {known}",
-            row=table.row_number(k), column="pattern",
+            row=table.rows[k], column="pattern",
         )  # fmt: skip
     return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
 
@@ -330,11 +329,11 @@ def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str
     """
     out: dict[str, FloatArray] = {}
     if "led" in table.columns:
-        table = table.with_cells("led", map(led_cell, table.cells("led")))
+        table = replace(table, columns={**table.columns, "led": list(map(led_cell, table.columns["led"]))})
     for name in table.columns:
         if name in _KNOWN:
             continue
-        filled = [cell for cell in table.cells(name) if cell not in MISSING]
+        filled = [cell for cell in table.columns[name] if cell not in MISSING]
         if not name.isprintable():
             raise FileError(table.path, shown(name), f"{_A_NAME} for each column", row=1)
         elif not filled:

@@ -105,5 +105,5 @@ def read_prediction_columns(path: str | os.PathLike[str]) -> tuple[FloatArray, F
     mean, sd = table.column_of_numbers("mean"), table.column_of_numbers("sd")
     if np.any(sd <= 0):
         k = int(np.argmax(sd <= 0))
-        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.row_number(k), column="sd")
+        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.rows[k], column="sd")
     return mean, sd, table.column_of_numbers("log_density", missing=True)

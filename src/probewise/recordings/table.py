@@ -9,14 +9,13 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray
 from probewise._words import count_with_noun
 from probewise.errors import FileError, shown
 from probewise.progress import Progress, silent
@@ -37,8 +36,10 @@ LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
 
 _BEGIN_FORMULA = ("=", "+", "-", "@")
-_ESCAPED = r"^'(?='*[=+@-])"  # see _not_as_formula
-_CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
+_ESCAPED = re.compile(r"'(?='*[=+@-])")  # see _not_as_formula
+_PLAIN = re.compile(r"[-+.0-9eE]*")
+_DASHES = frozenset({"-", "--", "---", "----"})  # words for what is missing
+_PROGRESS = 2_000  # rows between two reports
 _SAMPLE = 100_000  # characters from which the layout is found
 _N_LAST = 10  # rows at the end of these that show how many cells a row has
 # Marks between cells, or the blanks to replace by one: first those that stand in numbers and texts least.
@@ -51,34 +52,17 @@ _SUMMARY = re.compile(r"(mean|average|avg|median|total|sum|min|max|minimum|maxim
 
 @dataclass(frozen=True, eq=False)
 class CSVTable:
-    """Cells by column, stripped of blanks; `rows` holds the row number of each record in the file, (n_rows,).
-
-    Each column is one text, its cells joined by a character that does not occur in the file: a million separate texts
-    would take ten times the memory.
-    """
+    """Cells by column, stripped of blanks; `rows` holds the row number of each record in the file, (n_rows,)."""
 
     path: Path
-    columns: dict[str, str]
-    separator: str
-    rows: IntArray
+    columns: dict[str, list[str]]
+    rows: list[int]
     header_row: int = 1
     notes: tuple[str, ...] = ()
     """How the file was read, one line, where it is not plain CSV."""
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    def cells(self, name: str) -> list[str]:
-        """Return the cells of a column."""
-        return self.columns[name].split(self.separator) if len(self) else []
-
-    def with_cells(self, name: str, cells: Iterable[str]) -> CSVTable:
-        """Return the table with other cells in one column."""
-        return replace(self, columns={**self.columns, name: self.separator.join(cells)})
-
-    def row_number(self, k: int) -> int:
-        """Return the row number of a record in the file."""
-        return int(self.rows[k])
 
     def require_columns(self, *names: str) -> None:
         """Raise FileError if one of these columns is missing."""
@@ -111,7 +95,7 @@ class CSVTable:
         FileError
             At the first cell that is not such a number.
         """
-        cells = self.cells(name)
+        cells = self.columns[name]
         most = np.finfo(np.float64).max if largest is None else largest
         there = np.ones(len(cells), dtype=np.bool_)
         if missing:
@@ -122,7 +106,7 @@ class CSVTable:
             allowed = allowed or number + (", or empty, nan or n/a where it is missing" if missing else "")
             k = first_cell_without_number(cells, missing=missing, largest=most)
             assert k is not None
-            raise FileError(self.path, _cell_in_words(cells[k]), allowed, row=self.row_number(k), column=name)
+            raise FileError(self.path, _cell_in_words(cells[k]), allowed, row=self.rows[k], column=name)
         out = np.full(len(cells), math.nan)
         out[there] = values
         return out
@@ -198,25 +182,29 @@ class _Layout:
         above, units = [rows[k] for k in full if k < at], [rows[k] for k in below if k < first]
         return replace(self, header=header, at=at, first=first, width=width, numeric=numeric, above=above, units=units)
 
-    def row(self, path: Path, row: list[str], number: int) -> list[str]:
-        """Return a row with as many cells as the header: less empty ones, or more where comments may stand."""
+    def fitted_row(self, row: tuple[str, ...]) -> tuple[str, ...]:
+        """Return a row with as many cells as the header, if it has more that are empty, or lacks but comments."""
         n = len(self.header)
-        if not any(cell.strip() for cell in row[n:]) and all(name in _MAY_LACK for name in self.header[len(row) :]):
-            return (row + [""] * n)[:n]
-        commas = self.mark == "," and len(row) > n and all(_is_value(cell.strip()) for cell in row)
+        if any(cell.strip() for cell in row[n:]) or any(name not in _MAY_LACK for name in self.header[len(row) :]):
+            return row
+        return (*row, *[""] * n)[:n]
+
+    def error_of_row(self, path: Path, row: Sequence[str], number: int) -> FileError:
+        """Return the error of a row that has not as many cells as the header."""
+        commas = self.mark == "," and len(row) > len(self.header) and all(_is_value(cell.strip()) for cell in row)
         cure = "; a decimal comma cannot be told from one between cells: write 1.5, or separate cells by semicolons"
         found = f"the row has {len(row)} cells; row {self.at + 1} is taken for the header: {_in_words(self.header)}"
-        raise FileError(path, found, f"{n} cells as in the header{cure * commas}", row=number)
+        return FileError(path, found, f"{len(self.header)} cells as in the header{cure * commas}", row=number)
 
     def is_comment(self, row: Sequence[str]) -> bool:
-        """Return whether a row is a comment among readings."""
-        return len(row) != len(self.header) and 0 in self.numeric and row[0].lstrip().startswith("#")
+        """Return whether a row that has not as many cells as the header is a comment."""
+        return 0 in self.numeric and row[0].lstrip().startswith("#")
 
-    def ends_table(self, row: Sequence[str]) -> bool:
-        """Return whether a row after all others is no reading: empty, or a text or a summary below the table."""
-        first = next((cell.strip() for cell in row if cell.strip()), "")
-        if not first or 0 not in self.numeric or _is_value(first):
-            return not first
+    def is_below_table(self, row: Sequence[str]) -> bool:
+        """Return whether a row after all others is no reading, but a text or a summary."""
+        first = next(cell.strip() for cell in row if cell.strip())
+        if 0 not in self.numeric or _is_value(first):
+            return False
         return len(row) not in (len(self.header), self.width) or _SUMMARY.match(first) is not None
 
     def notes(self) -> list[str]:
@@ -257,11 +245,16 @@ def _count_up(cells: Sequence[str]) -> bool:
 
 def _names(row: Sequence[str], wanted: Sequence[str], width: int) -> list[str]:
     """Return the names of a header: on one line, without the # of a comment if such a column is wanted."""
-    names = [re.sub(_ESCAPED, "", re.sub(r"\s*[\r\n]\s*", " ", cell)) for cell in row]
+    names = [_not_escaped(re.sub(r"\s*[\r\n]\s*", " ", cell)) for cell in row]
     if names[0] in ("#", "%") and len(names) == width + 1:
         return names[1:]
     bare = names[0].lstrip("#% ")
     return [bare, *names[1:]] if bare in wanted else names
+
+
+def _not_escaped(cell: str) -> str:
+    """Return a cell without the apostrophe that keeps a text from being a formula."""
+    return cell[1:] if _ESCAPED.match(cell) else cell
 
 
 def _in_words(row: Sequence[str]) -> str:
@@ -305,55 +298,56 @@ def read_table(
     layout = _Layout.of_text(text, wanted)
     text, header = layout.separated(text), layout.header
     _require_distinct_columns(path, header, layout.at + 1)
-    n_lines = text.count("\n")
-    separator = next(c for c in itertools.chain("\x1f\x1e", map(chr, range(0xE000, 0x110000))) if c not in text)
-    unescape = partial(re.compile(_ESCAPED.replace("^", f"(?<![^{separator}])")).sub, "")
-    columns: list[list[str]] = [[] for _ in header]
-    rows: list[IntArray] = []
-    left_out: list[int] = []
-    n_read = 0
-    for records, failed, is_last in _read_in_chunks(text, layout.mark):
-        lengths = np.fromiter(map(len, records), dtype=np.int64, count=len(records))
-        blank = [k for k in np.flatnonzero(lengths <= 1) if not any(cell.strip() for cell in records[k])]
-        kept = np.delete(np.arange(len(records)), blank)
-        kept = kept[n_read + kept >= layout.first]
-        while is_last and failed is None and kept.size and layout.ends_table(records[kept[-1]]):
-            left_out += [n_read + int(kept[-1]) + 1] * any(records[kept[-1]])
-            kept = kept[:-1]
-        wrong = kept[lengths[kept] != len(header)]
-        comments = [k for k in wrong if layout.is_comment(records[k])]
-        left_out += [n_read + int(k) + 1 for k in comments]
-        for k in np.setdiff1d(wrong, comments):
-            records[k] = layout.row(path, records[k], n_read + int(k) + 1)
-        kept = np.setdiff1d(kept, comments) if comments else kept
-        for column, cells in zip(columns, zip(*(records[k] for k in kept), strict=True), strict=False):
-            column.append(separator.join(map(str.strip, cells)))
-        rows.append(n_read + kept + 1)
-        n_read += len(records)
-        if failed is not None:
-            found = f"not readable as CSV ({failed})"
-            raise FileError(path, found, "comma-separated cells, quotes closed", row=n_read + 1) from failed
-        progress(f"reading {path.name}", n_read, max(n_lines, n_read))
+    n_lines, number = text.count("\n"), 0
+    records, rows, left_out = list[tuple[str, ...]](), list[int](), list[int]()
+    failed: csv.Error | None = None
+    try:
+        for number, record in enumerate(
+            csv.reader(io.StringIO(text, newline=""), delimiter=layout.mark, strict=True), 1
+        ):
+            if number > layout.first and any(map(str.strip, record)):
+                if len(record) != len(header) and layout.is_comment(record):
+                    left_out.append(number)
+                else:
+                    records.append(tuple(record))  # which, unlike lists, cost the garbage collector nothing
+                    rows.append(number)
+            if number % _PROGRESS == 0:
+                progress(f"reading {path.name}", number, max(n_lines, number))
+    except csv.Error as error:
+        failed = error
+    while failed is None and records and layout.is_below_table(records[-1]):
+        left_out.append(rows.pop())
+        records.pop()
+    for k, cells in enumerate(records):
+        if len(cells) != len(header):
+            records[k] = layout.fitted_row(cells)
+            if len(records[k]) != len(header):
+                raise layout.error_of_row(path, cells, rows[k])
+    if failed is not None:
+        found = f"not readable as CSV ({failed})"
+        raise FileError(path, found, "comma-separated cells, quotes closed", row=number + 1) from failed
+    progress(f"reading {path.name}", number, max(n_lines, number))
     if not header:
         raise FileError(path, "the file is empty", "a header row and one row per reading")
     notes = layout.notes()
     if left_out:
         notes.append(f"{count_with_noun(len(left_out), 'row')} without readings left out (first: row {min(left_out)})")
-    joined = [unescape(separator.join(column)) for column in columns]
-    unnamed = [cells for name, cells in zip(header, joined, strict=True) if not name]
-    if n_filled := sum(bool(cells.strip(separator)) for cells in unnamed):
+    columns = [list(map(str.strip, cells)) for cells in zip(*records, strict=True)] or [list[str]() for _ in header]
+    columns = [list(map(_not_escaped, cells)) if "'" in "".join(cells) else cells for cells in columns]
+    unnamed = [cells for name, cells in zip(header, columns, strict=True) if not name]
+    if n_filled := sum(any(cells) for cells in unnamed):
         if n_filled > 1:
             found = "two columns without a name in the header"
             raise FileError(path, found, "a name for each column, or one without a name", row=layout.at + 1)
         notes.append("a column without a name, ignored")
     if len(unnamed) > n_filled or layout.width > len(header):
         notes.append("empty cells at the ends of rows ignored")
-    named = {name: cells for name, cells in zip(header, joined, strict=True) if name}
+    named = {name: cells for name, cells in zip(header, columns, strict=True) if name}
     is_time = ["X_Dimension", "Time"] in [row[:2] for row in layout.above]
     if time and time not in named and time_unit == "s" and is_time:
         named = {time if name == _X_VALUE else name: cells for name, cells in named.items()}
         notes.append(f"{_X_VALUE}, in s, is {time}")
-    table = CSVTable(path, named, separator, np.concatenate(rows), layout.at + 1)
+    table = CSVTable(path, named, rows, layout.at + 1)
     return _with_plain_numbers(table, notes, names, time, time_unit)
 
 
@@ -361,51 +355,28 @@ def _with_plain_numbers(
     table: CSVTable, notes: list[str], names: Sequence[str], time: str | None, time_unit: str
 ) -> CSVTable:
     """Rewrite the numbers and times of a table as plain numbers, and join the notes to one."""
-    end = re.escape(table.separator)
-    plain, dash = re.compile(f"[-+.0-9eE{end}]*"), re.compile(f"-({end}|$)")  # a dash alone is a word for missing
     odd = {
-        name: table.cells(name)
+        name: cells
         for name, cells in table.columns.items()
-        if name not in names and len(table) and (not plain.fullmatch(cells) or dash.search(cells))
+        if name not in names and not (_PLAIN.fullmatch("".join(cells)) and _DASHES.isdisjoint(cells))
     }
+    columns = dict(table.columns)
     try:
-        cells = [] if time is None or time not in table.columns else table.cells(time)
+        cells = [] if time is None else columns.get(time, [])
         if time and cells and (times := texts_to_times(time, cells, time_unit)) is not None:
-            table = table.with_cells(time, map(number_text, times[0].tolist()))
+            columns[time] = list(map(number_text, times[0].tolist()))
             odd.pop(time, None)
             notes.append(times[1])
         elif time in odd:
             require_unit_of_time(time, unit_of_cells(odd[time]), time_unit)
-        usual = [name for name in table.columns if name not in odd and name not in names and name != time]
-        rewritten, said = plain_cells(odd, lambda: {name: table.cells(name) for name in usual})
+        usual = [name for name in columns if name not in odd and name not in names and name != time]
+        rewritten, said = plain_cells(odd, lambda: {name: columns[name] for name in usual})
     except UnclearCellError as error:
-        cell = _cell_in_words(table.cells(error.name)[error.index])
-        row = table.row_number(error.index)
+        cell, row = _cell_in_words(table.columns[error.name][error.index]), table.rows[error.index]
         raise FileError(table.path, cell, error.allowed, row=row, column=error.name) from error
-    for name, cells in rewritten.items():
-        table = table.with_cells(name, cells)
     notes += said
-    return replace(table, notes=(f"{table.path.name}: {'; '.join(notes)}",) if notes else ())
-
-
-def _read_in_chunks(text: str, mark: str) -> Iterator[tuple[list[list[str]], csv.Error | None, bool]]:
-    """Yield lists of up to 2,000 records, each with the error that ended it, if any, and whether it is the last."""
-    # Not StringIO, which takes four bytes per character.
-    lines = io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8", newline="")
-    reader = csv.reader(lines, delimiter=mark, strict=True)
-    failed, before = None, list[list[str]]()
-    while failed is None:
-        records: list[list[str]] = []
-        try:
-            records.extend(itertools.islice(reader, _CHUNK))
-        except csv.Error as error:
-            failed = error
-        if before:
-            yield before, None, not records and failed is None
-        if not records and failed is None:
-            return
-        before = records
-    yield before, failed, True
+    said_how = (f"{table.path.name}: {'; '.join(notes)}",) if notes else ()
+    return replace(table, columns=columns | rewritten, notes=said_how)
 
 
 def _require_distinct_columns(path: Path, header: Sequence[str], row: int) -> None:

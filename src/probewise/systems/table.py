@@ -344,15 +344,15 @@ def read_run_table(
     columns: dict[str, NDArray[Any]] = {}
     for name in table.columns:
         if name == run:
-            columns[name] = np.array(table.cells(name))
+            columns[name] = np.array(table.columns[name])
         elif name == time:
             columns[name] = table.column_of_numbers(name)
         else:
             try:
                 columns[name] = table.column_of_numbers(name, missing=True, largest=None)
             except FileError:
-                columns[name] = np.array(table.cells(name))
-    return RunTable(columns, time, run, time_unit=time_unit, notes=table.notes, first_line=table.row_number(0))
+                columns[name] = np.array(table.columns[name])
+    return RunTable(columns, time, run, time_unit=time_unit, notes=table.notes, first_line=table.rows[0])
 
 
 def run_table_csv(table: RunTable) -> str:

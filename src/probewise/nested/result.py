@@ -397,9 +397,8 @@ class NestedResult(Samples):
     def load(cls, path: str | Path) -> NestedResult:
         """Read a file written by `save`; FileError if there is none, or it is damaged or of another format."""
         path = checked_path("path", path)
-        head, arrays = read_archive(path, "a file written by NestedResult.save")
-        if (found := head.pop("format", None)) != _FORMAT:
-            raise FileError(path, f"format {shown(found)}", f"{_FORMAT!r}; make the file anew with this version")
+        cure = "make the file anew with this version"
+        head, arrays = read_archive(path, _FORMAT, "a file written by NestedResult.save", cure=cure)
         odd = {*head, *arrays} ^ {f.name for f in fields(cls)}
         if odd:
             names = ", ".join(sorted(odd))
@@ -422,26 +421,30 @@ def archive_bytes(head: Mapping[str, object], arrays: Mapping[str, NDArray[Any]]
     return buffer.getvalue()
 
 
-def read_archive(path: Path, wanted: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Read the JSON object and the arrays of a file of `archive_bytes`; `wanted`, for messages, is what it should be.
+def read_archive(path: Path, form: str, wanted: str, *, cure: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read the JSON object, without its "format", and the arrays of a file of `archive_bytes`.
 
-    FileError if it is missing or no such file, or holds anything but what was written.
+    `wanted` is, for messages, what it should be. FileError if it is missing or no such file, its format is not `form`
+    (`cure`: the way out), or it holds anything but what was written.
     """
     try:
         # Opened here, since np.load leaves a damaged file open.
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {name: file[name] for name in file.files}
-        written = content.pop("sha256", None)  # files of earlier versions have none
-        if written is not None and str(written) != _digest(content):
+        written, head = content.pop("sha256", None), json.loads(str(content["head"]))
+        found = head.pop("format", None) if isinstance(head, dict) else None
+        if found == form and written is not None and str(written) != _digest(content):  # earlier files have none
             raise ValueError("it holds something else than was written")
-        head = json.loads(str(content.pop("head")))
-        return head if isinstance(head, dict) else {}, content
+        del content["head"]
     except FileNotFoundError as error:
         raise FileError(path, "there is no such file", wanted) from error
     except Exception as error:  # a damaged archive can raise whatever its parts do
         # NumPy takes any other file for a pickle, and its message would advise to load it.
         why = "no NumPy archive" if "pickle" in str(error) else message_of(error, kind=False)
         raise FileError(path, f"unreadable ({why})", wanted) from error
+    if found != form:
+        raise FileError(path, f"format {shown(found)}", f"{form!r}; {cure}")
+    return head, content
 
 
 def _digest(content: Mapping[str, NDArray[Any]]) -> str:

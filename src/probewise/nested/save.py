@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._writing import write_bytes_atomically
-from probewise.errors import FileError, NotSavedWarning, ParameterError, shown
+from probewise.errors import FileError, NotSavedWarning, ParameterError
 from probewise.nested.moves import Move
 from probewise.nested.problem import Evaluator, Points, Rows
 from probewise.nested.result import archive_bytes, read_archive
@@ -208,9 +208,8 @@ class CheckpointFile:
         """
         if not self.path.exists():
             return None
-        head, arrays = read_archive(self.path, "a checkpoint of this run; delete it to start anew")
-        if (found := head.get("format")) != _FORMAT:
-            raise FileError(self.path, f"format {shown(found)}", f"{_FORMAT!r}; delete the file to start anew")
+        cure = "delete the file to start anew"
+        head, arrays = read_archive(self.path, _FORMAT, "a checkpoint of this run; delete it to start anew", cure=cure)
         if head["settings"] != self.settings:
             raise self._error_for_other_settings(head["settings"])
         now = _run_state_from_file(head, arrays, move)

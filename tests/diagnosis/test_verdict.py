@@ -29,6 +29,15 @@ def verdict(probabilities, *, p_value=1e-6, aliases=(), same=(), **more):
     )
 
 
+def test_what_is_unknown_may_count_for_less_against_all_others():
+    found = ranked_hypotheses({((), ()): 0.4, (("unknown",), ()): 0.5, (("lag",), ()): 0.1}, unknown_weight=0.1)
+    assert {h.effects: h.probability for h in found} == {
+        (): pytest.approx(0.4 / 0.55),
+        ("unknown",): pytest.approx(0.05 / 0.55),
+        ("lag",): pytest.approx(0.1 / 0.55),
+    }
+
+
 def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_noise():
     found = ranked_hypotheses(
         {

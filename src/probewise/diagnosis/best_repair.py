@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.apparatus import SETTLED
 from probewise.diagnosis.evidence import SCALES, Linearised
 from probewise.diagnosis.fit import Fit, fit_each_start
 from probewise.diagnosis.held_out import (
@@ -29,7 +30,7 @@ from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.templates import TemplateBank
-from probewise.diagnosis.verdict import GlobalTest, Judged
+from probewise.diagnosis.verdict import GlobalTest, Judged, judge
 from probewise.recordings.plan import Recording
 
 
@@ -156,15 +157,27 @@ def judged_and_best_repair(
 ) -> tuple[Judged, BestRepair]:
     """Choose the fit that belongs to a verdict; the null if nothing was found.
 
-    Returns the verdict, withdrawn if the named effects predict held-out readings far worse; and the fit.
+    Returns the verdict, withdrawn if the named effects predict held-out readings far worse; and the fit. A formula that
+    predicts them no better than the null is none. If nothing unknown does, its odds against nothing on the mean are
+    those of the prior, if the latter is credible.
     """
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
         leading = searched.leading_combination_out_of_vocabulary()
-        fit = (
-            searched.best_refit_of(leading, noise) if leading else searched.likeliest_fit_beside_unknown(noise)
-        ) or null
-        return judged, BestRepair.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
+        fit = searched.best_refit_of(leading, noise) if leading else None
+        if fit is not None:
+            best = BestRepair.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
+            if best.improvement.heldout_log_density_per_reading > 0:
+                return judged, best
+        best = BestRepair.of(searched, test, searched.likeliest_fit_beside_unknown(noise) or null, noise, rng=rng)
+        if not _corrects_held_out_readings(searched, best):
+            on_noise, prior = searched.prepared.noise_effect_names, searched.prior
+            mean_is_right = sum(h.probability for h in judged.hypotheses if {*h.effects} <= on_noise)
+            if mean_is_right > 1 - SETTLED:
+                odds = prior.unknown / prior.clean_mean * mean_is_right / judged.unknown_probability
+                judged = judge(searched, test, unknown_weight=min(odds, 1.0))
+        if judged.verdict == "unknown":
+            return judged, best
     on_noise = searched.prepared.noise_effect_names
     if judged.verdict in ("named", "noise", "clean"):
         stated = tuple(name for name in judged.repaired_by if name in on_noise)
@@ -176,6 +189,14 @@ def judged_and_best_repair(
     ):  # a fit that fails on held-out readings is no repair
         return judged.with_verdict_withdrawn(), BestRepair.of(searched, test, null, noise, rng=rng)
     return judged, best
+
+
+def _corrects_held_out_readings(searched: Searched, best: BestRepair) -> bool:
+    """Return whether a correction by the best basis improves predictions of held-out parts, or of held-out blocks."""
+    prepared, bases = searched.prepared, searched.misfit_templates.unknown_bases
+    parts = prepared.apparatus.held_out_parts(prepared.recording), partition_into_blocks(prepared.recording)
+    corrections = (correct_by_best_basis(best.repaired, best.problem, bases, part) for part, _ in parts)
+    return any(fixed.held_out.per_reading > 0 for fixed in corrections)
 
 
 _ABOUT_EQUAL = 5.0  # nats

@@ -517,11 +517,8 @@ def _nodes_about(effect: NoiseEffect, about: Mapping[int, tuple[float, float]]) 
 def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
     """Return the log probability that every effect of a fit has a detectable size (lambda 4 or more).
 
-    The size is the norm, in noise sds, of the effect's change after a (linearised) refit of all other parameters; its
-    posterior is normal with unit sd. This probability, multiplied with the evidence, removes the part of a hypothesis
-    that readings cannot tell from the hypothesis without the effect.
-
-    `usable`: row numbers of the usable readings, (n_usable,).
+    The size is the norm, in noise sds, of its change after a linearised refit of all else; its posterior has unit sd.
+    Without this factor hypotheses would count that readings cannot tell from those without the effect.
     """
     sizes = linearised_sizes(found, law, usable, found.model.names)
     return float(sum(log_ndtr(size - LEAST_VISIBLE) for size in sizes))

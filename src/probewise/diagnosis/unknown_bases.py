@@ -60,12 +60,11 @@ def bank_of_unknown_effects(
     *,
     multiplied: Sequence[Covariate] = (),
 ) -> TemplateBank:
-    """Build the template bank of unknown effects: basis functions over every covariate.
+    """Build the template bank of unknown effects: basis functions over every covariate, in families of equal prior.
 
     `signal`, `slope`: predicted reading above its minimum, and its slope along the motion, (n_usable,) each; `scan`:
-    number of each usable row's scan, (n_usable,); rows of scans may be mixed. None: rows are in no order, and nothing
-    depends on the rows before. `multiplied`: covariates of which the product of every two is a basis; all products are
-    one family. Returns bank of bases, (n_usable, n_columns) each, labelled by family; families have equal prior weight.
+    number of each row's scan, (n_usable,), None where rows are in no order; `multiplied`: covariates of which the
+    product of every two is a basis, all in one family.
     """
     numbers = np.zeros(len(signal), dtype=np.int64) if scan is None else scan
     order = np.argsort(numbers, kind="stable")  # those of each scan together
@@ -92,10 +91,8 @@ def bank_of_unknown_effects(
 def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linearised) -> TemplateBank:
     """Return the bases without those that a template of a named effect holds, the fit's parameters projected out.
 
-    A basis of one column that is in or near a template's span, with a cosine of 0.9 or more, is left out: a window that
-    extends to the end of the recording, for instance, is the effect of a light switched on. A basis of several columns
-    that has a template's span, such as an offset for each run, becomes zero: as an unknown effect it explains nothing,
-    and its share of the prior is not given to the others.
+    A basis of one column with a cosine of 0.9 or more with a template's span is left out. One of several columns that
+    has its span becomes zero: it explains nothing, and its share of the prior is not given to the others.
     """
     if bases.widths.size == 0 or named.widths.size == 0:
         return bases

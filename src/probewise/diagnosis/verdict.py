@@ -140,31 +140,12 @@ class Hypothesis:
 class Judged:
     """The verdict on a recording, with probabilities.
 
-    Parameters
-    ----------
-    verdict
-        "clean", "named", "noise" (named, but all effects are on the noise), "unknown" or "cannot_tell".
-    combination
-        Most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown. Of a simulator,
-        if only the `shared` effects can be named, these and others of the `leader` with more than half the probability.
-    p_value
-        p-value of the global test of the mean, under the noise model found.
-    hypotheses
-        All hypotheses, most probable first; probabilities sum to one.
-    aliases
-        Pairs of aliased effects.
-    order_probabilities
-        Probability of each number of Gaussians of the SSF.
-    unknown_shares
-        Probability of each form, such as "place", that an unknown effect could have, given that there is one.
-    too_little
-        Whether there are too few readings for a verdict, or all are equal.
-    withdrawn
-        Whether the leading hypothesis is not stated because it predicts held-out readings far worse than the null.
-    shared
-        Effects that nearly all hypotheses have, whatever else acts; always () for a light sensor.
-    leader
-        Most probable set of effects that holds the `combination`, by which the model is repaired, if that is another.
+    `combination`: the most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown. Of a
+    simulator, if only the `shared` effects, which nearly all hypotheses have, can be named, these and others of the
+    `leader`, the set by which the model is repaired, with more than half the probability. `p_value`: of the global test
+    of the mean, under the noise model found. `hypotheses`: all, most probable first. `unknown_shares`: probability of
+    each form, such as "place", that an unknown effect could have. `too_little`: whether there are too few readings for
+    a verdict, or all are equal. `withdrawn`: whether the leader predicts held-out readings far worse than the null.
     """
 
     verdict: Verdict
@@ -223,8 +204,11 @@ class Judged:
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
 
-def judge(searched: Searched, test: GlobalTest) -> Judged:
-    """Return the verdict, with probabilities and aliases, from a search and the global test."""
+def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) -> Judged:
+    """Return the verdict, with probabilities and aliases, from a search and the global test.
+
+    The probability of what is out of vocabulary counts `unknown_weight` times against all others.
+    """
     prepared, posterior = searched.prepared, searched.posterior
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
@@ -247,7 +231,9 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
             named_needs_half=searched.prior.named_needs_half,
         )
 
-    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(searched, test.p_value, verdict_on)
+    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(
+        searched, test.p_value, verdict_on, unknown_weight=unknown_weight
+    )
     if (
         verdict == "unknown"
         and searched.prior.unknown_explains_most
@@ -277,6 +263,8 @@ def hypotheses_with_verdict(
     searched: Searched,
     p_value: float,
     verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]],
+    *,
+    unknown_weight: float = 1.0,
 ) -> tuple[tuple[Hypothesis, ...], Names, tuple[Verdict, Names]]:
     """Return the hypotheses, most probable first, the rare effects that they name (or ()), and the verdict on them.
 
@@ -295,7 +283,7 @@ def hypotheses_with_verdict(
         verdict, combination = verdict_on(hypotheses)
         if verdict == "named" and {*rare} <= {*combination}:
             return hypotheses, rare, (verdict, combination)
-    hypotheses = ranked_hypotheses(posterior.probabilities, shares)
+    hypotheses = ranked_hypotheses(posterior.probabilities, shares, unknown_weight=unknown_weight)
     return hypotheses, (), verdict_on(hypotheses)
 
 
@@ -358,6 +346,8 @@ def _unknown_if_out_of_vocabulary(mean: Names) -> Mapping[Names, float]:
 def ranked_hypotheses(
     probabilities: Mapping[tuple[Names, Names], float],
     reported_as: Callable[[Names], Mapping[Names, float]] = _unknown_if_out_of_vocabulary,
+    *,
+    unknown_weight: float = 1.0,
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 
@@ -368,7 +358,7 @@ def ranked_hypotheses(
     for (mean, noise), p in probabilities.items():
         for known, share in reported_as(mean).items():
             key = known if known == ("unknown",) else tuple(sorted((*known, *noise_effects_in_vocabulary(noise))))
-            joined[key] = joined.get(key, 0.0) + p * share
+            joined[key] = joined.get(key, 0.0) + p * share * (unknown_weight if key == ("unknown",) else 1.0)
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)

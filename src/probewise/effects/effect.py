@@ -33,6 +33,9 @@ AGAIN = "~again"
 PHASE = Uniform(-2 * np.pi, 2 * np.pi)
 """Prior of a phase, two full turns: every phase has an equivalent far from both ends."""
 
+ROWS_OF_A_SIDE = 5
+"""Least number of rows on which an effect rests, on either side where it is switched."""
+
 V = TypeVar("V")
 
 Act: TypeAlias = Callable[[Any, FloatArray, Any], Any]
@@ -320,7 +323,7 @@ class StepEffect(Effect):
     @cached_property
     def _variants(self) -> tuple[Effect, ...]:
         out = []
-        for low, high in pairwise(self.change_points.at):
+        for low, high in self.change_points.intervals:
             entries = self.entries.copy()
             entries[:, :, -1] = 0.5 * (low + high)
             priors = {**self.marginals, list(self.marginals)[-1]: Uniform(low, high)}
@@ -623,11 +626,18 @@ class ChangePoints:
     """Candidate positions of a change point, rising: times, row numbers (`by_row`) or values of a column.
 
     Between which two of them it lies is a discrete choice; its position in that interval does not affect any reading.
+    It does not lie between the two runs at whose `border`: what begins there is what differs from run to run.
     """
 
     at: tuple[float, ...]
     by_row: bool = False
     column: str = ""
+    border: float = math.inf
+
+    @property
+    def intervals(self) -> list[tuple[float, float]]:
+        """The intervals in which the change point may lie."""
+        return [(low, high) for low, high in pairwise(self.at) if not low <= self.border < high]
 
     @classmethod
     def of(cls, values: FloatArray, by_row: bool = False) -> Self:
@@ -648,13 +658,13 @@ class ChangePoints:
         """Return the masks of the rows after the middle of each interval, and a bank entry that acts on all rows."""
         always, along = entry.copy(), self.variable_at_rows(plan)
         always[:, -1] = -np.inf
-        return VariantMasks(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.at)]))
+        return VariantMasks(always, np.array([along > 0.5 * (low + high) for low, high in self.intervals]))
 
     def redrawn(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Redraw theta's last column: for each sample an interval by `weights`, (n_intervals,), uniform within it."""
-        at = np.array(self.at)
+        low, high = np.transpose(self.intervals)
         chosen = rng.choice(len(weights), len(theta), p=weights)
-        drawn = at[chosen] + np.diff(at)[chosen] * rng.random(len(theta))
+        drawn = low[chosen] + (high - low)[chosen] * rng.random(len(theta))
         return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
 
 

@@ -675,3 +675,42 @@ def test_what_a_parameter_jumps_by_has_its_unit():
     assert said == "tau_s jumps by -2.00 ± 0.10 s at 3.00 ± 0.20 s and stays there"
     said = forms["sensitivity:room_c"].sentence(np.array([0.5]), np.array([0.1]))
     assert said == "y changes by 0.50 ± 0.10 V per °C of room_c"
+
+
+def test_a_jump_of_the_gain_may_go_back_as_a_block_of_rows_in_another_unit_does():
+    form = FORMS["gain_step"]
+    assert form.prior.names == ("a", "until_s", "at_s")
+    found = _read("gain_step", 9.0, 4.0, 2.0)
+    np.testing.assert_allclose(found, np.where((_T > 2) & (_T <= 4), 10 * NOTHING, NOTHING))
+    never = form.bank()[0, 0, 1]
+    np.testing.assert_allclose(_read("gain_step", 9.0, never, 2.0), np.where(_T > 2, 10 * NOTHING, NOTHING))
+    steps = [variant for variant in form.variants() if variant.fixed]
+    blocks = [variant for variant in form.variants() if not variant.fixed]
+    assert sum(v.relative_odds for v in blocks) == pytest.approx(0.1 * sum(v.relative_odds for v in steps))
+    masks = form.variant_masks(TABLE)
+    for variant, mask in list(zip(form.variants(), masks.opened, strict=True))[:: len(blocks) // 40]:
+        a, until, at = variant.bank()[0, 0]
+        changed = _read("gain_step", a, until, at) != NOTHING
+        np.testing.assert_array_equal(changed, mask & (NOTHING != 0))
+    theta = form.redraw_by_variant(
+        np.tile([9.0, never, 2.0], (50, 1)), np.eye(len(masks.opened))[-1], rng=np.random.default_rng(0)
+    )
+    assert np.isfinite(form.variants()[-1].prior.log_prob(theta)).all()
+    assert (theta[:, 0] == 9.0).all()
+    assert "goes back" in form.sentence(np.array([9.0, 4.0, 2.0]), np.full(3, 0.1))
+
+
+def test_a_second_wave_of_a_column_is_the_shorter_of_two():
+    """Two that are both near its range are together a curve of it, which has a name."""
+    first, second = FORMS["periodic_error:drive"], FORMS["periodic_error:drive~again"]
+    assert second.marginals["period"].high == pytest.approx(first.marginals["period"].high / 2)
+    assert np.isfinite(second.prior.log_prob(second.bank()[:, 0])).all()
+
+
+def test_what_begins_with_the_second_of_two_runs_differs_from_run_to_run():
+    later = TABLE.with_columns({"t_s": np.linspace(0.0, 12.0, N_ROWS)})
+    about = ReferenceFit(ABOUT.system, later, np.zeros(2), SD)
+    at = [variant.marginals["at_s"] for variant in bind_forms(about)["offset_step"].variants()]
+    border = later.time_s[N_ROWS // 2 - 1 : N_ROWS // 2 + 1].mean()
+    assert len(at) == N_ROWS - 2
+    assert not any(prior.low < border < prior.high for prior in at)

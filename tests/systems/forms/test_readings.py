@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.templates import EffectTemplates
 from probewise.systems import Law, RunTable, Simulator
-from probewise.systems.forms.readings import Spline, delayed_readings, lagged_readings
+from probewise.systems.forms.readings import delayed_readings, lagged_readings
 
 _RNG = np.random.default_rng(1)
 _T = np.sort(_RNG.uniform(0, 10, 60))
@@ -21,30 +21,15 @@ def _rows(t=_T):
     return RunTable({"t": t, "y": _reading(t)}, time="t", run=None)
 
 
-def test_a_spline_goes_through_its_values_and_is_exact_for_a_parabola():
-    x = 1.0 - 0.5 * _T + 0.3 * _T**2
-    spline = Spline(_T, x[None])
-    gaps = np.arange(len(_T) - 1)[None]
-    np.testing.assert_allclose(spline.at(gaps, np.zeros(gaps.shape))[0], x[:-1])
-    np.testing.assert_allclose(spline.at(gaps, np.diff(_T)[None])[0], x[1:], atol=1e-9)
-    middle = 0.5 * (_T[1:] + _T[:-1])
-    np.testing.assert_allclose(
-        spline.at(gaps, 0.5 * np.diff(_T)[None])[0], 1 - 0.5 * middle + 0.3 * middle**2, atol=1e-9
-    )
-    np.testing.assert_allclose(spline.slopes[0], -0.5 + 0.6 * _T, atol=1e-8)
-
-
-def test_a_spline_has_no_kink_in_its_slope_or_bend():
-    spline = Spline(_T, _RNG.normal(size=(2, len(_T))))
-    after, before, third = spline.derivatives
-    np.testing.assert_allclose(before[:, :-1], after[:, 1:], rtol=1e-6, atol=1e-6 * np.abs(after).max())
-    np.testing.assert_allclose(third[:, [0, -1]] * spline.gaps[[0, -1]], 0.0, atol=1e-6 * np.abs(after).max())
-
-
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_a_few_rows_are_enough_for_a_spline(n):
-    spline = Spline(_T[:n], 2.0 * _T[None, :n])
-    np.testing.assert_allclose(spline.slopes, np.full((1, n), 2.0 if n > 1 else 0.0))
+def test_a_few_rows_are_enough_for_a_smooth_reading(n):
+    """A straight line of slope 2 from which the reading lags: 2 (t - tau + tau exp(-t / tau)), t since the start."""
+    since, tau = _T[:n] - _T[0], 0.3
+    line, setting = 2.0 * since[None], np.array([[tau, 1.0]])
+    expected = 2 * (since - tau + tau * np.exp(-since / tau))
+    np.testing.assert_allclose(lagged_readings(line, setting, _rows(_T[:n]))[0], expected, atol=1e-12)
+    late = delayed_readings(line, setting, _rows(_T[:n]))[0]
+    np.testing.assert_allclose(late, 2 * np.maximum(since - tau, 0), atol=1e-12)
 
 
 @pytest.mark.parametrize("tau", [0.01, 0.3, 2.0, 50.0])

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import (
     SCALES,
     Linearised,
@@ -287,66 +287,6 @@ class NoiseModels:
         return tuple(n for n in names if n not in self.certain)
 
 
-_PROPORTIONAL = 1e-9  # one minus the cosine of two templates
-_SAME_READINGS = 1e-3  # noise sds, the largest difference of two predictions
-_SAME_SLOPES = 1e-3  # of the norm of a slope
-
-
-def are_proportional(first: EffectTemplates, second: EffectTemplates) -> bool:
-    """Return whether all corresponding templates of two effects are proportional; False if both are one object."""
-    if first is second or [a.shape for a in first.settings] != [b.shape for b in second.settings]:
-        return False
-    if len(first.variants) != len(second.variants):
-        return False
-    a, b = (np.concatenate(templates.columns, axis=1) for templates in (first, second))
-    norms = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
-    return bool(np.all(np.abs(np.einsum("ij,ij->j", a, b)) >= (1 - _PROPORTIONAL) * norms) and np.all(norms > 0))
-
-
-@dataclass(frozen=True, eq=False)
-class TwinSwap:
-    """The exchange of an effect `name` for its `twin`, with the templates of both."""
-
-    name: str
-    of_first: EffectTemplates
-    twin: str
-    of_twin: EffectTemplates
-
-    def candidate_with_twin(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
-        """Return a candidate with the twin in place of the effect; None if this changes predictions or slopes."""
-        found = self._fit_with_twin(candidate.found, usable)
-        if found is None:
-            return None
-        weights = {self.twin if name == self.name else name: own for name, own in candidate.weights.items()}
-        return replace(candidate, found=found, weights=weights)
-
-    def _fit_with_twin(self, found: Fit, usable: IntArray) -> Fit | None:
-        effects, of = list(found.model.effects), self.of_first.variants
-        pair = next(((i, k) for i, held in enumerate(effects) for k, each in enumerate(of) if each is held), None)
-        if pair is None:
-            return None
-        at, variant = pair
-        held, effects[at] = effects[at], self.of_twin.variants[variant]
-        model = replace(found.model, effects=tuple(effects))
-        amplitudes = np.array(held.amplitudes, dtype=np.int64) + found.model.coordinate_slice(held.name).start
-        for sign in (1.0, -1.0):
-            z, slopes = found.z.copy(), found.slopes.copy()
-            z[amplitudes] *= sign
-            slopes[:, amplitudes] *= sign
-            predicted, own = (values[usable] for values in model.predict_and_differentiate(z))
-            if _has_same_predictions(predicted, own, replace(found, slopes=slopes)):
-                residuals = found.residuals + found.predicted - predicted
-                return replace(found, model=model, z=z, predicted=predicted, residuals=residuals, slopes=own)
-        return None
-
-
-def _has_same_predictions(predicted: FloatArray, slopes: FloatArray, found: Fit) -> bool:
-    if not np.abs(predicted - found.predicted).max() <= _SAME_READINGS * found.sd:
-        return False
-    apart, norms = np.linalg.norm(slopes - found.slopes, axis=0), np.linalg.norm(found.slopes, axis=0)
-    return bool(np.all(apart <= _SAME_SLOPES * norms + _SAME_READINGS * found.sd))
-
-
 _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
 
 
@@ -394,8 +334,6 @@ class Refits:
     templates: TemplateCache
     known: dict[tuple[WeighedFit, NamedEffect[Any], float], Extended] = field(default_factory=dict, repr=False)
     """Refits with one more effect, by the candidate, the effect, and the nats against it."""
-    twins: dict[WeighedFit, tuple[WeighedFit, TwinSwap]] = field(default_factory=dict, repr=False)
-    """Refits taken from those of twins, with the refit and the exchange of effects."""
     plain: dict[WeighedFit, WeighedFit | None] = field(default_factory=dict, repr=False)
     """Nulls as fitted under the plainest noise, where they predict otherwise."""
     scored: dict[tuple[Fit, NoiseLaw, TemplateBank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
@@ -472,50 +410,19 @@ class Refits:
     def refit_with_effect(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
         """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
 
-        A refit made before is returned as it was; an effect that changes the readings exactly as one refitted before
-        takes over that fit and evidence.
+        A refit made before is returned as it was.
 
         Returns the fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats;
         and the effect's log Bayes factor by screening, by noise model.
         """
         key = parent, effect, against
         if key not in self.known:
-            twin = self._refit_taken_from_twin(parent, effect, against) or self._refit_taken_from_parents_twin(
-                parent, effect, against
-            )
-            self.known[key] = twin or self._refit_with_likely_variants(parent, effect, against)
+            self.known[key] = self._refit_with_likely_variants(parent, effect, against)
         return self.known[key]
 
     def replace_fit(self, held: WeighedFit, better: WeighedFit) -> None:
         """Use the fit `better` in place of `held`, of the same combination, in later calls of `refit_with_effect`."""
         self.known.update({key: (better, scores) for key, (fit, scores) in self.known.items() if fit is held})
-
-    def _refit_taken_from_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
-        """Take over an earlier refit of the parent with an effect of proportional templates (a twin); None: no twin."""
-        own = self.templates.templates_of(parent.found, effect)
-        for (held, other, less), (candidate, scores) in list(self.known.items()):
-            if (
-                held is parent
-                and less == against
-                and are_proportional(own, self.templates.templates_of(held.found, other))
-            ):
-                swap = TwinSwap(other.name, self.templates.templates_of(held.found, other), effect.name, own)
-                twin = swap.candidate_with_twin(candidate, self.templates.usable)
-                if twin is not None:
-                    self.twins[twin] = candidate, swap
-                    return twin, scores
-        return None
-
-    def _refit_taken_from_parents_twin(
-        self, parent: WeighedFit, effect: NamedEffect[Any], against: float
-    ) -> Extended | None:
-        """Take over a refit of this effect where the parent's last effect is replaced by its twin; None: no twin."""
-        first, swap = self.twins.get(parent, (None, None))
-        known = None if first is None else self.known.get((first, effect, against))
-        if known is None or swap is None:
-            return None
-        twin = swap.candidate_with_twin(known[0], self.templates.usable)
-        return None if twin is None else (twin, known[1])
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)

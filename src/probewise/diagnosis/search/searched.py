@@ -26,9 +26,11 @@ from probewise.diagnosis.search.refits import (
 )
 from probewise.diagnosis.templates import TemplateBank, TemplateCache
 from probewise.effects import PROPOSAL, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.effects.noise import Outliers
 from probewise.sensor import Stage
 
+_TIE = 1e-4  # nats between hypotheses that are one
 _BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
 _NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, as a smaller misfit beside it would
 
@@ -122,7 +124,8 @@ class Evidences:
         """Return whether effects on the mean that beat outlying readings change no other readings than those.
 
         Outlying readings are beyond doubt then without an effect. Jumps before the last reading, or delays past the
-        first, are many ways to say the same; the others differ by less than the three nats that tell aliases apart.
+        first, are many ways to say the same of fewer than five rows; the others differ by less than the three nats that
+        tell aliases apart.
         """
         noise = tuple(sorted({Outliers.name, *certain}))
         nulls = [fit for (_, names), fit in self.fits.items() if not names and {noise, certain} <= fit.evidence.keys()]
@@ -138,7 +141,10 @@ class Evidences:
         narrow = 1 - outlier_probabilities(null.found.residuals, law)
         sd = law.likeliest_sigma_of(null.found.residuals)
         apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
-        return all(0.5 * float(narrow @ change**2) < ALIASED_NATS for change in apart)
+        return all(
+            0.5 * float(narrow @ change**2) < ALIASED_NATS and np.count_nonzero(np.abs(change) > 1) < ROWS_OF_A_SIDE
+            for change in apart
+        )
 
     def _largest_log_z(self, names: Names) -> float:
         """Return a combination's largest log evidence over SSF orders and noise models; minus infinity: no fit."""
@@ -203,9 +209,12 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
 
     for names, noise in log_p:
         log_p[names, noise] += -math.log(n_forms) + log_prior_on_noise(noise, alone=not names)
-    # Exact aliases differ by rounding errors, which depend on the machine. To a millionth of a nat they tie; of those
-    # that tie the one with fewer effects, on a reading before a parameter or a rate, comes first.
-    log_p = {key: round(value, 6) if math.isfinite(value) else value for key, value in log_p.items()}
+    # Exact aliases differ by rounding errors, which depend on the machine: within a ten-thousandth of a nat they tie.
+    # Of those that tie the one with fewer effects, on a reading before a parameter or a rate, comes first.
+    level = math.inf
+    for key in sorted(log_p, key=lambda key: -log_p[key]):
+        level = level if level - log_p[key] < _TIE else log_p[key]
+        log_p[key] = level
     log_p = dict(sorted(log_p.items(), key=lambda item: (-item[1], *map(_plainness, item[0]))))
     total = float(logsumexp(list(log_p.values())))
     nulls = {n: fit for (n, names), fit in evidences.fits.items() if not names}
@@ -295,11 +304,11 @@ class Searched:
         )
 
     def likeliest_fit_beside_unknown(self, noise: Names) -> WeighedFit | None:
-        """Return the fit that, with an unknown effect added, is most probable under a noise model, if any."""
+        """Return the fit by names alone that, with an unknown effect added, is most probable under a noise, if any."""
         scores = {
             (n, names): value + self.prior.log_prior_with_unknown(names)
             for (n, names, own), value in self.evidences.unknown.items()
-            if own == noise
+            if own == noise and not effects_out_of_vocabulary(names)
         }
         return self.evidences.fits[max(scores, key=lambda key: scores[key])] if scores else None
 

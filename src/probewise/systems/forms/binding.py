@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import AGAIN, PROPOSAL
 from probewise.errors import ParameterError
+from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, Form, StepForm, WaveForm
 from probewise.systems.forms.formulas import formula_forms
@@ -37,10 +38,22 @@ def bind_forms(about: ReferenceFit) -> dict[str, Form]:
     if not about.rows_are_in_order:
         named = [form for form in named if form.name.split(":")[0] not in _IN_ORDER]
     if (column := sorting_column(about)) is not None:
-        named = [jump_in_sorted_rows(form, about.table, column) for form in named]
+        along = covariate_of_column(column)
+        named = [replace(f, covariates=(along, *f.covariates)) if _jumps_at_row(f) else f for f in named]
     found = [*named, *forms_of_extras(about)]
-    waves = [replace(form, name=form.name + AGAIN) for form in found if isinstance(form, WaveForm)]
+    waves = [_second_wave(form) for form in found if isinstance(form, WaveForm)]
     return {form.name: form for form in [*found, *waves]}
+
+
+def _second_wave(form: Form) -> Form:
+    """Return a second wave; of a column it is the shorter, for two that are near its range are together a curve."""
+    again = replace(form, name=form.name + AGAIN)
+    if not form.name.startswith("periodic_error:"):
+        return again
+    period = cast(LogUniform, form.marginals["period"])
+    shorter = replace(period, high=max(0.5 * period.high, 1.1 * period.low))
+    entries = form.entries[form.entries[:, 0, 1] < shorter.high]
+    return replace(again, parameters={**form.marginals, "period": shorter}, entries=entries)
 
 
 _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
@@ -60,29 +73,13 @@ def sorting_column(about: ReferenceFit) -> str | None:
     return next((name for name in driving_columns(about) if name in ordered), None) if ordered else None
 
 
-def jump_in_sorted_rows(form: Form, table: RunTable, column: str) -> Form:
-    """Return a form with a jump at a row as one that shows in the column, and says where that is; others as given."""
-    if not isinstance(form, StepForm) or not form.change_points.by_row:
-        return form
-    values = table.covariates[column]
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        before = int(np.clip(np.floor(mean[-1]), 0, len(values) - 1))
-        return (
-            f"{form.says(mean, sd)}; rows are sorted by {column}, so it may be where {column} passes "
-            f"{values[before]:.4g} instead"
-        )
-
-    return replace(form, covariates=(covariate_of_column(column), *form.covariates), says=says)
-
-
 def names_of_jumps_in_sorted_rows(effects: Mapping[str, Any]) -> frozenset[str]:
-    """Return the names of the effects that `jump_in_sorted_rows` has changed."""
-    return frozenset(
-        name
-        for name, effect in effects.items()
-        if isinstance(effect, StepForm) and effect.change_points.by_row and effect.covariates[0] != "row"
-    )
+    """Return the names of jumps at a row that may be jumps along the column that sorts the rows."""
+    return frozenset(name for name, form in effects.items() if _jumps_at_row(form) and form.covariates[0] != "row")
+
+
+def _jumps_at_row(effect: Any) -> bool:
+    return isinstance(effect, StepForm) and effect.change_points.by_row
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,21 +147,8 @@ def rebind_forms(
 ) -> dict[str, Form]:
     """Bind the forms of these names to a recording again; return them by name, without names of other effects.
 
-    Parameters
-    ----------
-    names
-        Names of forms and proposals.
-    simulator
-        The simulator.
-    known
-        The recording, and the predictions of the fit, to which they were bound.
-    more_runs
-        Runs outside the recording, for which forms with one value per run also get a value.
-
-    Raises
-    ------
-    ParameterError
-        If a proposal cannot be rebound.
+    `known` is the recording with the predictions of the fit to which they were bound; for `more_runs` outside it, forms
+    with one value per run also get a value. Raises ParameterError if a proposal cannot be rebound.
     """
     wanted = list(dict.fromkeys(names))
     found = _bind_wanted_forms(wanted, simulator, known)

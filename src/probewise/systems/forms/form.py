@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from typing import Any, Self, TypeAlias
+
+import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
-from probewise.effects.effect import Act, Effect, Fixed, Say, StepEffect, WaveEffect
+from probewise.effects.effect import Act, Effect, Fixed, Say, StepEffect, VariantMasks, WaveEffect, thinned
 from probewise.effects.priors import HeavyTailedPrior
+from probewise.priors import Uniform
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.table import RunTable
 
@@ -17,6 +22,8 @@ AMPLITUDE, POSITIVE = HeavyTailedPrior(1.0), HeavyTailedPrior(1.0, positive=True
 """Priors of amplitudes of a form before `ReferenceFit.scaled` finds their typical size: of either sign, or positive."""
 
 _FLAG_WIDTH = 1e-9  # of its prior
+_BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
+_BLOCKS = 0.1  # odds of a step that goes back: as those of a second wave
 
 ActBetween = Callable[[BetweenRows, FloatArray], BetweenRows]
 """Function of what other effects do between the rows and parameters (n_samples, n_params); adds the effect's."""
@@ -27,7 +34,7 @@ Form: TypeAlias = Effect
 StepForm: TypeAlias = StepEffect
 WaveForm: TypeAlias = WaveEffect
 
-__all__ = ["AMPLITUDE", "POSITIVE", "Act", "ActInTime", "Fixed", "Form", "Say", "StepForm", "WaveForm"]
+__all__ = ["AMPLITUDE", "POSITIVE", "Act", "ActInTime", "BlockForm", "Fixed", "Form", "Say", "StepForm", "WaveForm"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,55 @@ class ActInTime:
     def __call__(self, value: Any, theta: FloatArray, table: RunTable) -> Any:
         """Return the stage's value at the rows with the effect."""
         return self.at_rows(value, theta, table)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlockForm(StepForm):
+    """A step that may go back: its last parameters are its end, of prior `never` where it stays, and its begin.
+
+    In so many intervals, `most`, a block of rows may begin or end; all blocks have a tenth of the odds of all steps.
+    """
+
+    never: Fixed
+    most: int = _BLOCK_ENDS
+
+    @cached_property
+    def _ends(self) -> list[tuple[tuple[float, float], tuple[float, float] | None]]:
+        """Intervals of the begin and of the end, None for a step, of each variant."""
+        thinner = replace(self.change_points, at=thinned(np.array(self.change_points.at), self.most))
+        return [*((begin, None) for begin in self.change_points.intervals), *combinations(thinner.intervals, 2)]
+
+    @cached_property
+    def _variants(self) -> tuple[Form, ...]:
+        n_steps, out = len(self.change_points.intervals), []
+        _, name_of_end, name_of_begin = self.marginals
+        odds = max(len(self._ends) - n_steps, 1) / (_BLOCKS * n_steps)
+        never = replace(self.never, odds=odds)
+        for begin, end in self._ends:
+            last: Uniform = never if end is None else Uniform(*end)
+            entries = self.entries.copy()
+            entries[:, :, 1:] = [0.5 * (last.low + last.high), 0.5 * sum(begin)]
+            priors = {**self.marginals, name_of_end: last, name_of_begin: Uniform(*begin)}
+            out.append(replace(self, parameters=priors, entries=entries))
+        return tuple(out)
+
+    def with_fewer_variants(self) -> Self:
+        """Return the form with fewer begins and ends."""
+        return replace(self, change_points=self.change_points.fewer(), most=_FEW_BLOCK_ENDS)
+
+    def variant_masks(self, plan: Any) -> VariantMasks | None:
+        """Return the masks of the rows from each begin to each end."""
+        along, always = self.change_points.variable_at_rows(plan), self.entries[0].copy()
+        always[:, 1:] = -np.inf
+        between = [(sum(begin) / 2, np.inf if end is None else sum(end) / 2) for begin, end in self._ends]
+        return VariantMasks(always, np.array([(along > begin) & (along < end) for begin, end in between]))
+
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw end and begin: a variant by `weights`, (n_variants,), each uniform within its interval."""
+        chosen = rng.choice(len(weights), len(theta), p=weights)
+        priors = [self._variants[k].prior for k in chosen]
+        drawn = [prior.from_unit_cube(rng.random((1, 3)))[0, 1:] for prior in priors]
+        return np.concatenate([theta[:, :1], drawn], axis=1)
 
 
 def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from probewise._arrays import FloatArray, varies
 from probewise._words import value_with_sd
@@ -38,9 +39,7 @@ _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter
 _MOST_SQUARE_WAVES = 160  # periods of a square wave that are tried
 _ROWS_OF_A_WAVE = 6  # least rows per period: with fewer a square wave is not told from a sinusoid
 _SOFT = 0.5  # steepness of its edges to begin with: at 1 it is nearly a sinusoid
-# Mean number of waves in the recording, up to which a wave whose frequency changes is tried, in steps of a half: faster
-# ones would need tens of thousands of templates, gigabytes in a long table.
-_MOST_SWEPT = 40
+_MOST_SWEPT = 40  # waves in the recording of which the frequency may change: faster ones would need gigabytes
 _SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the recording: phases to within a radian
 _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart they are in the row of those
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
@@ -326,17 +325,11 @@ def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
 
 def _covariates_of_term(about: ReferenceFit, side: str, term: _Term) -> tuple[str, ...]:
     """Return the covariates along which a term's variables show: "level", "time", a state's or a column's."""
-    reading = about.system.simulator.reading
-    return tuple(
-        f"state:{name}"
-        if name in about.states and (side == "rate" or name == reading)
-        else "level"
-        if name == reading
-        else "time"
-        if name == about.table.time
-        else covariate_of_column(name)
-        for name in dict.fromkeys(variable.name for variable in term.variables)
-    )
+    reading, time = about.system.simulator.reading, about.table.time
+    states = [state for state in about.states if side == "rate" or state == reading]
+    known = {str(time): "time", reading: "level"} | {state: f"state:{state}" for state in states}
+    names = dict.fromkeys(variable.name for variable in term.variables)
+    return tuple(known.get(name) or covariate_of_column(name) for name in names)
 
 
 def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
@@ -486,10 +479,7 @@ def _integral_since_start_of_run(values: FloatArray, rows: RunTable, *, in_time:
     """Return the integral of values over time from the start of each row's run, (n_points,); or their sum over rows."""
     out = np.zeros(len(rows))
     for own in rows.rows_by_scan():
-        if not in_time:
-            out[own] = np.cumsum(values[own])
-        elif own.size:
-            widths = np.diff(rows.time_s[own], prepend=rows.time_s[own][0])
-            before = np.append(values[own][:1], values[own][:-1])
-            out[own] = np.cumsum(widths * 0.5 * (values[own] + before))
+        if own.size:
+            at = rows.time_s[own]
+            out[own] = cumulative_trapezoid(values[own], at, initial=0) if in_time else np.cumsum(values[own])
     return out

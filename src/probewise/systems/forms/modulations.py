@@ -16,7 +16,18 @@ from probewise.effects.priors import SharedScalePrior
 from probewise.effects.reference import is_far_from_zero
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, ActBetween, Form, StepForm, WaveForm, period_with_sd
+from probewise.systems.forms.form import (
+    AMPLITUDE,
+    POSITIVE,
+    Act,
+    ActBetween,
+    BlockForm,
+    Fixed,
+    Form,
+    StepForm,
+    WaveForm,
+    period_with_sd,
+)
 from probewise.systems.forms.reference import ReferenceFit
 from probewise.systems.law_inputs import Jump
 from probewise.systems.table import RunTable, covariate_of_column
@@ -33,11 +44,9 @@ _MOST_OF_ONE_SCALE = 24  # values per run: with 36 a vector of typical length ha
 
 
 def origin_of_column(values: FloatArray) -> float:
-    """Return the origin from which an effect counts a column, (n_points,), in its unit: 0 unless that is far away.
+    """Return the origin from which an effect counts a column, (n_points,): 0, or the least value if that is far away.
 
-    Where all values are more than ten times the column's range from 0, as times in seconds of the epoch are, the origin
-    is the least of them. Counted from 0, a drift would be a constant, and a phase would turn with the last digit of a
-    frequency.
+    Far is more than ten times the column's range, as seconds of the epoch are: a drift from 0 would be a constant.
     """
     least = float(np.nanmin(values))
     return least if is_far_from_zero(values, float(np.nanmax(values)) - least) else 0.0
@@ -78,10 +87,8 @@ def trial_frequencies(
 ) -> FloatArray:
     """Return trial frequencies along a covariate, (n_trial,), rising evenly from `least_waves` / range.
 
-    A wave slower than one in the range is never seen as a whole: nothing tells it from a drift or a bend. They go up to
-    one wave in `rows_each` rows or `most_waves` / range, and to 2 `least_waves` / range at least, in steps of about
-    half the resolution; where that gives fewer than 8 or more than `most`, there are 8 or `most`. `groups` are the rows
-    of each run.
+    Nothing tells a slower wave from a bend. They go up to one wave in `rows_each` rows of a group or `most_waves` /
+    range, in steps of about half the resolution, but there are 8 at least and `most` at most.
     """
     reach = float(np.ptp(values))
     highest = _frequency_of_median_gap(values, groups, rows_each)
@@ -119,11 +126,8 @@ class Peaks:
 def residual_peaks(about: ReferenceFit, tried: FloatArray) -> Peaks:
     """Find the frequencies in time at which the residuals of a fit have peaks, where those `tried` are too sparse.
 
-    Times that come in clusters, as of readings in bursts or with a long pause, tell waves apart that are much faster
-    than their average spacing: up to one wave in two median gaps. Of such frequencies there may be 100,000, too many to
-    try each. A fast Fourier transform of the residuals finds the eight highest peaks in each of 64 bands, of one width
-    in log frequency, so that slow noise hides no fast wave. There are none where `tried`, (n_trial,), has gaps of about
-    half the resolution at most and reaches as high.
+    Clustered times tell waves apart up to one in two median gaps, far too many to try each. A fast Fourier transform
+    finds the eight highest peaks in each of 64 bands, of one width in log frequency, so that slow noise hides no wave.
     """
     times, groups = _times_of_readings(about)
     residuals, reach = _weighted_residuals(about), float(np.ptp(times))
@@ -178,9 +182,8 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `form` is a function of the quantity's name and unit that returns its form, of amplitude 1, which acts on nothing
-    yet. `between_rows` is a function of the name of a parameter that varies so, where it does not go on between the
-    rows of a law as the law's `hold` says.
+    `form` returns its form, of amplitude 1, from the quantity's name and unit; `between_rows` what a parameter of some
+    name does between the rows of a law, where that is not as the law's `hold` says.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
@@ -229,39 +232,56 @@ def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
     )
 
 
-def change_point_step_modulation(table: RunTable, time_unit: str) -> Modulation:
-    """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number."""
+def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bool = False) -> Modulation:
+    """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number; it may go back."""
     by_row = not table.has_varying_time
-    change_points = ChangePoints.of(np.arange(float(len(table))) if by_row else table.time_s, by_row=by_row)
+    along = np.arange(float(len(table))) if by_row else table.time_s
+    ends = sorted((along[rows].max(), along[rows].min()) for rows in table.rows_by_scan())
+    change_points = ChangePoints.of(along, by_row=by_row)
+    if len(ends) == 2 and ends[0][0] < ends[1][1] and len(change_points.at) > 5:
+        change_points = replace(change_points, border=float(ends[0][0]))
     first, last = change_points.at[0], change_points.at[-1]
 
     def form(what: str, unit: str) -> Form:
         def says(mean: FloatArray, sd: FloatArray) -> str:
             jump = f"{what} jumps by {value_with_sd(mean[0], sd[0], unit)}"
+            until = "and stays there"
             if by_row:  # a point between two rows, counted from 0
-                return f"{jump} at row {int(mean[1]) + 3} of the table (the header is row 1) and stays there"
-            return f"{jump} at {value_with_sd(mean[1], sd[1], time_unit)} and stays there"
+                if may_end and mean[1] > mean[2]:
+                    until = f"and goes back at row {int(mean[1]) + 3}"
+                return f"{jump} at row {int(mean[-1]) + 3} of the table (the header is row 1) {until}"
+            if may_end and mean[1] > mean[2]:
+                until = f"and goes back at {value_with_sd(mean[1], sd[1], time_unit)}"
+            return f"{jump} at {value_with_sd(mean[-1], sd[-1], time_unit)} {until}"
 
-        return StepForm(
-            name="",
-            stage=Stage.OFFSET,
-            parameters={"a": AMPLITUDE, "at_row" if by_row else "at_s": Uniform(first, last)},
-            units=(unit, "row" if by_row else time_unit),
-            covariates=("row",) if by_row else ("time",),
-            act=_unbound,
-            entries=np.array([[[1.0, 0.5 * (first + last)]]]),
-            says=says,
-            change_points=change_points,
+        place, unit_of_place = ("row", "row") if by_row else ("s", time_unit)
+        never = Fixed(first - 2.0, first - 1.0)
+        ends, more = ({f"until_{place}": never}, {"never": never}) if may_end else ({}, {})
+        kind: Any = BlockForm if may_end else StepForm
+        return cast(
+            Form,
+            kind(
+                name="",
+                stage=Stage.OFFSET,
+                parameters={"a": AMPLITUDE, **ends, f"at_{place}": Uniform(first, last)},
+                units=(unit, *(unit_of_place for _ in ends), unit_of_place),
+                covariates=("row",) if by_row else ("time",),
+                act=_unbound,
+                entries=np.array([[[1.0, *(first - 1.5 for _ in ends), 0.5 * (first + last)]]]),
+                says=says,
+                change_points=change_points,
+                **more,
+            ),
         )
 
     def jump_in_time(parameter: str) -> ActBetween:
         return lambda between, theta: between.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))
 
-    return Modulation(
-        lambda theta, rows: np.asarray(theta[:, :1] * (change_points.variable_at_rows(rows) > theta[:, 1:2])),
-        form,
-        None if by_row else jump_in_time,
-    )
+    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
+        at, begin, end = change_points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]
+        return np.asarray(theta[:, :1] * ((at > begin) & ((at <= end) | (end <= begin))))
+
+    return Modulation(at_rows, form, None if by_row else jump_in_time)
 
 
 def value_per_run_modulation(table: RunTable) -> Modulation:

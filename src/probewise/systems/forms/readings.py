@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
-from scipy.linalg import solve_banded
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
-from probewise.effects.effect import single_column_bank
+from probewise.effects.effect import ROWS_OF_A_SIDE, single_column_bank
 from probewise.effects.reading import decaying_sum
 from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
@@ -26,7 +24,7 @@ from probewise.systems.forms.modulations import (
     sinusoid_modulation,
     value_per_run_modulation,
 )
-from probewise.systems.forms.reference import ROWS_OF_A_SIDE, ReferenceFit, switch_points
+from probewise.systems.forms.reference import ReferenceFit, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
 _N_SIZES = 9
@@ -39,63 +37,19 @@ _NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
 _OUTLYING = 5.0  # medians of the residual's size
 
 
-@dataclass(frozen=True, eq=False)
-class Spline:
-    """Splines through values (n_samples, n) at rising times (n,), twice differentiable, a parabola in each end segment.
+def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the cubic in the time since the row before of each gap, highest power first, (4, n_samples, n - 1).
 
-    Of rows at the same time the last counts.
+    They are splines through values (n_samples, n) at rising times (n,); of rows at the same time the last counts.
     """
+    from scipy.interpolate import CubicSpline  # a third of a second, which few diagnoses need
 
-    time: FloatArray
-    values: FloatArray
-
-    @cached_property
-    def gaps(self) -> FloatArray:
-        """Time from each row to the next, (n - 1,)."""
-        return np.diff(self.time)
-
-    @cached_property
-    def slopes(self) -> FloatArray:
-        """First derivative at each row, (n_samples, n)."""
-        last = np.append(self.gaps > 0, True)
-        x = self.values[:, last]
-        h = np.diff(self.time[last])
-        if len(h) == 0:
-            return np.zeros_like(self.values)
-        secants = np.diff(x, axis=1) / h
-        if len(h) == 1:
-            slopes = np.repeat(secants, 2, axis=1)
-        else:
-            n = len(h) + 1
-            bands, right = np.zeros((3, n)), np.empty_like(x)
-            bands[1, [0, -1]] = bands[0, 1] = bands[2, -2] = 1.0
-            bands[1, 1:-1] = 2 * (h[:-1] + h[1:])
-            bands[0, 2:], bands[2, :-2] = h[:-1], h[1:]
-            right[:, 0], right[:, -1] = 2 * secants[:, 0], 2 * secants[:, -1]
-            right[:, 1:-1] = 3 * (h[1:] * secants[:, :-1] + h[:-1] * secants[:, 1:])
-            slopes = np.asarray(solve_banded((1, 1), bands, right.T, check_finite=False)).T
-        return np.asarray(slopes[:, np.cumsum(last) - last])
-
-    @cached_property
-    def derivatives(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Second derivative after and before each gap, and third derivative in it, (n_samples, n - 1) each."""
-        h = np.where(self.gaps > 0, self.gaps, 1.0)
-        before, after = self.slopes[:, :-1], self.slopes[:, 1:]
-        secants = np.diff(self.values, axis=1) / h
-        return (
-            (6 * secants - 4 * before - 2 * after) / h,
-            (2 * before + 4 * after - 6 * secants) / h,
-            6 * (before + after - 2 * secants) / h**2,
-        )
-
-    def at(self, gap: IntArray, since: FloatArray) -> FloatArray:
-        """Return the values in the gaps `gap` after the time `since` from their start, (n_samples, n_asked) each."""
-        second, _, third = self.derivatives
-        start, slope, bend, twist = (
-            np.take_along_axis(np.broadcast_to(own, (len(gap), own.shape[1])), gap, axis=1)
-            for own in (self.values[:, :-1], self.slopes[:, :-1], second, third)
-        )
-        return np.asarray(start + since * (slope + since * (bend / 2 + since * twist / 6)))
+    out, passes = np.zeros((4, len(values), len(time) - 1)), np.diff(time) > 0
+    out[3] = values[:, :-1]
+    if passes.any():
+        last = np.append(passes, True)
+        out[:, :, passes] = CubicSpline(time[last], values[:, last], axis=1).c.transpose(0, 2, 1)
+    return out
 
 
 def late_forms(about: ReferenceFit) -> Iterator[Form]:
@@ -158,22 +112,22 @@ def lagged_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> Fl
             carry = np.where(tau > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)), 0.0)
         gain = (1 - carry) * x[:, 1:]
         if smooth.any():
-            gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(Spline(time, x), tau, carry), gain)
+            gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(time, x, tau, carry), gain)
         added, kept = np.insert(gain, 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
         out[:, rows] = decaying_sum(added, kept, longest=len(rows))
     return out
 
 
-def _gain_of_smooth_readings(spline: Spline, tau: FloatArray, carry: FloatArray) -> FloatArray:
+def _gain_of_smooth_readings(time: FloatArray, x: FloatArray, tau: FloatArray, carry: FloatArray) -> FloatArray:
     """Return what each gap adds to `carry` times the lagging reading before it, (n_samples, n - 1).
 
     Of a cubic x the lagging reading is x - tau x' + tau^2 x'' - tau^3 x''' once the start is forgotten.
     """
-    second_after, second_before, third = spline.derivatives
-    late = tau**2 * np.stack([second_after, second_before]) - tau**3 * third
-    begin = spline.values[:, :-1] - tau * spline.slopes[:, :-1] + late[0]
-    end = spline.values[:, 1:] - tau * spline.slopes[:, 1:] + late[1]
-    return np.asarray(end - carry * begin)
+    (third, second, first, start), gap = _cubics(time, x), np.diff(time)
+    twist = 6 * tau**3 * third
+    begin = start - tau * first + 2 * tau**2 * second - twist
+    slope, bend = first + gap * (2 * second + 3 * gap * third), 2 * second + 6 * gap * third
+    return np.asarray(x[:, 1:] - tau * slope + tau**2 * bend - twist - carry * begin)
 
 
 def delayed_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -227,7 +181,9 @@ def _smooth_values_at_earlier_times(time: FloatArray, values: FloatArray, by: Fl
         return np.broadcast_to(values, (len(by), len(time)))
     asked = np.maximum(time[None, :] - by[:, None], time[0])
     gap = _index_of_next_row(time, asked) - 1
-    found = Spline(time, values).at(gap, asked - time[gap])
+    since, found = asked - time[gap], np.zeros(asked.shape)
+    for power in _cubics(time, values):
+        found = found * since + np.take_along_axis(np.broadcast_to(power, (len(by), len(time) - 1)), gap, axis=1)
     return np.where(by[:, None] == 0, np.broadcast_to(values, asked.shape), found)
 
 
@@ -258,7 +214,9 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
 
     for kind, how in over.items():
         yield from added(f"offset_{kind}", how)
-        yield from scaled(f"gain_{kind}", how)
+        # Rows may be in another unit for a while.
+        of_gain = change_point_step_modulation(table, about.time_unit, may_end=True) if kind == "step" else how
+        yield from scaled(f"gain_{kind}", of_gain)
     if table.has_varying_time:
         yield from added("interference", sinusoid_modulation(about))
         yield from _settling_form(about)

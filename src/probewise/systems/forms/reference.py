@@ -13,6 +13,7 @@ from scipy.special import gammaln
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise.effects import HeavyTailedPrior
+from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_read_only, read_only_views
@@ -38,11 +39,9 @@ _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without
 
 
 def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
-    """Return the probability that readings in equal rows are in order by chance; 1 if they are not in order.
+    """Return the probability that readings in rows of equal columns are in order by chance; 1 if they are in none.
 
-    Rows are equal where all columns but the reading and its sd are. Readings must rise in all groups of equal rows, or
-    fall in all: by chance once in the product of the numbers of their arrangements. It is 1 where a time was recorded,
-    where equal rows are apart, and for readings that rise or fall along the whole table, as those of a drift do.
+    It is 1 too where a time was recorded, where equal rows are apart, and where readings rise or fall along all rows.
     """
     own, readings = simulator, table.columns.get(simulator.reading)
     if table.has_varying_time or readings is None or readings.dtype != np.float64:
@@ -141,7 +140,7 @@ def clipping_levels(values: FloatArray) -> ClippingLevels | None:
     return ClippingLevels(float(inner[0]), float(inner[-1]), float(ordered[-1]))
 
 
-ROWS_OF_A_SIDE, _VALUES_OF_A_SIDE = 5, 3  # at least, on either side of a switch
+_VALUES_OF_A_SIDE = 3  # at least, on either side of a switch
 
 
 def switch_points(values: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
 
 
 @contextlib.contextmanager
-def _open_executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
+def open_executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
     """Yield the executor that --workers or --scheduler asks for; None for this process."""
     if arguments.scheduler is not None:
         with _cluster_executor(arguments.scheduler) as executor:
@@ -59,7 +59,7 @@ def executor_and_progress(
     with (
         reporting_what_is_kept(lambda: message_to_resume_campaign(path, noun, arguments)),
         progress_shown(quiet=arguments.quiet) as progress,
-        _open_executor(arguments) as executor,
+        open_executor(arguments) as executor,
     ):
         yield executor, progress
 

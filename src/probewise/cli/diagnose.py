@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.cli._common import (
+    CommandError,
     add_out_directory,
     add_path,
     add_seed_and_quiet,
@@ -16,6 +17,7 @@ from probewise.cli._common import (
     inputs_and_filled_in_plan,
     parse_recording,
 )
+from probewise.cli._executor import add_executor
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
 from probewise.cli._simulator import add_simulator, read_joined_table, refuse_sensor
 from probewise.errors import ParameterError
@@ -58,6 +60,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "approximation where they differ by more than one nat plus its standard error and no run gives a warning "
         "(first says how long it may take)",
     )
+    parser.add_argument(
+        "--each",
+        action="store_true",
+        help="diagnose each recording by itself, into a folder of its name; table.csv and report.html sort them by "
+        "what ails them; the same command resumes",
+    )
+    add_executor(parser)
     add_out_directory(parser)
     add_seed_and_quiet(parser)
 
@@ -66,6 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
     from probewise._progress import progress_shown
 
+    if arguments.each:
+        from probewise.cli._each import diagnose_each
+
+        return diagnose_each(arguments)
+    if arguments.workers > 1 or arguments.scheduler is not None:
+        raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
     if arguments.simulator is not None:
         return _diagnose_simulator(arguments)
     from probewise.diagnosis import (

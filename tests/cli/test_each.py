@@ -1,0 +1,53 @@
+"""`probewise diagnose --each`: a folder and a row for each recording, whatever one of them holds."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from probewise.cli import main
+from probewise.report import each
+
+LINE = (
+    "reading, unit = 'y', 'V'\nparameters = {'slope': (-5, 5), 'offset': (-5, 5)}\nvectorized = True\n"
+    "def simulate(p, data):\n    return p['slope'] * data['x'] + p['offset']\n"
+)
+
+
+def write_line(path, *, jump=0.0):
+    x = np.linspace(0.0, 1.0, 40)
+    y = 2 * x + 1 + 0.1 * np.random.default_rng(1).standard_normal(40) + jump * (x > 0.55)
+    np.savetxt(path, np.c_[x, y], delimiter=",", header="x,y", comments="", fmt="%.4f")
+    return str(path)
+
+
+def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, monkeypatch, capsys):
+    law, out = tmp_path / "line.py", tmp_path / "out"
+    law.write_text(LINE)
+    (tmp_path / "1.10.csv").write_text("x,z\n1,2\n")
+    files = [write_line(tmp_path / "a.csv"), write_line(tmp_path / "b.csv", jump=0.8), str(tmp_path / "1.10.csv")]
+    given = ["diagnose", *files, "--simulator", str(law), "--each", "--out", str(out), "--quiet"]
+    assert main(given) == 0
+    with (out / "table.csv").open() as file:
+        rows = {row["device"]: row for row in csv.DictReader(file)}
+    assert {name: row["verdict"] for name, row in rows.items()} == {"b": "cannot_tell", "a": "clean", "1.10": "refused"}
+    assert "y" in rows["1.10"]["says"]
+    assert (out / "b" / "repaired.json").exists()
+    assert not (out / "1.10").exists()
+    page = (out / "report.html").read_text()
+    assert page.index("b/report.html") < page.index("a/report.html")
+    monkeypatch.setattr("probewise.cli._each._diagnosed", lambda words: pytest.fail("diagnosed again"))
+    assert main([*given[:3], *given[4:]]) == 0  # without the one that was refused
+    assert main(["diagnose", files[0], "--out", str(out), "--workers", "2"]) == 2
+    assert "for --each" in capsys.readouterr().err
+
+
+def test_rows_are_sorted_by_what_ails_most_devices():
+    rows = [
+        each.DeviceRow("clean one", "clean"),
+        each.DeviceRow("lagging", "named", "lag", 9.0, 0.9, 0.001, "it lags"),
+        each.DeviceRow("worse", "named", "drag:v", 20.0),
+        each.DeviceRow("bad", "named", "drag:v", 12.0),
+    ]
+    assert [row.device for row in each.in_order(rows)] == ["worse", "bad", "lagging", "clean one"]
+    assert each.columns_of(rows)["probability"] == ["", "", "0.9", ""]

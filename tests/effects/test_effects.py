@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from dataclasses import replace
 from itertools import permutations
 
@@ -103,6 +104,21 @@ def test_every_setting_of_every_bank_changes_finite_readings(name):
             none[:, effect.amplitudes] = 0.0
             np.testing.assert_allclose(chain.predict(none, PLAN), np.repeat(plain, len(none), axis=0), atol=1e-9)
     assert changed > 1e-3
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_every_effect_acts_alike_in_another_process(name):
+    effect = EFFECTS[name].for_extent(EXTENT)
+    values = np.full((1, len(PLAN)), 0.4)
+    for variant in {effect, effect.variants()[0], effect.variants()[-1]}:
+        copy = pickle.loads(pickle.dumps(variant))
+        theta = variant.bank()[0, :1]
+        assert copy.sentence(theta[0], theta[0]) == variant.sentence(theta[0], theta[0])
+        assert (copy.name, copy.scans, copy.patterns) == (variant.name, variant.scans, variant.patterns)
+        np.testing.assert_array_equal(copy.bank(), variant.bank())
+        if effect.stage in (Stage.RESPONSE, Stage.GAIN, Stage.OFFSET, Stage.LAG, Stage.SATURATION):
+            np.testing.assert_array_equal(copy.apply(values, theta, PLAN), variant.apply(values, theta, PLAN))
+    assert pickle.loads(pickle.dumps(EFFECTS[name])) is EFFECTS[name]
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from probewise.arm import Pose, Reading
-from probewise.effects import EFFECTS
 from probewise.experiment.rivals import EACH_S, EffectInPacedTime, Pace, gain_loss, rivals_of
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import experiment_of
@@ -49,7 +48,7 @@ def test_one_reading_has_the_usual_pace():
 
 def test_a_lamp_that_begins_as_calibrated_may_fade():
     plan = experiment_of(REFERENCE).problem(readings(8.0)).recording.plan
-    faded = gain_loss(EFFECTS["gain_drift"]()).apply(np.full((1, 8), 50.0), np.array([[-0.5, 800.0]]), plan)[0]
+    faded = gain_loss().apply(np.full((1, 8), 50.0), np.array([[-0.5, 800.0]]), plan)[0]
     assert faded[0] == 50.0
     assert (np.diff(faded) < 0).all()
     np.testing.assert_allclose(faded[-1], 50.0 * (1 - 0.5 * (1 - np.exp(-56.0 / 800.0))))
@@ -57,7 +56,7 @@ def test_a_lamp_that_begins_as_calibrated_may_fade():
 
 @pytest.mark.parametrize(("tau_s", "told"), [(10.0, "falls by 10 % in the end, 10 % in the"), (6000.0, "0.1 % in the")])
 def test_a_lamp_never_fades_by_more_in_a_minute_than_in_the_end(tau_s, told):
-    assert told in gain_loss(EFFECTS["gain_drift"]()).sentence(np.array([-0.1, tau_s]), np.zeros(2))
+    assert told in gain_loss().sentence(np.array([-0.1, tau_s]), np.zeros(2))
 
 
 def test_the_ways_of_one_name_share_what_it_has():

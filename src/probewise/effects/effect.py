@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeAlias, TypeVar
 
@@ -225,6 +226,8 @@ class Effect(NamedEffect[Any]):
         Whether it looks back to earlier times of a run, which time must then not fall within.
     where
         Of a light sensor's effect: origin, scans, patterns.
+    source
+        Function that builds one with the same `act` and `says`, by which a pickled effect finds them again.
     """
 
     name: str
@@ -242,6 +245,13 @@ class Effect(NamedEffect[Any]):
     expression: str = ""
     needs_rising_time: bool = False
     where: Where = EVERYWHERE
+    source: Callable[[], Effect] | None = None
+
+    def __reduce__(self) -> tuple[Callable[..., Effect], tuple[Any, ...]]:
+        state = {each.name: getattr(self, each.name) for each in fields(self)}
+        if self.source is not None:
+            del state["act"], state["says"]
+        return _restored_effect, (type(self), state)
 
     @cached_property
     def prior(self) -> Prior:
@@ -307,6 +317,12 @@ class Effect(NamedEffect[Any]):
     @cached_property
     def _variants(self) -> tuple[Effect, ...]:
         return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
+
+
+def _restored_effect(kind: type[Effect], state: dict[str, Any]) -> Effect:
+    source = state["source"]
+    made = None if source is None else source()
+    return kind(**state) if made is None else kind(**state, act=made.act, says=made.says)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -411,6 +427,9 @@ class LightEffect:
     reads: tuple[str, ...] = ()
     is_absorbed_by_ssf: Callable[[Plan], bool] = lambda plan: False
 
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str, str]]:
+        return _attribute, (self.build.__module__, self.build.__name__)
+
     def for_extent(self, extent: Extent) -> Effect | None:
         """Bind the effect to a recording, with a prior at its scales; None where the recording cannot show it."""
         return self.build(self, extent)
@@ -443,7 +462,8 @@ class LightEffect:
             elif self.counts == "place" and (at.x_mm or at.y_mm):
                 counted_from = f"X and Y count from ({at.x_mm:g}, {at.y_mm:g}) mm"
         given = (self.name, self.stage, parameters, units, self.covariates, act, entries, says)
-        return kind(*given, counted_from=counted_from, where=where, **more)
+        source = partial(_effect_there, self, of, where)
+        return kind(*given, counted_from=counted_from, where=where, source=source, **more)
 
     def linear(
         self,
@@ -493,6 +513,17 @@ class LightEffect:
             change_points=points,
             is_thinned=is_thinned,
         )
+
+
+def _attribute(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
+
+
+def _effect_there(kind: LightEffect, of: Extent, where: Where) -> Effect:
+    """Return that of an effect's variants which is restricted to the same scans and patterns."""
+    found = kind.for_extent(of)
+    assert found is not None
+    return next(variant for variant in found.variants() if variant.where == where)
 
 
 def light_effect(

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
@@ -599,7 +599,7 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
             f"pattern explains: {why}"
         )
 
-    return kind.bind(
+    found = kind.bind(
         of,
         {"amp": HeavyTailedPrior(typical), "w": LogUniform(narrowest_mm, widest_mm)},
         ("1", "mm"),
@@ -608,6 +608,7 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
         says,
         where=Where(patterns=patterns),
     )
+    return replace(found, source=partial(edge_shadow_of_patterns, kind, of, patterns))
 
 
 def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:

@@ -19,9 +19,18 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.effects import VOCABULARY, Effect, Extent, HeavyTailedPrior, LightEffect, LogHeavyTailedPrior
+from probewise.effects import (
+    VOCABULARY,
+    Effect,
+    Extent,
+    HeavyTailedPrior,
+    LightEffect,
+    LogHeavyTailedPrior,
+    light_effect,
+)
 from probewise.effects.known import WrappedEffect
 from probewise.effects.optics import PatchPrior
+from probewise.effects.reading import gain_drift
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.inference.problem import Likelihood
@@ -29,7 +38,7 @@ from probewise.inquiry import cards_of
 from probewise.priors import LogUniform, Prior, Product, Uniform
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.sensor import Chain, FixedLevels
-from probewise.sensor.stages import AnyEffect, Poses, SensorModel
+from probewise.sensor.stages import AnyEffect, Poses, SensorModel, Stage
 
 ON_FIELD = {
     "ambient_gradient": True,
@@ -99,9 +108,10 @@ def rivals_of(
     found = []
     for name, wide in ({**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD).items():
         plan = _plan_there_and_back(math.hypot(*field_mm) if wide else _SCAN_MM, height_mm)
-        effect = cast(LightEffect, VOCABULARY[name]).for_extent(Extent(min(dark, bright), max(dark, bright), plan))
+        extent = Extent(min(dark, bright), max(dark, bright), plan)
+        effect = cast(LightEffect, VOCABULARY[name]).for_extent(extent)
         if effect is not None and name not in carried:
-            found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, field_mm)]
+            found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, extent, field_mm)]
     noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
         found += [
@@ -110,7 +120,7 @@ def rivals_of(
     return tuple(found)
 
 
-def _forms_of_effect_in_run(effect: Effect, field_mm: tuple[float, float]) -> list[DescribedEffect]:
+def _forms_of_effect_in_run(effect: Effect, extent: Extent, field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """Return the forms in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
     in_run = EffectWithRunPrior(effect, field_mm)
     if effect.name in OF_MOTION:
@@ -119,7 +129,7 @@ def _forms_of_effect_in_run(effect: Effect, field_mm: tuple[float, float]) -> li
         return [in_run]
     forms: list[DescribedEffect] = [EffectInPacedTime(in_run)]
     if effect.name == "gain_drift":
-        forms.append(EffectInPacedTime(EffectWithRunPrior(gain_loss(effect), field_mm)))
+        forms.append(EffectInPacedTime(EffectWithRunPrior(cast(Effect, gain_loss.for_extent(extent)), field_mm)))
     return forms
 
 
@@ -140,7 +150,8 @@ def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
     )
 
 
-def gain_loss(drift: Effect) -> Effect:
+@light_effect("gain_drift", Stage.GAIN, "a gain that drifts", ("time",), counts="time")
+def gain_loss(kind: LightEffect, of: Extent) -> Effect:
     """Return a lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
 
     def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -154,7 +165,7 @@ def gain_loss(drift: Effect) -> Effect:
             "the first minute of this: the lamp or its battery changes"
         )
 
-    return replace(drift, act=act, says=says)
+    return replace(cast(Effect, gain_drift.build(kind, of)), act=act, says=says)
 
 
 class DescribedEffect(AnyEffect, Protocol):

@@ -20,7 +20,7 @@ from probewise.experiment import Exploration, OneScan, arm_over, begin, explore,
 from probewise.experiment.stopping import p_value_and_worst_reading
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, UtilityMap, prior_entropy
-from probewise.inquiry.any_settings.posterior import prior_samples
+from probewise.inquiry.any_instrument import prior_samples
 from probewise.recordings import Disc
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 from probewise.scene.scenes import HypothesisScene

@@ -8,11 +8,12 @@ hypotheses directly (`DirectForecast`). For an instrument that reads no field of
 settings.
 """
 
-from probewise.inquiry.any_settings import Inquiry, Predictive, ReadingNoise
+from probewise.inquiry.any_instrument import Inquiry
 from probewise.inquiry.disc_table import DiscForecast, DiscTable, TabulatedChain, forecast_of
 from probewise.inquiry.entropy import UtilityMap, best_places_mask, choose, entropy_map, label_entropy, reachable_rows
 from probewise.inquiry.forecast import CardedForecast, DirectForecast, Forecast, PredictiveDistributions, cards_of
 from probewise.inquiry.grid import Design, Designs, Grid
+from probewise.inquiry.predictive import ReadingNoise
 from probewise.inquiry.readout import (
     Bound,
     Readout,
@@ -61,7 +62,6 @@ __all__ = [
     "Label",
     "ParameterValue",
     "PerSecond",
-    "Predictive",
     "PredictiveDistributions",
     "ReadingEntropy",
     "ReadingNoise",

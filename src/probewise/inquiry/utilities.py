@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 
@@ -185,6 +185,13 @@ class WeightsGivenReading:
         self._index = nearest_level_index(answers, levels)
         self._weight = weight
         self._chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
+
+    @classmethod
+    def from_levels(cls, index: IntArray, weight: FloatArray, chance: FloatArray) -> Self:
+        """Build from the level that each hypothesis predicts, (n, n_designs), and each level's cells' probability."""
+        made = cls.__new__(cls)
+        made._index, made._weight, made._chance = index, weight, chance
+        return made
 
     @cached_property
     def weight_by_cell(self) -> FloatArray:

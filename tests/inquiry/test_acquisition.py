@@ -6,30 +6,35 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from probewise.inquiry import Predictive, ReadingNoise
+from probewise.inquiry import ReadingNoise
+from probewise.inquiry.predictive import expected_nats_above_goal, readings_given_noise
 from probewise.priors import LogUniform
 
 
+def given(predicted, scale, noise):
+    return readings_given_noise(predicted, scale, np.full(len(predicted), 1 / len(predicted)), noise)
+
+
 def linear(slopes, *, n=4000, seed=1, noise_sd=1.0, **law):
-    """Predictions slope * x of standard normal x: (x, Predictive)."""
+    """Predictions slope * x of standard normal x: (x, weights given readings)."""
     x = np.random.default_rng(seed).standard_normal(n)
     x = (x - x.mean()) / x.std()
     predicted = x[:, None] * np.asarray(slopes)
-    return x, Predictive(predicted, np.full(predicted.shape, noise_sd), ReadingNoise(noise_sd, **law))
+    return x, given(predicted, np.full(predicted.shape, noise_sd), ReadingNoise(noise_sd, **law))
 
 
 @pytest.mark.parametrize("slope", [0.03, 0.3, 1.0, 3.0, 30.0])
 def test_information_about_a_gaussian_is_the_closed_form(slope):
     """Shannon: log2(1 + signal / noise) / 2; from a thousandth of a bit up; groups cost up to 3 %."""
     _, predictive = linear([slope])
-    assert predictive.information()[0] == pytest.approx(0.5 * math.log2(1 + slope**2), rel=0.03)
+    assert predictive.information_bits[0] == pytest.approx(0.5 * math.log2(1 + slope**2), rel=0.03)
 
 
 def test_a_reading_that_separates_two_hypotheses_tells_one_bit():
     predicted = np.repeat([0.0, 50.0], 500)[:, None]
-    one = Predictive(predicted, np.ones(predicted.shape), ReadingNoise(1.0))
-    assert one.information()[0] == pytest.approx(1.0, abs=0.06)  # one group of 32 holds some of both
-    assert Predictive(0 * predicted, np.ones(predicted.shape), ReadingNoise(1.0)).information()[0] < 1e-9
+    one = given(predicted, np.ones(predicted.shape), ReadingNoise(1.0))
+    assert one.information_bits[0] == pytest.approx(1.0, abs=0.06)  # one group of 32 holds some of both
+    assert given(0 * predicted, np.ones(predicted.shape), ReadingNoise(1.0)).information_bits[0] < 1e-9
 
 
 def by_adding_up(predicted, scale, noise, n_readings, seed):
@@ -60,9 +65,7 @@ def test_information_is_that_of_adding_up_all_hypotheses(noise):
     predicted = rng.permutation(predicted)
     scale = noise.scale(predicted, None)
     mean, error = by_adding_up(predicted[:, 0], scale[:, 0], noise, 4000, 4)
-    assert Predictive(predicted, scale, noise).information()[0] == pytest.approx(
-        mean, abs=3 * error + 0.02 * mean + 0.01
-    )
+    assert given(predicted, scale, noise).information_bits[0] == pytest.approx(mean, abs=3 * error + 0.02 * mean + 0.01)
 
 
 UNKNOWN = LogUniform(0.1, 10.0)
@@ -80,7 +83,7 @@ def test_information_with_an_unknown_sd_of_the_noise_is_that_of_adding_up_all_hy
     """The information about the sd counts too; within 3 sds of the Monte Carlo and 5 %."""
     _, predicted, scale, noise = unknown_noise(slope, dof=dof)
     mean, error = by_adding_up(predicted[:, 0], scale[:, 0], noise, 4000, 4)
-    found = Predictive(predicted, scale, noise).information()[0]
+    found = given(predicted, scale, noise).information_bits[0]
     assert found == pytest.approx(mean, abs=3 * error + 0.05 * mean)
 
 
@@ -94,7 +97,7 @@ def test_the_expected_nats_above_the_goal_with_an_unknown_sd_are_those_of_adding
     weight = np.exp(noise.log_density(readings[:, None], predicted[None, :, 0], scale[None, :, 0]))
     weight /= weight.sum(axis=1, keepdims=True)
     variance = weight @ x**2 - (weight @ x) ** 2
-    found = Predictive(predicted, scale, noise).expected_nats_above_goal(x[:, None], np.array([1e-3]))[0]
+    found = expected_nats_above_goal(given(predicted, scale, noise), x[:, None], np.array([1e-3]))[0]
     assert found == pytest.approx(0.5 * np.log(variance).mean() - math.log(1e-3), abs=0.03)
 
 
@@ -104,21 +107,11 @@ def test_the_expected_fall_of_a_gaussians_sd_is_the_closed_form():
     x, predictive = linear(slopes)
     goal = np.array([0.01])
     expected = -0.5 * np.log(1 + slopes**2) - math.log(0.01)
-    np.testing.assert_allclose(predictive.expected_nats_above_goal(x[:, None], goal), expected, atol=0.02)
+    np.testing.assert_allclose(expected_nats_above_goal(predictive, x[:, None], goal), expected, atol=0.02)
 
 
 def test_what_is_within_its_goal_counts_no_more():
     x, predictive = linear([3.0])
-    assert predictive.expected_nats_above_goal(x[:, None], np.array([2.0]))[0] == 0.0
-    both = predictive.expected_nats_above_goal(np.stack([x, x], axis=1), np.array([2.0, 0.01]))
-    assert both[0] == pytest.approx(predictive.expected_nats_above_goal(x[:, None], np.array([0.01]))[0])
-
-
-def test_settings_are_valued_alike_in_blocks_and_alone(monkeypatch):
-    slopes = np.linspace(0.1, 2.0, 7)
-    x, together = linear(slopes)
-    whole = together.information(), together.expected_nats_above_goal(x[:, None], np.array([0.1]))
-    monkeypatch.setattr("probewise.inquiry.any_settings.acquisition._BLOCK", 1)
-    _, alone = linear(slopes)
-    np.testing.assert_allclose(alone.information(), whole[0], rtol=1e-12)
-    np.testing.assert_allclose(alone.expected_nats_above_goal(x[:, None], np.array([0.1])), whole[1], rtol=1e-12)
+    assert expected_nats_above_goal(predictive, x[:, None], np.array([2.0]))[0] == 0.0
+    both = expected_nats_above_goal(predictive, np.stack([x, x], axis=1), np.array([2.0, 0.01]))
+    assert both[0] == pytest.approx(expected_nats_above_goal(predictive, x[:, None], np.array([0.01]))[0])

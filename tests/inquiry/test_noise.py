@@ -45,14 +45,6 @@ def test_draws_follow_the_distribution(name):
     assert p_value > 1e-4
 
 
-def test_the_nodes_of_a_gaussian_have_its_moments_and_those_of_a_student_t_its_quantiles():
-    node, weight = LAWS["gaussian"].nodes_and_weights
-    np.testing.assert_allclose([weight @ node**k for k in (0, 1, 2, 4)], [1, 0, 1, 3], atol=1e-12)
-    node, weight = LAWS["student"].nodes_and_weights
-    assert weight @ (np.abs(node) < 1.0) == pytest.approx(stats.t(3).cdf(1) - stats.t(3).cdf(-1), abs=0.1)
-    assert weight @ np.abs(node) == pytest.approx(stats.t(3).expect(np.abs), rel=0.02)
-
-
 def test_the_sd_may_be_a_function_of_the_prediction_or_a_parameter():
     predicted = np.array([[1.0, 4.0], [9.0, 16.0]])
     np.testing.assert_allclose(ReadingNoise(np.sqrt).scale(predicted, None), [[1, 2], [3, 4]])

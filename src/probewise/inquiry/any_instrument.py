@@ -1,0 +1,664 @@
+"""The choice of the next setting of any instrument, from a model of its readings, a prior, settings and noise.
+
+The paper's machine learning system without a field of shapes: readings update weighted samples of the posterior
+(iterated batch importance sampling, Chopin 2002), and the next setting maximises an acquisition function
+(`Inquiry.utility`): expected information (Lindley 1956) or, near a goal, the expected decrease of the posterior sds
+towards the goal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, logsumexp, ndtri
+
+from probewise._arrays import FloatArray, IntArray, floats, own_arithmetic
+from probewise._display import ShowsItself
+from probewise._kinds import checked_finite_number, checked_whole, require_callable, require_rng
+from probewise.errors import ParameterError, ShapeError, did_you_mean
+from probewise.inquiry.entropy import choose
+from probewise.inquiry.predictive import AnyNoise, ReadingNoise, expected_nats_above_goal, readings_given_noise
+from probewise.nested import Weighted, diversify, make_problem, run
+from probewise.nested.problem import AnyPrior
+from probewise.nested.weights import n_effective, power_bracket, resampled_rows
+from probewise.priors import Joint, Prior, Product, require_prior
+from probewise.systems.calls import Caller
+
+Column: TypeAlias = NDArray[Any]
+
+NOISE_SD = "noise.sd"
+"""Name of the parameter that an unknown sd of the noise is."""
+
+_ALLOWED = (
+    "one knob: numbers or names (n,); several: numbers (n, n_knobs), a row for each setting; or a dict of columns (n,) "
+    "by name, all of one length"
+)
+_BLOCK = 2_000_000  # densities held, or readings predicted, at a time
+_KEEP = 0.5  # share of the samples that must count, else they are resampled and moved
+_N_MOVES = 10  # steps of each sample
+_LEAST_STEP = 1e-3  # of a reading's likelihood at a time: with less, the samples cannot follow it
+_IMPOSSIBLE = 1e200  # nats, of a reading that a sample excludes
+_LOST_NATS = 3.0  # prior samples overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
+_N_PROBED = 3
+_N_ASKED = 500  # samples whose predictions value the settings
+_FEWER_ASKED = 200  # of a model that is called for one sample at a time
+_N_IMAGINED = 8
+_DOUBT_P = 1e-6
+_NEAR_GOAL = 3.0  # times the sds that are asked for
+_BITS = "expected information (bits)"
+_NEARER = "expected fall of the sum of ln(sd / goal)"
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """Settings as columns (n,) by name; `form` is how the user gave them, and how user and model get them back.
+
+    `form`: "one" knob, an array (n,); "several" knobs, an array (n, n_knobs); or knobs by "name", a dict of columns.
+    """
+
+    columns: Mapping[str, Column]
+    form: str
+
+    @classmethod
+    def of(cls, given: Any) -> Settings:
+        """Read settings in any of their forms; ParameterError for anything else."""
+        if isinstance(given, Settings):
+            return given
+        if isinstance(given, Mapping):
+            columns = {str(name): _checked_column(f"settings[{name!r}]", values) for name, values in given.items()}
+            if not columns or len({len(column) for column in columns.values()}) != 1:
+                sizes = {name: len(column) for name, column in columns.items()}
+                raise ParameterError("settings", sizes, _ALLOWED)
+            return cls(columns, "name")
+        try:
+            array = np.asarray(given)
+        except ValueError as error:
+            raise ParameterError("settings", given, _ALLOWED) from error
+        if array.ndim == 2 and array.shape[1] >= 1 and len(array):
+            _require_texts_given("settings", given, array)
+            columns = {str(k): _checked_column("settings", column) for k, column in enumerate(array.T)}
+            return cls(columns, "several")
+        return cls({"setting": _checked_column("settings", array)}, "one")
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def take(self, rows: IntArray) -> Settings:
+        """Return the settings with these indices."""
+        return Settings({name: column[rows] for name, column in self.columns.items()}, self.form)
+
+    def joined(self, other: Settings) -> Settings:
+        """Return these settings, then `other`."""
+        return Settings({n: np.concatenate([c, other.columns[n]]) for n, c in self.columns.items()}, self.form)
+
+    def in_model_form(self, columns: Mapping[str, Column]) -> Any:
+        """Return `columns` in the form of these settings; several knobs as (n_knobs, n), to be unpacked."""
+        if self.form == "one":
+            return columns["setting"]
+        return np.stack(list(columns.values())) if self.form == "several" else dict(columns)
+
+    def __getitem__(self, row: int) -> Any:
+        """Return one setting: a number or a name, an array (n_knobs,), or a dict by name."""
+        own = {n: str(c[row]) if isinstance(c[row], str) else float(c[row]) for n, c in self.columns.items()}
+        if self.form == "one":
+            return own["setting"]
+        return np.array(list(own.values())) if self.form == "several" else own
+
+    def checked_setting(self, setting: Any) -> Settings:
+        """Parse one setting given in the form of `self[row]` as Settings of length 1; it need not be one of these.
+
+        ParameterError if it is not of that form.
+        """
+        if self.form == "name":
+            if not isinstance(setting, Mapping) or setting.keys() != self.columns.keys():
+                raise ParameterError("setting", setting, f"a dict of {', '.join(self.columns)}")
+            columns = {name: [setting[name]] for name in self.columns}
+        elif self.form == "one":
+            columns = {"setting": [setting]}
+        else:
+            if np.shape(setting) != (len(self.columns),):
+                raise ParameterError("setting", setting, f"{len(self.columns)} numbers, one for each knob")
+            columns = {name: [value] for name, value in zip(self.columns, setting, strict=True)}
+        made = {name: _checked_column("setting", values) for name, values in columns.items()}
+        for name, column in made.items():
+            if (column.dtype.kind == "U") != (self.columns[name].dtype.kind == "U"):
+                kind = "a name" if self.columns[name].dtype.kind == "U" else "a number"
+                raise ParameterError("setting", setting, f"{kind}, as in settings")
+        return Settings(made, self.form)
+
+
+def _checked_column(name: str, values: Any) -> Column:
+    """Convert the values of one knob to a read-only column of finite numbers or of names, (n,)."""
+    array = np.asarray(values)
+    if array.ndim != 1 or not array.size or array.dtype.kind not in "biufU":
+        raise ParameterError(name, values, _ALLOWED)
+    _require_texts_given(name, values, array)
+    if array.dtype.kind != "U":
+        array = array.astype(np.float64)
+        if not np.isfinite(array).all():
+            raise ParameterError(name, float(array[~np.isfinite(array)][0]), "finite numbers")
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def _require_texts_given(name: str, values: Any, array: Column) -> None:
+    """Raise ParameterError where `array`, of `values`, has numbers among names, which NumPy has made texts."""
+    if array.dtype.kind == "U" and not all(isinstance(one, str) for one in np.asarray(values, dtype=object).flat):
+        raise ParameterError(name, values, _ALLOWED)
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentModel:
+    """Prior, predictions and noise of one instrument."""
+
+    caller: Caller
+    own_prior: Prior
+    noise: ReadingNoise
+
+    @classmethod
+    def from_function(
+        cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings
+    ) -> InstrumentModel:
+        """Make the model of a user's function; find out if it takes arrays, one sample, or one reading at a time."""
+
+        def call_with_arrays(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
+            return function(dict(parameters), settings.in_model_form(columns))
+
+        def call_for_one_sample(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
+            rows = Settings(columns, settings.form)
+            return np.array([function(dict(parameters), rows[k]) for k in range(len(rows))])
+
+        u = np.linspace(0.2, 0.8, _N_PROBED)[:, None] * np.ones(len(prior.names))
+        theta = prior.from_unit_cube(u)
+        samples = {name: theta[:, [k]] for k, name in enumerate(prior.names)}
+        some = settings.take(np.unique(np.linspace(0, len(settings) - 1, _N_PROBED).astype(int))).columns
+        try:
+            caller = Caller.from_trial_calls(
+                call_with_arrays, samples, some, per_run=(), broadcasts=False, name="model"
+            )
+        except Exception:
+            caller = Caller.from_trial_calls(
+                call_for_one_sample, samples, some, per_run=(), broadcasts=False, name="model"
+            )
+        return cls(caller, prior, noise)
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The prior of the parameters, and at its end that of the noise sd if it is unknown."""
+        if not self.noise.is_sd_inferred:
+            return self.own_prior
+        return Joint((self.own_prior, Product({NOISE_SD: self.noise.sd})))  # type: ignore[dict-item]
+
+    def predict(self, theta: FloatArray, settings: Settings) -> FloatArray:
+        """Predict readings, theta (n_samples, n_params) -> (n_samples, n_settings).
+
+        Raises
+        ------
+        ParameterError
+            If a prediction is not finite. What the function itself raises is passed on.
+        """
+        names, n = self.own_prior.names, len(settings)
+        at_once = max(_BLOCK // n, 1)
+        if len(theta) > at_once:
+            return np.concatenate(
+                [self.predict(theta[k : k + at_once], settings) for k in range(0, len(theta), at_once)]
+            )
+        samples = {name: theta[:, [k]] for k, name in enumerate(names)}
+        out = self.caller(samples, settings.columns, strict=True)
+        if not np.isfinite(out).all():
+            self._raise_own_error(theta, settings, out)
+        return out
+
+    def _raise_own_error(self, theta: FloatArray, settings: Settings, out: FloatArray) -> None:
+        """Raise the function's own error at the first sample without a finite prediction, else ParameterError."""
+        sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
+        own = {name: theta[[sample], k : k + 1] for k, name in enumerate(self.own_prior.names)}
+        self.caller(own, settings.columns, strict=True)
+        at = ", ".join(f"{name} = {theta[sample, k]:.10g}" for k, name in enumerate(self.own_prior.names))
+        raise ParameterError(f"the model at {at}, setting {settings[row]}", float(out[sample, row]), "finite readings")
+
+    def scale(self, theta: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return the sd of the noise of each prediction, (n_samples, n_settings)."""
+        return self.noise.scale(predicted, theta[:, -1] if self.noise.is_sd_inferred else None)
+
+    def log_density(self, theta: FloatArray, settings: Settings, readings: FloatArray) -> FloatArray:
+        """Return the log density of readings, one per setting, (n_settings,), under theta: (n_samples, n_settings)."""
+        predicted = self.predict(theta, settings)
+        return self.noise.log_density(readings, predicted, self.scale(theta, predicted))
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingsProblem:
+    """Readings with their settings, as a problem for nested sampling.
+
+    `settings` holds each distinct setting once; `row`, the setting's index, and `values` are of each reading,
+    (n_readings,). The likelihood of the last reading counts to the power `last_power`.
+    """
+
+    model: InstrumentModel
+    settings: Settings
+    row: IntArray
+    values: FloatArray
+    last_power: float = 1.0
+
+    @property
+    def prior(self) -> Prior:
+        """Prior of the model's parameters."""
+        return self.model.prior
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
+        out = np.empty(len(theta))
+        at_once = max(_BLOCK // len(self.values), 1)
+        for k in range(0, len(theta), at_once):
+            predicted = self.model.predict(theta[k : k + at_once], self.settings)
+            scale = self.model.scale(theta[k : k + at_once], predicted)
+            density = self.model.noise.log_density(self.values, predicted[:, self.row], scale[:, self.row])
+            density[:, -1] *= self.last_power
+            out[k : k + at_once] = density.sum(axis=1)
+        return out
+
+    def log_density_of_last(self, theta: FloatArray) -> FloatArray:
+        """Return the log density of the last reading, (n_samples, n_params) -> (n_samples,); finite."""
+        density = self.model.log_density(theta, self.settings.take(self.row[-1:]), self.values[-1:])[:, 0]
+        return np.maximum(density, -_IMPOSSIBLE)
+
+    def p_value_and_worst_reading(self, theta: FloatArray) -> tuple[float, int]:
+        """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
+
+        It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.
+        """
+        predicted = self.model.predict(theta, self.settings)
+        scale = self.model.scale(theta, predicted)
+        tail = self.model.noise.smaller_tail(self.values, predicted[0, self.row], scale[0, self.row])
+        z = np.abs(ndtri(np.clip(tail, 1e-300, 0.5)))
+        return float(chdtrc(len(z), float(z @ z))), int(np.argmax(z))
+
+
+def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:
+    """Draw `n` equally weighted samples of the prior, as the posterior without readings: its evidence is one."""
+    return _equal_weights(prior.names, prior.from_unit_cube(rng.random((n, len(prior.names)))), np.zeros(n))
+
+
+def _equal_weights(names: tuple[str, ...], theta: FloatArray, log_likelihood: FloatArray) -> Weighted:
+    n = len(theta)
+    return Weighted(
+        names,
+        theta,
+        log_likelihood=log_likelihood,
+        log_weight=np.full(n, -math.log(n)),
+        log_z=0.0,
+        log_z_error=0.0,
+        n_eff=float(n),
+        n_calls=0,
+        pareto_k=-math.inf,
+    )
+
+
+def updated_posterior(previous: Weighted, readings: ReadingsProblem, *, rng: np.random.Generator) -> Weighted | None:
+    """Update the posterior given all readings but the last by the last; None if the samples cannot follow it.
+
+    Samples are reweighted. Where fewer than half of them would count, the last reading's likelihood is applied in
+    powers, so that half count each time; after each the samples are resampled and moved (`nested.diversify`).
+    """
+    now, power, n = previous, 0.0, len(previous.theta)
+    while power < 1.0:
+        log_density = readings.log_density_of_last(now.theta)
+
+        def log_weight_at(step: float, now: Weighted = now, log_density: FloatArray = log_density) -> FloatArray:
+            return now.log_weight + step * log_density
+
+        step = 1.0 - power
+        if n_effective(log_weight_at(step)) < _KEEP * n:
+            step = power_bracket(log_weight_at, 0.0, step, wanted=_KEEP * n, n_steps=30)[0]
+        if step < min(_LEAST_STEP, 1.0 - power):
+            return None
+        log_weight = log_weight_at(step)
+        gained, n_eff = float(logsumexp(log_weight)), n_effective(log_weight)
+        power = min(power + step, 1.0) if step < 1.0 - power else 1.0
+        now = replace(
+            now,
+            log_likelihood=now.log_likelihood + step * log_density,
+            log_weight=log_weight - gained,
+            log_z=now.log_z + gained,
+            log_z_error=math.hypot(now.log_z_error, math.sqrt(max(1 / n_eff - 1 / now.n_eff, 0.0))),
+            n_eff=n_eff,
+            run=None,
+        )
+        if power < 1.0:
+            moved = _moved(now, replace(readings, last_power=power), rng)
+            now = replace(moved, log_z=now.log_z, log_z_error=now.log_z_error)
+    return now
+
+
+def _moved(found: Weighted, problem: ReadingsProblem, rng: np.random.Generator) -> Weighted:
+    """Resample and move the samples of a problem's posterior."""
+    rows = resampled_rows(found.weight, len(found.theta), rng)
+    theta, _ = diversify(found.theta[rows], problem, rng=rng, n_steps=_N_MOVES)
+    return _equal_weights(found.names, theta, problem.log_likelihood(theta))
+
+
+def nested_posterior(readings: ReadingsProblem, n: int, n_live: int, *, rng: np.random.Generator) -> Weighted:
+    """Return `n` samples of the posterior by nested sampling of all readings with `n_live` points."""
+    found = run(readings, rng=rng, n_live=n_live)
+    theta = found.samples(n, rng=rng)
+    start = _equal_weights(found.names, theta, readings.log_likelihood(theta))
+    return replace(_moved(start, readings, rng), log_z=found.log_z, log_z_error=found.log_z_error, run=found)
+
+
+class Inquiry(ShowsItself):
+    """An inquiry: the posterior of a model's parameters, and the setting with the largest acquisition function.
+
+    Parameters
+    ----------
+    model
+        Predicts readings: `model(parameters, settings)`, `parameters` a dict by name, `settings` in the form in which
+        they are given here. It is called with arrays that broadcast, parameters (n_samples, 1) against settings
+        (n_settings,), if that gives the same readings; otherwise sample by sample, and if need be setting by setting.
+    prior
+        Distributions by name (`probewise.priors` or frozen ones of scipy.stats), or a prior.
+    settings
+        Every setting that the instrument has: numbers or names (n_settings,) of one knob; numbers (n_settings, n_knobs)
+        of several, which the model gets as (n_knobs, n_settings), to be unpacked; or a dict of columns by name.
+    noise
+        Sd of a reading's noise: a number, a function of the predicted reading, or a prior if it is unknown; or a
+        `ReadingNoise`, for heavy tails and outliers.
+    rng
+        Source of randomness: the same generator and readings give the same choices.
+    goal
+        Target posterior sd by parameter: `{"centre_hz": 0.5}`. Readings are then chosen to reach it, and `settled`
+        turns True. Without it, readings are chosen for the information about all parameters.
+    cost_s
+        Seconds that a reading takes at each setting, (n_settings,); or a function of the last setting (None at first)
+        that returns them. `utility` is then per second.
+    n_samples
+        Posterior samples, 400 or more.
+    n_live
+        Live points of nested sampling, which starts anew if the samples cannot follow a reading, or have lost a part of
+        the posterior.
+
+    Raises
+    ------
+    ParameterError
+        If an argument is of the wrong kind.
+    ShapeError
+        If `cost_s` has not one number per setting.
+    """
+
+    @own_arithmetic
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        prior: AnyPrior,
+        settings: Any,
+        noise: AnyNoise,
+        *,
+        rng: np.random.Generator,
+        goal: Mapping[str, float] | None = None,
+        cost_s: Sequence[float] | FloatArray | Callable[[Any], Any] | None = None,
+        n_samples: int = 2000,
+        n_live: int = 300,
+    ) -> None:
+        require_callable("model", model, "a function model(parameters, settings) that predicts readings")
+        require_rng(rng)
+        named = make_problem(lambda _: 0.0, prior).prior
+        require_prior("prior", named, "to_unit_cube", "log_prob")
+        self._settings = Settings.of(settings)
+        self._model = InstrumentModel.from_function(model, named, ReadingNoise.of(noise), self._settings)
+        self._rng = rng
+        self._goal = _checked_goal(goal, self._model.prior.names)
+        self._cost_s = cost_s
+        self._n_samples, self._n_live = (
+            checked_whole("n_samples", n_samples, least=400, most=1_000_000),
+            checked_whole("n_live", n_live),
+        )
+        self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)
+        self._prior_theta = self._posterior.theta
+        self._prior_log_likelihood, self._lost_nats = np.zeros(self._n_samples), 0.0
+        self._taken: list[tuple[Any, float]] = []
+        self._readings: ReadingsProblem | None = None
+        self._utility: FloatArray | None = None
+        self._next: Any = None
+        self._costs_s(None)
+
+    @property
+    def posterior(self) -> Weighted:
+        """The posterior as `nested.Weighted` samples: `mean()`, `sd()`, `interval(0.95)`, `samples(n, rng=rng)`."""
+        return self._posterior
+
+    @property
+    def evidence(self) -> tuple[float, float]:
+        """Natural log of the evidence of the readings, and its standard error."""
+        return self._posterior.log_z, self._posterior.log_z_error
+
+    @property
+    def readings(self) -> tuple[tuple[Any, float], ...]:
+        """Pairs (setting, reading) so far; to resume, call `tell(reading, setting)` of a new inquiry for each."""
+        return tuple(self._taken)
+
+    @property
+    @own_arithmetic
+    def utility(self) -> FloatArray:
+        """Acquisition function of each setting, (n_settings,), per second if the costs in seconds are given.
+
+        It is the expected information, bits, until every sd that the goal names is within three times its goal; then
+        the expected decrease of the sum of ln(sd / goal), until the goal is reached; and from then on information
+        again.
+        """
+        if self._utility is None:
+            self._utility = self._utility_for_weights(self._posterior.weight) / self._costs_s(self._last_setting)
+            self._utility.flags.writeable = False
+        return self._utility
+
+    @property
+    def utility_label(self) -> str:
+        """Axis label of the acquisition function, with its unit."""
+        per_second = "" if self._cost_s is None else " per second"
+        return f"{_NEARER if self._is_near_goal else _BITS}{per_second}"
+
+    @property
+    @own_arithmetic
+    def settled(self) -> bool:
+        """Whether the posterior sd of every parameter in the goal is at most its goal.
+
+        Raises ParameterError if the inquiry has no goal.
+        """
+        if not self._goal:
+            raise ParameterError("goal", None, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
+        return self._largest_sd_over_goal <= 1.0
+
+    @property
+    @own_arithmetic
+    def doubt(self) -> str | None:
+        """A warning if even the best posterior sample does not explain the readings (chi-square, p < 1e-6); or None.
+
+        It names the reading that fits worst.
+        """
+        if self._readings is None:
+            return None
+        best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
+        p_value, worst = self._readings.p_value_and_worst_reading(best)
+        if p_value >= _DOUBT_P:
+            return None
+        setting, value = self._taken[worst]
+        return (
+            f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "
+            f"({value:g} at {setting}); the model leaves something out, the prior excludes the truth, or the noise is "
+            "greater than stated"
+        )
+
+    @own_arithmetic
+    def next(self) -> Any:
+        """Return the setting with the largest acquisition function, in the form of `settings`; ties break at random."""
+        if self._next is None:
+            row = choose(self.utility, np.ones(len(self._settings), dtype=np.bool_), rng=self._rng)
+            self._next = self._settings[row]
+        return self._next
+
+    @own_arithmetic
+    def tell(self, reading: float, setting: Any = None) -> None:
+        """Update the posterior by a reading.
+
+        Parameters
+        ----------
+        reading
+            The value read.
+        setting
+            Its setting, which need not be one of the settings; by default the one that `next()` returned since the
+            last reading.
+
+        Raises
+        ------
+        ParameterError
+            If the reading is not a finite number, the setting not of the form of `settings`, or not given though
+            `next()` was not called since the last reading. The posterior is unchanged.
+        NotConvergedError
+            If no hypothesis could have given these readings. The posterior is unchanged.
+        """
+        value = checked_finite_number("reading", reading, "a finite number; leave out a missing reading")
+        if setting is None and self._next is None:
+            way_out = (
+                "the setting of this reading: tell(reading, setting); next() has chosen none since the last reading"
+            )
+            raise ParameterError("setting", None, way_out)
+        at = self._settings.checked_setting(self._next if setting is None else setting)
+        readings = _append_reading(self._readings, self._model, at, value)
+        of_prior = self._prior_log_likelihood + readings.log_density_of_last(self._prior_theta)
+        by_prior = float(logsumexp(of_prior)) - math.log(self._n_samples)
+        found = updated_posterior(self._posterior, readings, rng=self._rng)
+        # Samples of the prior that explain the readings better than the posterior does lie in a part that it has lost.
+        if found is None or by_prior - found.log_z > _LOST_NATS + self._lost_nats:
+            found = nested_posterior(readings, self._n_samples, self._n_live, rng=self._rng)
+            self._lost_nats = max(by_prior - found.log_z, 0.0)
+        self._posterior, self._prior_log_likelihood = found, of_prior
+        self._readings = readings
+        self._taken.append((at[0], value))
+        self._utility, self._next = None, None
+
+    @own_arithmetic
+    def several(self, n: int) -> list[Any]:
+        """Choose the settings of `n` readings to be taken before any of them is known; best first.
+
+        Greedy: each setting has the largest utility given those before it in the list, averaged over simulated readings
+        there. While the utility is information, this is greedy on the joint information (Nemhauser, Wolsey & Fisher
+        1978). Costs count from the setting before it. Pass the results one by one to `tell(reading, setting)`.
+        ParameterError if `n` is below 1.
+        """
+        checked_whole("n", n)
+        everywhere = np.ones(len(self._settings), dtype=np.bool_)
+        rows = [choose(self.utility, everywhere, rng=self._rng)]
+        theta, noise = self._posterior.theta, self._model.noise
+        weights = [self._posterior.weight] * _N_IMAGINED
+        while len(rows) < n:
+            predicted = self._model.predict(theta, self._settings.take(np.array(rows[-1:])))
+            scale = self._model.scale(theta, predicted)
+            for k, weight in enumerate(weights):
+                truth = [self._rng.choice(len(weight), p=weight / weight.sum())]
+                imagined = noise.draw(predicted[truth], scale[truth], rng=self._rng)
+                log_density = noise.log_density(imagined, predicted, scale)[:, 0]
+                weights[k] = weight * np.exp(log_density - log_density[weight > 0].max())
+            cost_s = self._costs_s(self._settings[rows[-1]])
+            utility = np.mean([self._utility_for_weights(weight) for weight in weights], axis=0) / cost_s
+            rows.append(choose(utility, everywhere, rng=self._rng))
+        return [self._settings[row] for row in rows]
+
+    @own_arithmetic
+    def summary(self) -> str:
+        """Describe the posterior in plain text."""
+        found = self._posterior
+        width = max(9, *(len(name) for name in found.names))
+        low, high = found.interval(0.95)
+        lines = [
+            f"{len(self._taken)} readings, log Z {found.log_z:.2f} ± {found.log_z_error:.2f}, "
+            f"effective sample size {found.n_eff:.0f} of {len(found.theta)}",
+            f"{'parameter':<{width}}  {'mean':>11}  {'sd':>11}  95 % interval",
+        ]
+        for name, mean, sd, a, b in zip(found.names, found.mean(), found.sd(), low, high, strict=True):
+            goal = f", asked for {self._goal[name]:.3g}" if name in self._goal else ""
+            lines.append(f"{name:<{width}}  {mean:>11.5g}  {sd:>11.3g}  {a:.5g} to {b:.5g}{goal}")
+        return "\n".join([*lines, *([] if self.doubt is None else [f"doubtful: {self.doubt}"])])
+
+    @property
+    def _largest_sd_over_goal(self) -> float:
+        """Largest ratio of a posterior sd to its goal."""
+        sd = dict(zip(self._posterior.names, self._posterior.sd(), strict=True))
+        return float(max(sd[name] / goal for name, goal in self._goal.items()))
+
+    @property
+    def _is_near_goal(self) -> bool:
+        """Whether the goal is not reached yet, but every sd is within three times its goal."""
+        return bool(self._goal) and 1.0 < self._largest_sd_over_goal < _NEAR_GOAL
+
+    def _utility_for_weights(self, weight: FloatArray) -> FloatArray:
+        """Compute the acquisition function per reading, (n_settings,), for the posterior samples with these weights."""
+        n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
+        theta = self._posterior.theta[resampled_rows(weight, n, self._rng)]
+        theta = theta[self._rng.permutation(n)]  # copies of one sample apart
+        predicted = self._model.predict(theta, self._settings)
+        even = np.full(n, 1.0 / n)
+        given = readings_given_noise(predicted, self._model.scale(theta, predicted), even, self._model.noise)
+        if self._is_near_goal:
+            values, goal = theta[:, [self._posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
+            now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
+            fall = np.asarray(now - expected_nats_above_goal(given, values, np.array(goal)))
+            if fall.max() > 0.0:  # else most readings lead to the goal, but a few far away from it
+                return fall
+        return given.information_bits
+
+    @property
+    def _last_setting(self) -> Any:
+        """Setting of the last reading; None before the first."""
+        return self._taken[-1][0] if self._taken else None
+
+    def _costs_s(self, last: Any) -> FloatArray:
+        """Return the seconds of a reading at each setting after one at `last`, (n_settings,) or a number; default 1.
+
+        ShapeError or ParameterError for costs of a wrong shape or not above 0.
+        """
+        given = self._cost_s
+        if given is None:
+            return np.ones(len(self._settings))
+        if callable(given):
+            given = given(last)
+        cost_s = floats(given, "cost_s")
+        if cost_s.shape not in ((), (len(self._settings),)):
+            raise ShapeError(f"cost_s has shape {cost_s.shape}; allowed: ({len(self._settings)},), one per setting")
+        if not ((cost_s > 0) & np.isfinite(cost_s)).all():
+            raise ParameterError("cost_s", cost_s.tolist(), "seconds greater than 0, finite")
+        return cost_s
+
+
+def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
+    """Return the target sds by parameter, empty if no goal is given; ParameterError for anything else."""
+    if goal is None:
+        return {}
+    if not isinstance(goal, Mapping) or not goal:
+        raise ParameterError("goal", goal, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
+    for name, sd in goal.items():
+        if name not in names:
+            raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
+        if not checked_finite_number(f"goal[{name!r}]", sd) > 0:
+            raise ParameterError(f"goal[{name!r}]", sd, "greater than 0")
+    return dict(goal)
+
+
+def _append_reading(
+    readings: ReadingsProblem | None, model: InstrumentModel, at: Settings, value: float
+) -> ReadingsProblem:
+    """Return the readings with one more; a setting that was read before is not listed again."""
+    if readings is None:
+        return ReadingsProblem(model, at, np.array([0]), np.array([value]))
+    known = readings.settings
+    same = np.ones(len(known), dtype=np.bool_)
+    for name, column in known.columns.items():
+        same &= column == at.columns[name][0]
+    row = int(np.argmax(same)) if same.any() else len(known)
+    settings = known if same.any() else known.joined(at)
+    return ReadingsProblem(model, settings, np.append(readings.row, row), np.append(readings.values, value))

@@ -1,4 +1,4 @@
-"""Instruments: poses and readings, the interface, and the places within reach."""
+"""Instruments: poses, readings, interface, places within reach (paper, section "Robotic Arm Test Bed")."""
 
 from __future__ import annotations
 

@@ -20,7 +20,6 @@ from scipy.special import gammainc, gammaincc, gammaln
 
 from probewise._arrays import FloatArray, IntArray, floats, frozen_int, read_only_floats
 from probewise._kinds import checked_number
-from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import ParameterError, ShapeError
 
 
@@ -86,8 +85,10 @@ class Naive:
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         residuals(readings, predicted)
         middle, sign = 0.5 * (self.mu_black + self.mu_white), 1.0 if self.mu_white > self.mu_black else -1.0
-        black = log_gaussian_density(readings, self.mu_black, self.sd_black)
-        white = log_gaussian_density(readings, self.mu_white, self.sd_white)
+        black, white = (
+            -0.5 * ((readings - mean) / sd) * ((readings - mean) / sd) - np.log(sd) - 0.5 * math.log(2 * math.pi)
+            for mean, sd in ((self.mu_black, self.sd_black), (self.mu_white, self.sd_white))
+        )
         over_white = (predicted - middle) * sign > 0
         return np.asarray(over_white @ (white - black) + black.sum())
 

@@ -1,4 +1,4 @@
-"""The paper's inquiry engine (section "The Machine Learning System", figures 2 and 8).
+"""The inquiry engine (paper, section "The Machine Learning System", figures 2 and 8).
 
 Fifty hypotheses, drawn from the posterior, predict a reading at every place of a fine grid. The predictions at a place
 fall into bins as wide as the sensor's step; with p_j the share of hypotheses in bin j, H = - sum_j p_j log2 p_j is the

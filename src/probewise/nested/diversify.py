@@ -1,4 +1,4 @@
-"""Replace repeated posterior samples by distinct ones with Metropolis-Hastings ("The Machine Learning System")."""
+"""Make repeated posterior samples distinct by Metropolis-Hastings (paper, section "The Machine Learning System")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Nested sampling (Skilling 2006): remove the worst live points, shrink the volume, draw new ones above.
+"""Nested sampling (Skilling 2006), the inference engine (paper, section "The Machine Learning System").
+
+The worst live points are removed, which shrinks the volume, and new ones drawn above them.
 
 `run` is the entry point, `replace_worst_live_points` the step, and `RemainingEvidence` and `EvidenceChange` say when to
 stop.

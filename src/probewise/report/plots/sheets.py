@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,6 +30,7 @@ _PIXEL_MM = 0.25  # pixel size for patterns that have no outline
 _ROUND = np.linspace(0.0, 2 * np.pi, 721)[:-1]
 _SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
 _THUMB_MM = 38.0
+_LETTER_MM, _COVER_LETTERS = 1.6, 66  # of small print; letters on a line beside an overview
 _CROSS_MM = 15.0  # long enough to show beyond a block of two LEGO studs
 
 
@@ -91,7 +93,8 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
             pages = f"pages {first} to {last}"
             grid = [f"{columns} side by side, {rows} one above the other, from the lower left"]
         width, height = sheet.size_mm
-        lines = [f"{width:g} x {height:g} mm; {pages}", *grid, *sheet.lines, f"origin: {sheet.frame}"]
+        said = [line for text in sheet.lines for line in textwrap.wrap(text, _COVER_LETTERS)]
+        lines = [f"{width:g} x {height:g} mm; {pages}", *grid, *said, f"origin: {sheet.frame}"]
         if sheet.orientations_rad:
             turns = ", ".join(f"{np.degrees(turn):.4g}" for turn in sheet.orientations_rad)
             lines.append(f"the sensor stands at {turns} degrees")
@@ -146,10 +149,11 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
     said: dict[str, Any] = {"fontsize": _SMALL, "va": "center", "ha": "center"}
     for x, value in ((x0, low[0]), (x1, high[0])):
         if abs(value) > 12 or value == 0:
-            ax.text(x, y0 - 6.0, f"x = {value:.4g} mm", **said)
+            ax.text(x, y0 - 6.0, f"x = {value:.4g} mm", **{**said, "ha": "left" if x == x0 else "right"})
     for y, value in ((y0, low[1]), (y1, high[1])):
         if abs(value) > 12 or value == 0:
-            ax.text(x0 - 10.0, y, f"y = {value:.4g} mm", rotation=90, **said)
+            ends = {**said, "va": "bottom" if y == y0 else "top"}  # away from the corner, where x is written
+            ax.text(x0 - 10.0, y, f"y = {value:.4g} mm", rotation=90, **ends)
     heavy = line | {"lw": 1.2, "color": VERMILLION}
     if low[0] < 0 < high[0]:
         x = x0 - low[0]
@@ -189,7 +193,7 @@ def _draw_ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
     for mm in range(0, _RULER_MM + 1, 5):
         length = 3.0 if mm % 50 == 0 else 2.0 if mm % 10 == 0 else 1.2
         ax.plot([x_mm + mm] * 2, [y_mm, y_mm + length], color=BLACK, lw=0.4, solid_capstyle="butt")
-    ax.text(x_mm + _RULER_MM + 3.0, y_mm + 1.0, "100 mm?", fontsize=_SMALL, va="center")
+    ax.text(x_mm + _RULER_MM + 3.0, y_mm + 1.0, "100 mm", fontsize=_SMALL, va="center")
 
 
 def _draw_sheet_part(
@@ -213,21 +217,22 @@ def _draw_sheet_part(
         for arm in ([[-_CROSS_MM, 0.0], [_CROSS_MM, 0.0]], [[0.0, -_CROSS_MM], [0.0, _CROSS_MM]]):
             (half,) = ax.plot(*place(mark + np.array(arm)).T, color=BLACK, lw=0.35, solid_capstyle="butt", zorder=2)
             half.set_clip_path(clip)
-        x, y = place((mark + 10.0)[None])[0].tolist()
+        (x, y), (left, _), (right, _) = place(np.array([mark + 10.0, mark - 10.0, high_mm])).tolist()
         if (low_mm[0] <= mark[0] < high_mm[0]) and (low_mm[1] <= mark[1] < high_mm[1]):
             name = sheet.cross_names[k] if sheet.cross_names else f"{k + 1}: ({mark[0]:g}, {mark[1]:g})"
             if not named:
                 name = "" if sheet.cross_names else f"{k + 1}"
-            told = ax.text(x, y, name, fontsize=_SMALL, zorder=2)
-            told.set_clip_path(clip)
+            fits = x + _LETTER_MM * len(name) < right
+            written = ax.text(x if fits else left, y, name, ha="left" if fits else "right", fontsize=_SMALL, zorder=2)
+            written.set_clip_path(clip)
     for stroke in sheet.strokes_mm:
         (drawn,) = ax.plot(*place(stroke).T, color=BLACK, lw=0.5, solid_capstyle="butt", zorder=2)
         drawn.set_clip_path(clip)
     for x, y, words in sheet.words if named else ():
         if (low_mm[0] <= x < high_mm[0]) and (low_mm[1] <= y < high_mm[1]):
             at_x, at_y = place(np.array([[x, y]]))[0].tolist()
-            told = ax.text(at_x, at_y, words, fontsize=_SMALL, zorder=2, clip_on=True)
-            told.set_clip_path(clip)
+            written = ax.text(at_x, at_y, words, fontsize=_SMALL, zorder=2, clip_on=True)
+            written.set_clip_path(clip)
 
 
 def _outlines_with_albedo(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:

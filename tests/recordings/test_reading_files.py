@@ -256,7 +256,7 @@ BAD_DESCRIPTIONS = {
         described(a={"kind": "image", "file": "x.png", "pixel_mm": 1, "origin_mm": [0, 0]}),
         ["patterns.a.file", "x.png", "same folder"],
     ),
-    "range": (with_white(reading={"min": 5, "max": 5}), ["reading.max is 5", "greater than reading.min"]),
+    "range": (with_white(reading={"min": 5, "max": 5}), ["reading.max is 5", "greater than min"]),
     "step": (with_white(reading={"step": 0}), ["reading.step is 0", "greater than 0"]),
     "controls": (with_white(controls="led"), ["controls", "list of texts"]),
 }  # fmt: skip

@@ -11,8 +11,7 @@ from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
 from probewise.errors import ParameterError
 from probewise.recordings import paper_plan, two_way_plan
-from probewise.recordings.patterns import HalfPlane, Image, Quadrant, Stripes, Uniform
-from probewise.recordings.where_white import where_white_in_words
+from probewise.recordings.patterns import HalfPlane, Image, Quadrant, Stripes, Uniform, where_white_in_words
 from probewise.report.plots.sheets import sheets_pdf
 from probewise.report.sheets import (
     BOTTOM_MM,

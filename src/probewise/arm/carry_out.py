@@ -14,9 +14,8 @@ from probewise.arm.lego import LegoArm
 from probewise.arm.own import Measures, OwnInstrument, as_instrument
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
-from probewise.recordings.patterns import Uniform
+from probewise.recordings.patterns import Uniform, where_white_in_words
 from probewise.recordings.plan import Plan, Recording
-from probewise.recordings.where_white import where_white_in_words
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)

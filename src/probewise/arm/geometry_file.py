@@ -12,7 +12,7 @@ from typing import Any
 from probewise._kinds import checked_path
 from probewise.arm.geometry import FITTED, JOINTS, Accuracy, Geometry, Joint
 from probewise.errors import FileError, ParameterError, shown
-from probewise.recordings.text import read_text
+from probewise.recordings.io import read_text
 
 FORMAT = "arm/1"
 ELBOWS = ("absolute", "relative")

@@ -13,8 +13,7 @@ from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.prepared import MOST_READINGS, positions_in_stretches
 from probewise.diagnosis.simulator_fit import fit_system, is_noise_sd_known_beside_misfit
 from probewise.errors import ParameterError
-from probewise.recordings.ends import masks_of_readings_at_ends
-from probewise.recordings.plan import Plan
+from probewise.recordings.plan import Plan, masks_of_readings_at_ends
 from probewise.systems import RunRecording, RunTable, Simulator, System, as_recording
 from probewise.systems.forms.stop import (
     MeterStop,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.recordings.ends import masks_of_readings_at_ends
+from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.sensor.stages import NoiseParameters
 
 _LEAST_MASS = 1e-290  # below, masses lose digits; above, their difference is as exact as that of logs, in half the time

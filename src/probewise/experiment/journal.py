@@ -33,10 +33,9 @@ from probewise._writing import hold_lock, write_and_sync, write_text_atomically
 from probewise.arm.instrument import Pose, Reading
 from probewise.effects import NamedEffect
 from probewise.errors import FileError, ParameterError, shown
+from probewise.recordings.io import parse_json_file_text, read_bytes
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.recordings.strict_json import parse_json_file_text
-from probewise.recordings.text import read_bytes
 
 FORMAT = "journal/1"
 PATTERN = "field"

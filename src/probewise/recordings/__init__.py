@@ -2,13 +2,14 @@
 
 from probewise._writing import hold_lock, write_bytes_atomically, write_text_atomically
 from probewise.recordings.files import (
+    fingerprint,
     read_plan,
     read_plan_and_readings,
     read_recording,
     write_plan,
     write_recording,
 )
-from probewise.recordings.fingerprint import fingerprint
+from probewise.recordings.io import parse_json_file_text, parse_strict_json, read_bytes, read_text, shipped
 from probewise.recordings.patterns import (
     Disc,
     HalfPlane,
@@ -23,9 +24,6 @@ from probewise.recordings.patterns import (
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.plans import paper_plan, two_way_plan
 from probewise.recordings.prediction import Prediction, read_prediction_columns, write_prediction
-from probewise.recordings.shipping import shipped
-from probewise.recordings.strict_json import parse_json_file_text, parse_strict_json
-from probewise.recordings.text import read_bytes, read_text
 
 __all__ = [
     "Disc",

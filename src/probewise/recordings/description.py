@@ -13,6 +13,7 @@ import numpy as np
 
 from probewise.errors import FileError, ParameterError, shortened
 from probewise.recordings.images import is_file_name_without_path, read_image
+from probewise.recordings.io import parse_json_file_text, read_text
 from probewise.recordings.patterns import (
     Disc,
     HalfPlane,
@@ -25,9 +26,7 @@ from probewise.recordings.patterns import (
     Uniform,
 )
 from probewise.recordings.plan import Instrumentation
-from probewise.recordings.strict_json import parse_json_file_text
 from probewise.recordings.table import LARGEST
-from probewise.recordings.text import read_text
 
 FORMAT = "recording/1"
 _CONTROLS = ("orientation_deg", "height_mm", "led", "speed")

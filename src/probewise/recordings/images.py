@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
 from probewise.errors import FileError, ParameterError
-from probewise.recordings.text import read_bytes
+from probewise.recordings.io import read_bytes
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type

@@ -29,7 +29,7 @@ from probewise.recordings.cells import (
     plain_cells,
     unit_of_cells,
 )
-from probewise.recordings.text import read_text
+from probewise.recordings.io import read_text
 from probewise.recordings.times import looks_like_time, require_unit_of_time, texts_to_times
 
 LARGEST = 1e15

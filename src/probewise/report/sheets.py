@@ -14,9 +14,19 @@ from probewise.arm import Geometry
 from probewise.arm.fitting import spread_mark_places
 from probewise.effects.reference import orientation_deg
 from probewise.errors import ParameterError
-from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
+from probewise.recordings.patterns import (
+    Disc,
+    HalfPlane,
+    Image,
+    Pattern,
+    Polygon,
+    Quadrant,
+    Ramp,
+    Stripes,
+    Uniform,
+    where_white_in_words,
+)
 from probewise.recordings.plan import Plan
-from probewise.recordings.where_white import where_white_in_words
 
 PAPERS_MM: Mapping[str, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 """Width and height of the papers, upright."""

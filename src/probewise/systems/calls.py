@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray
 from probewise.errors import FileError, ParameterError, ShapeError, message_of
 from probewise.progress import Progress
-from probewise.recordings.python_file import EndedByFile
+from probewise.recordings.io import EndedByFile
 from probewise.systems.simulator import Simulate, Simulator
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row

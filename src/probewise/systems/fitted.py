@@ -25,8 +25,8 @@ from probewise._version import __version__
 from probewise.effects import EFFECTS, name_without_copy_suffix
 from probewise.errors import FileError, ParameterError, message_of, printable
 from probewise.recordings import parse_strict_json, write_text_atomically
+from probewise.recordings.io import read_text
 from probewise.recordings.table import csv_text, number_text
-from probewise.recordings.text import read_text
 from probewise.sensor import Stage
 from probewise.systems.forms.binding import StoredFit, counts_from_far_origin
 from probewise.systems.simulator import Simulator, fingerprint_of_text, run_simulator_text

@@ -18,8 +18,7 @@ from probewise._kinds import checked_path, checked_text, checked_texts, require_
 from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, shown
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
-from probewise.recordings.python_file import raising_exceptions, run_python_text
-from probewise.recordings.text import read_text
+from probewise.recordings.io import raising_exceptions, read_text, run_python_text
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable, read_run_table
 

@@ -16,7 +16,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
-from probewise.recordings.ends import masks_of_readings_at_ends
+from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories

@@ -20,7 +20,7 @@ from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.cells import first_cell_without_number, parsed_numbers
 from probewise.recordings.columns import text_of_name
-from probewise.recordings.ends import masks_of_readings_at_ends
+from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.recordings.table import csv_text, number_text, read_table
 from probewise.recordings.times import times_to_numbers
 

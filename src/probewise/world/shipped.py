@@ -15,9 +15,9 @@ import numpy as np
 
 from probewise.errors import ParameterError
 from probewise.recordings.files import write_recording
+from probewise.recordings.io import SHIPPED
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan, two_way_plan, with_jittered_times
-from probewise.recordings.shipping import SHIPPED
 from probewise.world.concealed import AmbientGradient, Backlash, CorrelatedNoise, GainDrift, Nonlinearity, Saturation
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.stages import Concealed

@@ -1,0 +1,236 @@
+"""Files as bytes and as text: strict JSON, a person's Python file, and what ships with the package."""
+
+from __future__ import annotations
+
+import codecs
+import functools
+import json
+import math
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Mapping
+from importlib import resources
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from probewise._kinds import checked_path
+from probewise.errors import FileError, ParameterError, PipeWarning, message_of, shown
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Read a whole file; `what`, for messages, is what it should be. A pipe gives a PipeWarning.
+
+    Raises
+    ------
+    FileError
+        If it is missing, cannot be read or is a device.
+    """
+    try:
+        device = path.is_char_device() or path.is_block_device()  # /dev/zero never ends
+        if path.is_fifo():
+            warnings.warn(f"{path} is a pipe: reading it waits for its writer to end", PipeWarning, stacklevel=2)
+        content = b"" if device else path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileError(path, "there is no such file", what) from error
+    except (OSError, ValueError) as error:
+        raise FileError(path, f"cannot be read ({error})", what) from error
+    if device:
+        raise FileError(path, "this is a device", what)
+    return content
+
+
+def read_text(path: Path, what: str) -> str:
+    """Read a whole file of UTF-8, or of UTF-16 with its byte-order mark, without that mark; `what` as in `read_bytes`.
+
+    Raises
+    ------
+    FileError
+        If it is missing, cannot be read or is no such text.
+    """
+    content = read_bytes(path, what)
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        return content.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = content.count(b"\n", 0, error.start) + 1
+        found = f"byte 0x{content[error.start]:02x} at offset {error.start} is not {'UTF-16' if wide else 'UTF-8'}"
+        raise FileError(path, found, "UTF-8 text (save the file again with that encoding)", row=row) from error
+
+
+_MOST_DIGITS = 400  # more digits than any finite float has before the point
+
+
+def parse_json_file_text(
+    path: str | os.PathLike[str], text: str | bytes, allowed: str, *, row: int | None = None
+) -> Any:
+    """Parse a JSON text, or UTF-8 bytes, from a file.
+
+    Parameters
+    ----------
+    path, row
+        Its place, for messages; without `row`, the row of the error within the text.
+    text
+        The text.
+    allowed
+        What the file should contain, for messages.
+
+    Raises
+    ------
+    FileError
+        If it is not strict JSON; see `parse_strict_json`.
+    """
+    try:
+        return parse_strict_json(text)
+    except json.JSONDecodeError as error:
+        found = f"does not parse as JSON: {error.msg} at character {error.colno}"
+        raise FileError(path, found, allowed, row=error.lineno if row is None else row) from error
+    except ValueError as error:
+        raise FileError(path, f"does not parse as JSON: {error}", allowed, row=row) from error
+
+
+def parse_strict_json(text: str | bytes) -> Any:
+    """Parse a JSON text, or UTF-8 bytes; a byte-order mark is skipped.
+
+    Raises
+    ------
+    json.JSONDecodeError
+        If it does not parse.
+    ValueError
+        If it is nested too deep, bytes are not UTF-8, a lone surrogate is escaped, a number is NaN, infinite or
+        beyond the floats, or an object repeats a name.
+    """
+    text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
+    try:
+        value = json.loads(
+            text,
+            object_pairs_hook=_dict_of_unique_names,
+            parse_constant=_refuse_constant,
+            parse_int=_parse_whole_number,
+            parse_float=_parse_finite_number,
+        )
+        if "\\u" in text:  # an escaped lone surrogate could not be written to a file
+            json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("half of an escaped character, a surrogate, stands alone") from error
+    except RecursionError as error:
+        raise ValueError("lists or objects nested too deep") from error
+    return value
+
+
+def _dict_of_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out = dict(pairs)
+    if len(out) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the name {shown(next(n for n in names if names.count(n) > 1))} comes twice")
+    return out
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _parse_whole_number(digits: str) -> int:
+    # Python refuses to convert texts of thousands of digits.
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError(f"a number of {len(digits)} digits, beyond every float")
+    _parse_finite_number(digits)
+    return int(digits)
+
+
+def _parse_finite_number(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"the number {shown(digits)} is beyond every float")
+    return value
+
+
+def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any]:
+    """Run a user's file as `import` would, and return the names that it defines.
+
+    Its folder is added to the module search path, as by `python FILE.py`.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        What the file should be, for messages.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read or run; the error names the line if there is one.
+    """
+    path = checked_path("path", path, what)
+    return run_python_text(read_text(path, what), path)
+
+
+def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
+    """Run the text of a user's file and return the names that it defines, as `run_python_file` does."""
+    try:
+        code = compile(text, str(path), "exec")
+    except Exception as error:
+        found = f"is no Python: {message_of(error, kind=False)}"
+        if isinstance(error, MemoryError | RecursionError):  # of the parser
+            found = f"has an expression that is too long or too deeply nested for Python ({type(error).__name__})"
+        raise FileError(path, found, "a file that Python can run", row=getattr(error, "lineno", None)) from error
+    module = ModuleType(f"probewise_file_{path.stem}")  # a prefix, so that serial.py cannot hide the package serial
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses look their module up
+    folder = str(path.absolute().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        with np.errstate(), warnings.catch_warnings():  # what the file sets is its own affair
+            exec(code, module.__dict__)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        found = f"stops with {message_of(error)}"
+        raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
+    return module.__dict__
+
+
+class EndedByFile(Exception):
+    """What a function of a user's file raised that is no Exception, such as SystemExit; the text names it."""
+
+
+def raising_exceptions(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of a user's file so that whatever it raises, but for Ctrl-C, is an Exception."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **named: Any) -> Any:
+        try:
+            return function(*args, **named)
+        except (Exception, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            raise EndedByFile(message_of(error)).with_traceback(error.__traceback__) from error
+
+    return call
+
+
+SHIPPED = ("paper", "concealed")
+
+
+def shipped(name: str) -> Path:
+    """Return the path of a recording shipped with the package, with its JSON beside it.
+
+    Both are simulated (world/shipped.py). `paper`: readings of the paper's plan, 404 over the black-and-white boundary
+    and four over the quadrants. `concealed`: 961 readings of scans out and back, with one effect that the sensor model
+    leaves out, drawn from a seed.
+
+    Raises
+    ------
+    ParameterError
+        If there is no recording of that name.
+    """
+    if name not in SHIPPED:
+        raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
+    return Path(str(resources.files("probewise"))) / "data" / f"{name}.csv"

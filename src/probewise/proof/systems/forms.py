@@ -107,7 +107,7 @@ def _curve_and_friction_forms(true: TrueSystem, column: str) -> Iterator[Form]:
             **common,
         )
     speeds = np.sort(np.abs(values[values != 0]))
-    if min(np.count_nonzero(values < 0), np.count_nonzero(values > 0)) >= 8:
+    if min(len(np.unique(side)) for side in (values[values < 0], values[values > 0])) >= 3:
         widths = np.geomspace(speeds[len(speeds) // 20], 0.3 * speeds[-1], 5)
         yield Form(
             f"friction:{column}",

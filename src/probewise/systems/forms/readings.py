@@ -32,7 +32,7 @@ _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and
 _ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
 _BEND_DEGREE = 4
-_HIGHEST_ORDER = 5  # of a curve
+_COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
 _NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
 _OUTLYING = 5.0  # medians of the residual's size
 
@@ -234,64 +234,61 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
 
 def _curve_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     """Yield a polynomial in a column scaled to [-1, 1]; its order, less than the number of values, is a variant."""
-    column, reading = about.table.covariates[name], about.system.simulator.reading
-    low, high = float(np.nanmin(column)), float(np.nanmax(column))
-    orders, names = np.arange(1, _HIGHEST_ORDER + 1)[:, None], [f"a{k}" for k in range(1, _HIGHEST_ORDER + 1)]
+    column, reading, unit = about.table.covariates[name], about.system.simulator.reading, about.reading_unit
+    low, high, every = float(np.nanmin(column)), float(np.nanmax(column)), tuple(range(len(_COEFFICIENTS)))
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         z = np.nan_to_num((2 * rows.covariates[name] - low - high) / (high - low))
-        return np.asarray(value + theta @ z**orders)
+        return np.asarray(value + theta @ z ** (1 + np.array(every))[:, None])
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        each = enumerate(
-            value_with_sd(m, s, about.reading_unit) for m, s in zip(mean, sd, strict=True) if s > _HARDLY * sd.max()
-        )
-        said = " + ".join(f"({size}) z^{k + 1}" if k else f"({size}) z" for k, size in each)
+        sizes = [value_with_sd(mean[k], sd[k], unit) for k in every if sd[k] > _HARDLY * sd.max()]
+        said = " + ".join(f"({size}) z^{k}" if k > 1 else f"({size}) z" for k, size in enumerate(sizes, 1))
         return f"{reading} follows a curve of {name}: {said}, z from -1 at {name} = {low:.4g} to 1 at {high:.4g}"
 
-    along, units = (covariate_of_column(name),), (about.reading_unit,) * _HIGHEST_ORDER
-    bank, amplitudes = np.eye(_HIGHEST_ORDER)[None], tuple(range(_HIGHEST_ORDER))
-    any_size = dict.fromkeys(names, AMPLITUDE)
-    form = Form(f"curve:{name}", Stage.OFFSET, any_size, units, along, act, bank, says, amplitudes)
-    for whole in about.scaled(form, about.sd):
-        none: Marginal = Fixed(-_NONE * whole.entries.max(), _NONE * whole.entries.max())
-        last = min(len(distinct_values(column[about.has_reading])) - 1, _HIGHEST_ORDER)
-        variants = [
-            replace(
-                whole, parameters={**whole.marginals, **dict.fromkeys(names[k:], none)}, entries=whole.entries[:, :k]
-            )
-            for k in range(2, last + 1)
-        ]
-        yield from (replace(first, alternatives=tuple(variants[1:])) for first in variants[:1])
+    along, any_size = (covariate_of_column(name),), dict.fromkeys(_COEFFICIENTS, AMPLITUDE)
+    bank = np.eye(len(every))[None]
+    form = Form(f"curve:{name}", Stage.OFFSET, any_size, (unit,) * len(every), along, act, bank, says, every)
+    last = min(len(distinct_values(column[about.has_reading])) - 1, len(every))
+    for whole in about.scaled(form, about.sd) if last > 1 else ():
+        first, *others = (_up_to_order(whole, order) for order in range(2, last + 1))
+        yield replace(first, alternatives=tuple(others))
+
+
+def _up_to_order(curve: Form, order: int) -> Form:
+    """Return the variant of a curve whose higher coefficients are 0."""
+    none = Fixed(-_NONE * curve.entries.max(), _NONE * curve.entries.max())
+    priors = {**curve.marginals, **dict.fromkeys(_COEFFICIENTS[order:], none)}
+    return replace(curve, parameters=priors, entries=curve.entries[:, :order])
 
 
 def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     """Yield the friction of a column that moves both ways: a sign or, another variant, a smooth one.
 
-    The width of that is from the fifth least speed, below which the rows show a sign, to half of the largest, above
-    which they show a bend alone.
+    Rows show a width below the fifth least speed as a sign, one above half of the largest as a bend alone.
     """
-    column, unit, reading = about.table.covariates[name], about.reading_unit, about.system.simulator.reading
-    read = column[about.has_reading]
-    points, speeds = switch_points(read), np.sort(np.abs(read[read != 0]))
+    column, unit = about.table.covariates[name][about.has_reading], about.reading_unit
+    points, speeds = switch_points(column), np.sort(np.abs(column[column != 0]))
     if not points.size or not points[0] < 0 < points[-1]:
         return
     low, high = float(speeds[ROWS_OF_A_SIDE - 1]), 0.5 * float(np.nanmax(speeds))
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * np.tanh(np.nan_to_num(rows.covariates[name]) / theta[:, 1:2]))
+        width = np.maximum(theta[:, 1:2], 0.1 * _NONE * low)
+        return np.asarray(value + theta[:, :1] * np.tanh(np.nan_to_num(rows.covariates[name]) / width))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         by = f"tanh({name} / width), width {value_with_sd(mean[1], sd[1])}" if mean[1] > _NONE * low else "its sign"
-        return f"{reading} has dry friction of {name}: {value_with_sd(mean[0], sd[0], unit)} times {by}"
+        size = value_with_sd(mean[0], sd[0], unit)
+        return f"{about.system.simulator.reading} has dry friction of {name}: {size} times {by}"
 
     priors: dict[str, Marginal] = {"a": AMPLITUDE, "width": Fixed(0.0, _NONE * low)}
     along, bank = (covariate_of_column(name),), np.array([[[1.0, 0.5 * _NONE * low]]])
     form = Form(f"friction:{name}", Stage.OFFSET, priors, (unit, name), along, act, bank, says)
     for sign in about.scaled(form, about.sd):
-        smooth = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, _N_SIZES))
-        prior = {**sign.marginals, "width": LogUniform(low, high)}
-        yield replace(sign, alternatives=(replace(sign, parameters=prior, entries=smooth),) if low < high else ())
+        bank = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, _N_SIZES))
+        smooth = replace(sign, parameters={**sign.marginals, "width": LogUniform(low, high)}, entries=bank)
+        yield replace(sign, alternatives=(smooth,) if low < high else ())
 
 
 def time_since_start_of_run(table: RunTable) -> FloatArray:

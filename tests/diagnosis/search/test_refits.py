@@ -13,6 +13,7 @@ from refitted import state_with_nulls
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.search import search as searching
+from probewise.diagnosis.search import stepwise
 from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, is_significantly_better
 from probewise.diagnosis.search.search import search_with_formulas
 from probewise.diagnosis.search.searched import Evidences, posterior_of
@@ -305,3 +306,18 @@ def test_a_pair_that_screening_about_the_null_favours_is_screened_about_its_part
     assert pair not in state.refitted_combinations | state.undetected
     (part,) = state.candidates_of_combination(("sensitivity:room",))
     assert state.screened_log_evidences()[pair, ()] < part.log_z + 3.0
+
+
+def test_the_curve_of_a_slow_column_is_tried_before_a_walk_takes_what_it_explains(monkeypatch):
+    rng = np.random.default_rng(3)
+    temp = 20 + 10 * np.sin(np.linspace(0, 2.5, 80))
+    z, walk = (temp - 20) / 10, np.cumsum(rng.normal(size=80))
+    y = 1 + 0.3 * z**2 - 0.5 * z**3 + 0.01 * walk + 0.02 * rng.normal(size=80)
+    table = RunTable({"t_s": np.arange(80.0), "temp": temp, "y": y}, time="t_s", run=None)
+    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 0 * u["temp"], time="t_s")
+    state = _state(prepare_system(simulator, table))
+    assert state.refits.likeliest_law(state.null).has_memory
+    monkeypatch.setattr(stepwise, "LEADING_PLAINLY", 0)
+    assert [proposal.added for proposal in stepwise._proposals_under_simplest_noise(state, state.null)] == [
+        "curve:temp"
+    ]

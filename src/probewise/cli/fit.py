@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "tables", type=parse_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
     )
     add_simulator(parser, replaces="")
+    parser.add_argument("--thorough", action="store_true", help="compute the evidence by nested sampling as well")
     add_out_directory(parser)
     add_seed_and_quiet(parser)
 
@@ -40,7 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     source = ", ".join(path.name for path in arguments.tables)
     with progress_shown(quiet=arguments.quiet) as progress:
         rng = np.random.default_rng(arguments.seed)
-        fitted = fit_simulator(simulator, table, source=source, notes=notes, rng=rng, progress=progress)
+        fitted = fit_simulator(
+            simulator, table, source=source, notes=notes, thorough=arguments.thorough, rng=rng, progress=progress
+        )
 
         def write_files(stage: StagedFiles) -> None:
             stage.write_json("fit.json", fit_json(fitted))

@@ -34,6 +34,7 @@ from probewise.diagnosis.outlying import find_lost_readings
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit
+from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.thorough import A_NAT
 from probewise.diagnosis.simulator_fit import fit_system, is_noise_sd_known_beside_misfit
@@ -146,7 +147,12 @@ def diagnose_system(
     def fit_and_diagnose(simulator: Simulator, *, stiff: bool = False) -> tuple[Searched, Diagnosis]:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
-        searched = search_prepared(prepared, progress=told)
+        if prepared.has_too_little_data:  # the verdict is that they cannot tell, whatever a search would find
+            prior = prepared.apparatus.prior_odds(prepared.effects)
+            found = search(replace(prepared, effects={}), prior=prior, progress=told)
+            searched = replace(found, prepared=prepared)
+        else:
+            searched = search_prepared(prepared, progress=told)
         return searched, diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
 
     searched, diagnosis = fit_and_diagnose(simulator)
@@ -188,13 +194,12 @@ def prepare_system(
     if recording.plan is not plan:
         table = replace(table, columns=cast(RunTable, recording.plan).columns)
     recording, stop = without_readings_at_stop(simulator, table, recording)
-    if not recording.usable.any():
-        raise ParameterError(
-            "usable readings", 0, f"{system.least_readings} or more; column {simulator.reading} has none"
-        )
-    n_within = int((recording.usable & ~recording.censored).sum())
-    if recording.censored.any() and n_within < system.least_readings:
-        allowed = f"{system.least_readings} or more: readings at its ends do not determine the noise"
+    least = system.least_readings if with_effects else system.n_params + 1
+    n_usable, n_within = int(recording.usable.sum()), int((recording.usable & ~recording.censored).sum())
+    if n_usable < (1 if with_effects else least):
+        raise ParameterError("usable readings", n_usable, f"{least} or more in column {simulator.reading}")
+    if recording.censored.any() and n_within < least:
+        allowed = f"{least} or more: readings at its ends do not determine the noise"
         raise ParameterError("readings within the declared range", n_within, allowed)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from scipy.special import ndtri
 
 from probewise import nested
 from probewise._arrays import FloatArray, own_arithmetic
@@ -17,18 +16,18 @@ from probewise._display import ShowsItself
 from probewise._kinds import require_kind, require_progress, require_rng
 from probewise.diagnosis.diagnose_simulator import notes_on_declared_noise, prepare_system
 from probewise.diagnosis.diagnosis import Diagnosis
-from probewise.diagnosis.evidence import NoiseEvidence
-from probewise.diagnosis.fit import FARTHEST
+from probewise.diagnosis.evidence import laplace_evidence
+from probewise.diagnosis.fit import Fit, Model, fit_each_start
 from probewise.diagnosis.hypothesis_problem import HypothesisProblem
+from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw, white_noise_of_recording
+from probewise.diagnosis.noise_models import HIDDEN, NoiseModel
 from probewise.diagnosis.outlying import note_on_improbable_rows
-from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node, sample_model
-from probewise.diagnosis.search.refits import NoiseModels, Refits, WeighedFit
-from probewise.diagnosis.search.stepwise import SearchState, fit_nulls, noise_sd_about_given_null
+from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node
+from probewise.diagnosis.simulator_fit import log_evidence_of, modes_of
+from probewise.diagnosis.simulator_posterior import NUMBERS, Draws, ProblemInBlocks, draw_by_importance
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
-from probewise.diagnosis.templates import TemplateCache
-from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.nested.weights import resampled_rows
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, run_table_csv, table_for
@@ -111,19 +110,25 @@ def fitted_system_from_samples(
 
 
 _N_LIVE = 200
-_MOST_NUMBERS = 60_000_000  # readings that nested sampling predicts; those of a law, which is integrated, count twice
-_LEAST_CALLS = 50_000  # of the likelihood, without which it would not end
-_MOST_PARAMETERS = 24  # beyond them it would take more
+_MOST_SAMPLES = 2000  # equally weighted, where many predictions cost little; else as few as a diagnosis has
+_ROUNDING = 1e-15  # of the largest reading: least noise sd
+_MISSED = 4.0  # nats by which all samples are less likely than the best fit, beyond the mean loss
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Log evidence in nats, its standard error, 0 if unknown, the method, and why it is not nested sampling ("")."""
+    """Log evidence in nats, its standard error, the method, and a doubt about it ("" without one)."""
 
     log_z: float
     error: float
     method: str
     reason: str = ""
+
+    @property
+    def in_words(self) -> str:
+        """Value, error and method, with the doubt."""
+        doubt = f" ({self.reason})" if self.reason else ""
+        return f"{self.log_z:.2f} ± {self.error:.2f} nats by {self.method}{doubt}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +143,8 @@ class SystemFit(ShowsItself):
         The simulator with posterior samples.
     evidence
         Log evidence.
+    nested
+        The same by nested sampling, if it was run beside (`thorough`).
     predicted, sd
         Mean and sd of every row's posterior predictive distribution, (n_points,), in the unit of the readings; the sd
         includes the noise.
@@ -148,6 +155,7 @@ class SystemFit(ShowsItself):
     evidence: Evidence
     predicted: FloatArray
     sd: FloatArray
+    nested: Evidence | None = None
 
     @property
     def residuals(self) -> FloatArray:
@@ -162,12 +170,10 @@ class SystemFit(ShowsItself):
     def summary(self) -> str:
         """Describe the fit in plain text."""
         own, unit = self.fitted, self.recording.plan.instrumentation.unit
-        how = f" ({self.evidence.reason})" if self.evidence.reason else ""
-        error = f" ± {self.evidence.error:.2f}" if self.evidence.error else ""
         lines = [
             f"{int(self.recording.usable.sum())} readings, rms of the residuals {self.rms:.4g} {unit}"
             f"{self.recording.weighting_in_words}",
-            f"log evidence {self.evidence.log_z:.2f}{error} nats by {self.evidence.method}{how}",
+            *(f"log evidence {evidence.in_words}" for evidence in (self.evidence, self.nested) if evidence is not None),
             f"noise sd of a reading {np.median(own.noise_sd):.4g} {unit}",
         ]
         return "\n".join([*lines, own.parameter_table()])
@@ -180,10 +186,11 @@ def fit_simulator(
     *,
     source: str = "",
     notes: Sequence[str] = (),
+    thorough: bool = False,
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> SystemFit:
-    """Fit a simulator to a table of readings: posterior and evidence, without a diagnosis.
+    """Fit a simulator to a table of readings: mode, posterior and evidence, without a diagnosis.
 
     Parameters
     ----------
@@ -193,6 +200,8 @@ def fit_simulator(
         The recorded rows, with the predicted column: a table, a dict of arrays, or a DataFrame.
     source, notes
         Name of the table, and notes on it for the report.
+    thorough
+        Whether to compute the evidence by nested sampling as well.
     rng
         Source of randomness.
     progress
@@ -201,9 +210,7 @@ def fit_simulator(
     Returns
     -------
     SystemFit
-        Evidence and posterior, by nested sampling if `simulate` takes all samples at once, or there is a law, with at
-        most 24 parameters, and if the run ends without warning before 60 million readings (30 million of a law) have
-        been predicted; otherwise by the Laplace approximation, with the reason.
+        Evidence and posterior by importance sampling from the best of many fits, and the mode.
 
     Raises
     ------
@@ -221,112 +228,109 @@ def fit_simulator(
     require_rng(rng)
     require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, with_effects=False)
-    if prepared.has_too_little_data:
-        found = (
-            f"{len(prepared.usable_rows)} usable readings"
-            if len(prepared.usable_rows) < prepared.least_readings
-            else "all equal"
-        )
-        raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
-    null, noise = _null_fit_and_evidence(prepared)
-    samples = sample_model(null.found, noise, prepared.recording, weights={}, rng=rng)
-    evidence = Evidence(noise.log_z, 0.0, "the Laplace approximation", _reason_against_sampling(prepared))
-    if not evidence.reason:
-        samples, evidence = _nested_samples_and_evidence(
-            prepared, null, noise, samples, evidence, rng=rng, progress=progress
-        )
     recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
-    notes = (
-        *note_on_improbable_rows(null.found, recording),
-        *notes_on_declared_noise(simulator, np.asarray(samples.noise_sd)),
-    )
-    recording = replace(recording, notes=(*recording.notes, *notes))
-    predicted = samples.chain.predict(samples.theta, recording.plan)
-    sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2) * recording.relative_sd**2)
-    known = recorded_table_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)
-    fitted = fitted_system_from_samples(system, samples, recording, predicted.mean(axis=0), known=known)
-    return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
-
-
-def _null_fit_and_evidence(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
-    """Fit the simulator without effects under white noise; return the fit and its evidence."""
-    prior = PriorOdds.for_effects({})
-    noises = NoiseModels(prepared.recording, {}, prior, noise_sd_about_given_null(prepared))
-    templates = TemplateCache(prepared.usable_rows)
-    state = SearchState({}, prior, noises, templates, Refits(prepared.null, noises, templates), frozenset())
-    fit_nulls(state, prepared, max_order=1)
-    return state.null, state.null.evidence[()]
-
-
-def _reason_against_sampling(prepared: Prepared) -> str:
-    """Return the reason why nested sampling would take too long; "" if it would not."""
-    system = cast(SimulatorApparatus, prepared.apparatus).system
-    if system.n_params > _MOST_PARAMETERS:
-        return f"nested sampling of {system.n_params} parameters would take too many calls"
-    if system.caller is not None and not system.caller.broadcasts:
-        return "nested sampling would take too many calls of simulate, which takes one sample at a time"
-    if _most_affordable_calls(prepared) < _LEAST_CALLS:
-        return f"nested sampling would take too long with {len(prepared.recording)} rows"
-    return ""
-
-
-def _most_affordable_calls(prepared: Prepared) -> int:
-    each = 1 if cast(SimulatorApparatus, prepared.apparatus).system.simulator.law is None else 2
-    return _MOST_NUMBERS // (each * len(prepared.recording))
-
-
-def _nested_samples_and_evidence(
-    prepared: Prepared,
-    null: WeighedFit,
-    noise: NoiseEvidence,
-    samples: ModelSamples,
-    otherwise: Evidence,
-    *,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> tuple[ModelSamples, Evidence]:
-    """Compute samples and evidence by nested sampling; return those given if the run ends with a warning.
-
-    With a law, which must be integrated, nested sampling starts from a prior near the given samples, which takes far
-    fewer calls.
-    """
-    problem: nested.Samplable = HypothesisProblem(null.found.model, prepared.recording, noise)
-    system = cast(SimulatorApparatus, prepared.apparatus).system
-    n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * system.n_params)
-    method = "nested sampling"
-    if system.simulator.law is not None:
-        u = system.prior.to_unit_cube(samples.theta[:, : system.n_params])
-        problem = nested.repartitioned(problem, np.clip(ndtri(u), -FARTHEST, FARTHEST))
-        method = "nested sampling near the posterior"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulResultWarning)  # the reason is reported below
-        found = nested.run(
-            problem, rng=rng, n_live=n_live, max_calls=_most_affordable_calls(prepared),
-            progress=_sampling_progress(progress), max_cost=1.0, return_interrupted=False,
-        )  # fmt: skip
-    if found.warnings:
-        return samples, replace(otherwise, reason=f"nested sampling: {found.warnings[0]}")
-    z = np.clip(found.samples(N_SAMPLES, rng=rng), -FARTHEST, FARTHEST)
-    law, usable = noise.likeliest_law, prepared.recording.usable
-    residuals = prepared.recording.readings[usable] - null.found.model.predict(z)[:, usable]
-    if law.flat:
-        nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
+    usable = recording.usable
+    if prepared.has_only_equal_readings:
+        raise ParameterError("readings", "all equal", "readings of which some differ")
+    progress("looking for the modes")
+    law = white_noise_of_recording(recording)
+    first = cast(FloatArray, cast(System, prepared.null).first)
+    modes, n_even = modes_of(system, recording, law, first)
+    fits = _distinct(fit_each_start(Model(system, (), recording.plan), recording, [first, *modes], law), law)
+    noise = laplace_evidence(fits[0], _noise_model(recording, fits[0].sd))
+    problem = ProblemInBlocks(fits[0].model, recording, noise)
+    progress("sampling the posterior")
+    draws, is_settled = draw_by_importance(problem, fits, law, rng=rng, progress=progress)
+    n_samples = N_SAMPLES
+    if system.predicts_in_bulk:
+        n_samples = int(np.clip(NUMBERS // len(recording), N_SAMPLES, _MOST_SAMPLES))
+    z = draws.z[rng.permutation(resampled_rows(draws.weight, n_samples, rng))]
+    predicted = problem.predict(z)
+    likeliest = noise.likeliest_law
+    if likeliest.flat:
+        nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
         noise_sd = noise_sd_by_node(noise, with_rounding=True)[nodes]
     else:
-        noise_sd = draw_noise_sd(law, residuals, rng=rng)
-    theta = cast(Any, null.found.model.sensor).theta(z)
-    evidence = Evidence(found.log_z + null.log_prior_factor, found.log_z_error, method)
-    return replace(samples, theta=theta, noise_sd=noise_sd), evidence
+        noise_sd = draw_noise_sd(likeliest, recording.readings[usable] - predicted[:, usable], rng=rng)
+    samples = ModelSamples(system.chain(recording.plan, ()), system.theta(z), noise_sd, (), 0)
+    notes = (
+        *note_on_improbable_rows(fits[0], recording),
+        *notes_on_declared_noise(simulator, noise_sd),
+        *_doubts(problem, draws, modes[0], n_even, is_settled=is_settled),
+    )
+    recording = replace(recording, notes=(*recording.notes, *notes))
+    mean = predicted.mean(axis=0)
+    sd = np.sqrt(predicted.var(axis=0) + np.mean(noise_sd**2) * recording.relative_sd**2)
+    known = recorded_table_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)
+    fitted = fitted_system_from_samples(system, samples, recording, mean, known=known)
+    fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
+    evidence = Evidence(draws.log_z, draws.log_z_error, "importance sampling")
+    beside = _nested_sampling(problem, z, rng=rng, progress=progress) if thorough else None
+    return SystemFit(recording, fitted, evidence, mean, sd, beside)
 
 
-def _sampling_progress(progress: Progress) -> Callable[[nested.RoundSummary], None]:
+def _noise_model(recording: Recording, sd: float) -> NoiseModel:
+    """Return white noise of unknown sd, with the rounding step that was declared, if it shows."""
+    step = recording.plan.instrumentation.step or 0.0
+    least = _ROUNDING * float(np.abs(recording.readings[recording.usable]).max())
+    return NoiseModel((), recording, {}, step if sd < HIDDEN * step else 0.0, least)
+
+
+def _distinct(fits: Sequence[Fit], law: NoiseLaw) -> list[Fit]:
+    """Return the fits with finite predictions that are more than an sd apart, the most probable first."""
+    out: list[Fit] = []
+    for found in sorted(fits, key=lambda found: -log_evidence_of(found, law)):
+        apart = (np.append(law(o.slopes @ (found.z - o.z)) / max(o.sd, LEAST_SCALE), found.z - o.z) for o in out)
+        if np.isfinite(found.objective) and all(np.linalg.norm(each) > 1.0 for each in apart):
+            out.append(found)
+    if not out:
+        raise NotConvergedError("the simulator gives no finite readings near its best fit")
+    return out
+
+
+def _doubts(
+    problem: HypothesisProblem, draws: Draws, mode: FloatArray, n_even: int, *, is_settled: bool
+) -> Iterator[str]:
+    """Yield a note if parameters can be exchanged, if draws are few, and if all are far less likely than the mode."""
+    if n_even > 1:
+        yield (
+            f"{n_even} sets of parameters fit equally well, as where terms can be exchanged: the samples hold all, the "
+            "mode is the one nearest to the middle of the priors"
+        )
+    if not is_settled:
+        yield (
+            f"the posterior is hard to sample ({draws.n_effective:.0f} effective draws, Pareto k "
+            f"{draws.pareto_k:.2f}): medians, sds and log evidence are rough; the mode is not"
+        )
+    lost = float(problem.log_likelihood(mode[None, :])[0] - draws.log_likelihood.max())
+    if lost > 0.5 * len(mode) + _MISSED:
+        yield (
+            f"the samples miss the best fit, which is {lost:.0f} nats more likely than any of them: it lies where the "
+            "priors have next to no mass; compare the modes with the medians"
+        )
+
+
+def _nested_sampling(
+    problem: HypothesisProblem, z: FloatArray, *, rng: np.random.Generator, progress: Progress
+) -> Evidence:
+    """Compute the evidence by nested sampling; of a law, from a prior near the samples, which takes fewer calls."""
+    method, target = "nested sampling", cast(nested.Samplable, problem)
+    if problem.model.sensor.predicts_cheaply_nearby:
+        method, target = "nested sampling near the posterior", nested.repartitioned(problem, z)
+
     def report_round(state: nested.RoundSummary) -> None:
         to_come = state.log_ratio_remaining
         progress(
             "nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come"
         )
 
-    return report_round
+    n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * z.shape[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # the doubt is part of the result
+        found = nested.run(
+            target, rng=rng, n_live=n_live, progress=report_round, max_cost=1.0, return_interrupted=False
+        )
+    return Evidence(found.log_z, found.log_z_error, method, "; ".join(found.warnings[:1]))
 
 
 def fit_json(fit: SystemFit) -> dict[str, Any]:
@@ -342,13 +346,15 @@ def fit_json(fit: SystemFit) -> dict[str, Any]:
             {"name": name, "median": median[k], "sd": sd[k], "interval95": list(interval[name])}
             for k, name in enumerate(own.names)
         ],
+        "mode": own.mode(),
         "noise": {"unit": own.simulator.unit, "median": float(np.median(own.noise_sd))},
         "log_evidence": {
             "value": fit.evidence.log_z,
-            "error": fit.evidence.error or None,
+            "error": fit.evidence.error,
             "method": fit.evidence.method,
             "reason": fit.evidence.reason,
         },
+        **({"nested_sampling": asdict(fit.nested)} if fit.nested is not None else {}),
         "rms": fit.rms,
         "samples": "samples.csv",
         "model": "fitted.json",

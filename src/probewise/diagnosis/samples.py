@@ -201,9 +201,13 @@ def sample_model(
 
 
 def draw_noise_sd(law: NoiseLaw, residuals: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-    """Draw the sd of the noise, rounding included, for each sample: residuals (1 or 500, n_usable) -> (500,)."""
+    """Draw the sd of the noise, rounding included, for each sample: residuals (n_samples, n_usable) -> (n_samples,).
+
+    One row of residuals serves 500 samples.
+    """
     sigma = law.likeliest_sigma(law(residuals.T))
-    return np.asarray(sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, N_SAMPLES)))
+    n_samples = N_SAMPLES if len(sigma) == 1 else len(sigma)
+    return np.asarray(sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, n_samples)))
 
 
 def noise_sd_by_node(noise: NoiseEvidence, *, with_rounding: bool) -> FloatArray:

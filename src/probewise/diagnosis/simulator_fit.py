@@ -12,13 +12,15 @@ from dataclasses import replace
 from typing import cast
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import covariance_root
-from probewise.diagnosis.fit import FARTHEST, Fit, Model, fit, fit_each_start
-from probewise.diagnosis.noise_law import NoiseLaw, white_noise_of_recording
+from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each_start
+from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.noise_models import rough_sd
 from probewise.errors import ParameterError
+from probewise.priors import LogUniform, Uniform
 from probewise.recordings.plan import Recording
 from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms.readings import time_since_start_of_run
@@ -29,6 +31,18 @@ from probewise.systems.table import median_sd_of_column
 _STEPS_TRIED = 8  # from each start
 _BEST_STARTS = 3  # of which it goes on
 _BEGINNINGS = 0.25, 0.5  # shares of the longest run that are fitted before all of it
+_CLEARLY = 0.5  # nats of evidence by which another fit is better
+
+_SCREENED, _DESCENTS = 2000, 200  # points of the prior that are predicted, and the best of them, that are followed
+_STAGES = (12, 40), (18, 12), (50, 6), (120, 6)  # steps of all, and the number of the best that go on
+_POLISH, _POLISH_FEW = 400, 25  # steps with central differences, where they cost little, and else
+_STILL = 1e-11  # nats
+_EVENLY_HIGH = 1e-5  # nats
+_SAME_PLACE = 1e-4  # of a coordinate
+_DIFFERENCE = 1e-6  # of a coordinate
+_LONGEST = 0.3  # of a coordinate's range, of a step
+_STILL_FOR = 8  # steps
+_ROUNDING = 1e-15
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:
@@ -58,17 +72,33 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
 
 
 def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -> Fit:
-    """Fit a few steps from every start, then to convergence from the best and from `_starts_from_partial_runs`."""
+    """Fit a few steps from every start, then to convergence from the best, `_starts_from_partial_runs` and `modes_of`.
+
+    A mode of the density in the priors' own coordinates leads where the evidence is larger, by Laplace's method.
+    """
     model = Model(system, (), recording.plan)
     tried = sorted(
         fit_each_start(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_objective_or_infinity
     )[:_BEST_STARTS]
     longer = _starts_from_partial_runs(model, recording)
-    if not longer and all(found.settled for found in tried):
-        return tried[0]
-    return min(
-        fit_each_start(model, recording, [*(found.z for found in tried), *longer], law), key=_objective_or_infinity
-    )
+    if longer or not all(found.settled for found in tried):
+        starts = [*(found.z for found in tried), *longer]
+        tried = sorted(fit_each_start(model, recording, starts, law), key=_objective_or_infinity)
+    best = tried[0]
+    if system.first is None and system.caller is not None and system.caller.broadcasts:
+        for found in fit_each_start(model, recording, list(modes_of(system, recording, law, best.z)[0]), law):
+            if log_evidence_of(found, law) > log_evidence_of(best, law) + _CLEARLY:
+                best = found
+    return best
+
+
+def log_evidence_of(found: Fit, law: NoiseLaw) -> float:
+    """Return a fit's log evidence by Laplace's method, up to a constant; minus infinity without a finite prediction."""
+    if not np.isfinite(found.objective):
+        return -np.inf
+    with np.errstate(all="ignore"):
+        root = covariance_root(law(found.slopes), max(found.sd, LEAST_SCALE) ** 2)
+    return float(np.linalg.slogdet(root)[1]) - found.objective
 
 
 def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatArray]:
@@ -98,6 +128,139 @@ def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatA
 
 def _objective_or_infinity(found: Fit) -> float:
     return found.objective if np.isfinite(found.objective) else np.inf
+
+
+def modes_of(system: System, recording: Recording, law: NoiseLaw, found: FloatArray) -> tuple[FloatArray, int]:
+    """Return the modes of the posterior density in the priors' own coordinates, (n_modes, n_params), and how many tie.
+
+    In its own coordinate, the value or its logarithm, a bounded prior is flat; a normal one has its own density. Of
+    modes that are equally high, as of exchangeable terms, the one nearest to the middle of the prior is first; after
+    these come the lower ones. They are in standard-normal coordinates. Levenberg-Marquardt descends from many points
+    of the prior at once if predictions cost little, else from one fit.
+
+    Parameters
+    ----------
+    system, recording, law
+        The system, its readings and their noise, whose sd is the likeliest everywhere.
+    found
+        Coordinates of a fit, (n_params,).
+    """
+    descent = _Descent(system, recording, law)
+    starts = found[None, :]
+    if system.caller is not None and system.caller.broadcasts:
+        points = AT_ONCE // len(recording)
+        scattered = system.scattered_points(int(np.clip(16 * points, 50, _SCREENED)))
+        heights = descent.heights(scattered)
+        kept = np.argsort(heights)[: int(np.clip(points // (system.n_params + 1), 8, _DESCENTS))]
+        starts = np.concatenate([starts, scattered[kept]])
+    x = descent.from_normal(starts)
+    for n_steps, n_kept in _STAGES if len(x) > 1 else ():
+        x, heights = descent.follow(x, n_steps)
+        x = x[np.argsort(heights)[:n_kept]]
+    x, heights = descent.follow(x, _POLISH if len(starts) > 1 else _POLISH_FEW, central=True)
+    x, heights = x[np.isfinite(heights)], heights[np.isfinite(heights)]
+    if not len(x):
+        return np.clip(found, -FARTHEST, FARTHEST)[None, :], 1
+    z = descent.to_normal(x)
+    even = heights <= heights.min() + _EVENLY_HIGH + descent.rounding_of_heights(heights.min())
+    out: list[int] = []
+    for k in np.lexsort((np.where(even, np.sum(z**2, axis=1), heights), ~even)).tolist():
+        if all(np.abs(x[k] - x[j]).max() > _SAME_PLACE for j in out):
+            out.append(k)
+    return z[out], int(even[out].sum())
+
+
+class _Descent:
+    """Levenberg-Marquardt from many points at once, in coordinates in which bounded priors are flat.
+
+    A coordinate is the share of its prior below the value, from 0 to 1, or standard normal if the prior has no bounds.
+    """
+
+    def __init__(self, system: System, recording: Recording, law: NoiseLaw) -> None:
+        self.system, self.law, self.model = system, law, Model(system, (), recording.plan)
+        self.usable, self.readings = recording.usable, recording.readings[recording.usable]
+        self.flat = np.array([isinstance(prior, Uniform | LogUniform) for prior in system.marginals.values()])
+        self.low, self.high = np.where(self.flat, 0.0, -FARTHEST), np.where(self.flat, 1.0, FARTHEST)
+        self.per_block = max(AT_ONCE // len(recording), 1)
+
+    def from_normal(self, z: FloatArray) -> FloatArray:
+        return np.where(self.flat, ndtr(z), z)
+
+    def to_normal(self, x: FloatArray) -> FloatArray:
+        return np.clip(np.where(self.flat, ndtri(np.where(self.flat, x, 0.5)), x), -FARTHEST, FARTHEST)
+
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """Return whitened residuals, (..., n_params) -> (..., n_usable)."""
+        u = np.where(self.flat, x, ndtr(x)).reshape(-1, x.shape[-1])
+        blocks = np.array_split(u, -(-len(u) // self.per_block))
+        with np.errstate(all="ignore"):
+            out = [
+                self.law((self.readings - self.model.chain.predict(theta, self.model.plan)[:, self.usable]).T).T
+                for theta in map(self.system.prior.from_unit_cube, blocks)
+            ]
+        return np.concatenate(out).reshape(*x.shape[:-1], -1)
+
+    def _height(self, residuals: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return minus the log density up to a constant, and the variance of a reading, (k,) both."""
+        with np.errstate(all="ignore"):
+            variance = np.maximum(np.sum(residuals**2, axis=-1) / self.law.n_kept, LEAST_SCALE**2)
+            height = 0.5 * self.law.n_kept * np.log(variance) + 0.5 * np.sum(np.where(self.flat, 0.0, x) ** 2, axis=-1)
+        return np.where(np.isfinite(height), height, np.inf), variance
+
+    def heights(self, z: FloatArray) -> FloatArray:
+        x = self.from_normal(z)
+        return self._height(self.residuals(x), x)[0]
+
+    def rounding_of_heights(self, height: float) -> float:
+        """Return the error of a height, in nats: of readings that are met to their last digits it is no small one."""
+        rms = np.exp(height / self.law.n_kept)
+        return float(np.finfo(np.float64).eps * self.law.n_kept * np.abs(self.readings).max() / rms)
+
+    def _look(self, x: FloatArray, *, central: bool) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return residuals (k, n), slopes of the readings (k, n_params, n), variances and heights, (k,), at points."""
+        steps = np.where(x > 0.5 * (self.low + self.high), -_DIFFERENCE, _DIFFERENCE) * (10.0 if central else 1.0)
+        apart = steps[:, :, None] * np.eye(x.shape[1])
+        sides = [x[:, None], x[:, None] + apart, *([x[:, None] - apart] if central else [])]
+        own, up, *down = np.split(
+            self.residuals(np.concatenate(sides, axis=1)), [1, 1 + x.shape[1]][: len(sides) - 1], axis=1
+        )
+        with np.errstate(all="ignore"):
+            slopes = (down[0] - up) / (2 * steps[:, :, None]) if central else (own - up) / steps[:, :, None]
+        residuals = own[:, 0]
+        height, variance = self._height(residuals, x)
+        wrong = ~(np.isfinite(height) & np.isfinite(slopes).all(axis=(1, 2)))
+        height[wrong], variance[wrong], residuals[wrong], slopes[wrong] = np.inf, 1.0, 0.0, 0.0
+        return residuals, slopes, variance, height
+
+    def follow(self, x: FloatArray, n_steps: int, *, central: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Descend from each point; return where to, (k, n_params), and minus the log density there, (k,)."""
+        x, damping, n_still = x.copy(), np.full(len(x), 1e-2), np.zeros(len(x))
+        now = self._look(x, central=central)
+        eye, of_prior = np.eye(x.shape[1]), np.where(self.flat, 0.0, 1.0)
+        for _ in range(n_steps):
+            go = np.flatnonzero(n_still < _STILL_FOR)
+            if not go.size:
+                break
+            residuals, slopes, variance, height = (values[go] for values in now)
+            at = x[go]
+            curvature = slopes @ slopes.transpose(0, 2, 1) + (variance[:, None] * of_prior)[:, :, None] * eye
+            downhill = np.einsum("kpn,kn->kp", slopes, residuals) - variance[:, None] * of_prior * at
+            held = ((at <= self.low) & (downhill < 0)) | ((at >= self.high) & (downhill > 0))
+            scale = np.sqrt(np.maximum(np.einsum("kpp->kp", curvature), LEAST_SCALE))
+            curvature = np.where(held[:, :, None] | held[:, None], eye, curvature / scale[:, :, None] / scale[:, None])
+            damped = curvature + (damping[go, None, None] + _ROUNDING) * eye
+            step = np.linalg.solve(damped, np.where(held, 0.0, downhill / scale)[:, :, None])[:, :, 0] / scale
+            longest = _LONGEST * (self.high - self.low)
+            to = np.clip(at + np.clip(step, -longest, longest), self.low, self.high)
+            then = self._look(to, central=central)
+            with np.errstate(invalid="ignore"):
+                gain = np.nan_to_num(height - then[3], nan=0.0)
+            better = gain > 0
+            for values, new in zip((x, *now), (to, *then), strict=True):
+                values[go[better]] = new[better]
+            n_still[go] = np.where(better & (gain > _STILL), 0, n_still[go] + 1)
+            damping[go] = np.clip(damping[go] * np.where(better, 1 / 6, 5.0), 1e-14, 1e8)
+        return x, now[3]
 
 
 def is_noise_sd_known_beside_misfit(simulator: Simulator, table: RunTable) -> bool:

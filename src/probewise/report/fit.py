@@ -14,7 +14,7 @@ from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, note_paragraphs, page, paragraph, table
 from probewise.report.plots.canvas import svg
 from probewise.report.plots.residuals import recorded_against_predicted, residuals_against_covariates
-from probewise.report.words import digits_of_range, number_text, typeset_numbers
+from probewise.report.words import digits_of_range, typeset_numbers
 from probewise.systems import RunTable
 
 _MOST_INPUTS = 4
@@ -62,21 +62,19 @@ def _labelled_covariates(fit: SystemFit) -> list[tuple[str, FloatArray]]:
 
 def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     """Return the HTML of a fit's page; `drawn` is from `figure_drawers`."""
-    own, evidence = fit.fitted, fit.evidence
+    own, mode = fit.fitted, fit.fitted.mode()
     median, interval = np.median(own.samples, axis=0), own.interval()
-    error = f" ± {number_text(evidence.error, 2)}" if evidence.error else ""
-    how = f"; {evidence.reason}" if evidence.reason else ""
     digits = {name: digits_of_range(*interval[name], 5) for name in own.names}
     ends = {name: " to ".join(f"{end:.{digits[name]}g}" for end in interval[name]) for name in own.names}
     rows = [
-        (name, typeset_numbers(f"{value:.{digits[name]}g}"), typeset_numbers(ends[name]))
+        (name, *(typeset_numbers(text) for text in (f"{value:.{digits[name]}g}", ends[name], f"{mode[name]:.8g}")))
         for name, value in zip(own.names, median, strict=True)
     ]
     run = (
         ("readings", f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}"),
         ("simulator", own.simulator.source or "given in Python"),
         ("noise sd of a reading", f"{np.median(own.noise_sd):.4g} {unit_after_number(own.simulator.unit)}"),
-        ("log evidence", f"{number_text(evidence.log_z, 2)}{error} nats by {evidence.method}{how}"),
+        *(("log evidence", typeset_numbers(each.in_words)) for each in (fit.evidence, fit.nested) if each is not None),
         ("seed", str(seed)),
     )
     return page(
@@ -84,7 +82,7 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
         answer=summary_sentence(fit),
         key_figure=figure(drawn["predicted.svg"], "Recorded against predicted readings; on the line they agree."),
         sections=[
-            Section("Posterior", (table(("parameter", "median", "95 % interval"), rows),)),
+            Section("Posterior", (table(("parameter", "median", "95 % interval", "mode"), rows),)),
             Section(
                 "Residuals",
                 (

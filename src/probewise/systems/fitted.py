@@ -66,6 +66,8 @@ class FittedSystem(NamedSamples):
     known
         The recording and fit by which the effects were scaled and given origins; None if there are noise effects at
         most.
+    best
+        The point of highest posterior density in the priors' own coordinates, (n_params,), if it is known: see `mode`.
     recording
         Fingerprint (digest) of the recording.
     source
@@ -86,6 +88,7 @@ class FittedSystem(NamedSamples):
     max_step: float = math.inf
     stiff: bool = False
     known: StoredFit | None = None
+    best: tuple[float, ...] = ()
     recording: str = ""
     source: str = ""
     notes: tuple[str, ...] = ()
@@ -117,10 +120,31 @@ class FittedSystem(NamedSamples):
         lines.append(f"noise of a new reading {np.median(self.noise_sd):.4g} {unit}")
         return "\n".join([*lines, self.parameter_table()])
 
+    def mode(self) -> dict[str, float]:
+        """Return the point of highest posterior density in the priors' own coordinates, by name of the parameter.
+
+        In its own coordinate, the value or its logarithm, a uniform or log-uniform prior is flat: with such priors it
+        is the point of least squares. Of points that are equally high it is the one nearest to the middle of the prior.
+
+        Raises
+        ------
+        ParameterError
+            If the model is that of a diagnosis, which keeps samples only.
+        """
+        if not self.best:
+            raise ParameterError("mode", None, "a model of `probewise fit` or fit_simulator(...).fitted; take median()")
+        return dict(zip(self.names, self.best, strict=True))
+
     def parameter_table(self) -> str:
-        """Return a text table of each parameter's median and 95 % interval."""
+        """Return a text table of each parameter's median and 95 % interval, and of its mode if that is known."""
         median, interval = self.median(), self.interval()
-        return "\n".join(interval_table_lines([(name, median[name], interval[name]) for name in self.names]))
+        lines = interval_table_lines([(name, median[name], interval[name]) for name in self.names])
+        if self.best:
+            lines = [
+                f"{line:<{max(map(len, lines))}}  {mode}"
+                for line, mode in zip(lines, ["mode", *(f"{value:.8g}" for value in self.best)], strict=True)
+            ]
+        return "\n".join(lines)
 
     @property
     def _counts_from_far_origin(self) -> bool:
@@ -152,6 +176,7 @@ class FittedSystem(NamedSamples):
             "effects": list(self.effects),
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {"mean": float(self.noise_sd.mean()), "sd": self.noise_sd.tolist()},
+            **({"mode": self.mode()} if self.best else {}),
             "level": list(self.level),
             "bound_about": None if self.known is None else _stored_fit_to_json(self.known),
             **({"origins": _ORIGINS} if self._counts_from_far_origin else {}),
@@ -209,6 +234,7 @@ class FittedSystem(NamedSamples):
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
                 stiff=bool(own["stiff"]),
                 known=None if known is None else _stored_fit_from_json(known),
+                best=tuple(float(value) for value in document.get("mode", {}).values()),
                 recording=str(document["recording"]["fingerprint"]),
                 source=str(document["recording"]["source"]),
                 notes=tuple(document["notes"]),

@@ -217,12 +217,16 @@ class System:
         """Standard-normal coordinates to fit from, (n_starts, n_params): an earlier fit, or 0 and seven scattered."""
         if self.first is not None:
             return self.first[None, :]
+        return np.concatenate([np.zeros((1, self.n_params)), self.scattered_points(_N_STARTS - 1)])
+
+    def scattered_points(self, n: int) -> FloatArray:
+        """Return points that cover the prior evenly, as standard-normal coordinates, (n, n_params)."""
         # Roberts's sequence (additive recurrence by the root of x^(d+1) = x + 1): uniform in any number of dimensions.
         root = 2.0
         for _ in range(32):
             root = (1 + root) ** (1 / (self.n_params + 1))
-        spread = (0.5 + np.outer(np.arange(1, _N_STARTS), root ** -np.arange(1.0, self.n_params + 1))) % 1.0
-        return np.concatenate([np.zeros((1, self.n_params)), np.asarray(ndtri(spread), dtype=np.float64)])
+        spread = (0.5 + np.outer(np.arange(1, n + 1), root ** -np.arange(1.0, self.n_params + 1))) % 1.0
+        return np.asarray(ndtri(spread), dtype=np.float64)
 
     @property
     def least_readings(self) -> int:

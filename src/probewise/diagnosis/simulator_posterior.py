@@ -1,0 +1,289 @@
+"""Posterior of a simulator's parameters, by adaptive importance sampling along the ridges of its density.
+
+A few readings, or parameters that act alike, leave a posterior that is narrow and bent: Laplace's approximation at its
+mode covers a part. The ridge is followed from the mode to where it is unlikely; kernels along it, each of the local
+shape, are a proposal that covers all of it (after Cornuet, Marin, Mira & Robert 2012, with local covariances).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import gammaln, logsumexp
+
+from probewise._arrays import BoolArray, FloatArray
+from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit
+from probewise.diagnosis.hypothesis_problem import HypothesisProblem
+from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
+from probewise.diagnosis.simulator_fit import log_evidence_of
+from probewise.nested import pareto_k
+from probewise.nested.weights import n_effective, power_bracket, resampled_rows
+from probewise.progress import Progress
+
+NUMBERS = 4_000_000
+"""Readings that are predicted at once."""
+
+# If many predictions cost little, and else: draws of a round, kernels, rounds, effective draws that suffice.
+_SIZES = {True: (2000, 150, 20, 1000.0), False: (400, 20, 4, 250.0)}
+_PER_PRIOR = 20  # draws of a proposal for one of the prior
+_AS_IT_IS = 0.75  # effective share of the first draws from which no ridge is followed
+_UNSURE_K = 0.7  # Pareto k from which the mean of the weights converges too slowly (Vehtari et al. 2024)
+_UNIFORM = 0.5  # effective share from which the weights have no tail, whatever k
+_SETTLED = 0.03, 0.05  # changes of the log evidence and, in their share, of the sds between two rounds
+_MOST_TAILED, _LEAST_TAILED = 2.0, 8.0  # degrees of freedom of the kernels, between them those of the readings
+_TEMPERED = 25  # effective draws for each parameter, to which weights are tempered for the next proposal
+_STRETCHED = 1.7  # distance of every other anchor from the middle, of a draw's
+_WALKERS, _STRIDES, _STARTS = 80, 60, 4
+_BELOW = 8.0  # nats, and half a nat for each parameter, below the mode, at which a ridge ends
+_FIRM = 9.0  # inverse square of how far, in strides, a walker is drawn back along the ridge
+_RETURNS, _PROXIMAL_STEPS = 2, 3  # Gauss-Newton steps to the ridge, of a walker after a stride, and of a kernel
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemInBlocks(HypothesisProblem):
+    """A hypothesis whose predictions of many samples are made in blocks, to fit in memory."""
+
+    def _in_blocks(self, function: Callable[[FloatArray], FloatArray], z: FloatArray) -> FloatArray:
+        blocks = np.array_split(z, -(-len(z) * len(self.recording) // NUMBERS))
+        return np.concatenate([function(block) for block in blocks])
+
+    def predict(self, z: FloatArray) -> FloatArray:
+        """Return the readings of all rows, (n_samples, n_params) -> (n_samples, n_points)."""
+        return self._in_blocks(self.model.predict, z)
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Return the log likelihood, (n_samples, n_params) -> (n_samples,)."""
+        return self._in_blocks(super().log_likelihood, theta)
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Draws of a posterior, coordinates (n, n_params), with log likelihoods and log importance weights, (n,) both."""
+
+    z: FloatArray
+    log_likelihood: FloatArray
+    log_weight: FloatArray
+
+    @property
+    def log_z(self) -> float:
+        """Log evidence."""
+        return float(logsumexp(self.log_weight)) - math.log(len(self.z))
+
+    @property
+    def log_z_error(self) -> float:
+        """Its standard error."""
+        return math.sqrt(max(1 / max(self.n_effective, 1.0) - 1 / len(self.z), 1e-6))
+
+    @property
+    def n_effective(self) -> float:
+        """Kish's effective sample size."""
+        return n_effective(self.log_weight)
+
+    @property
+    def pareto_k(self) -> float:
+        """Shape of the weights' tail."""
+        there = self.log_weight[np.isfinite(self.log_weight)]
+        return pareto_k(there) if len(there) > 1 else math.inf
+
+    @property
+    def weight(self) -> FloatArray:
+        """Weights, (n,), the largest 1."""
+        return np.asarray(np.exp(self.log_weight - self.log_weight.max()))
+
+    def sd(self) -> FloatArray:
+        """Return the sd of each coordinate, (n_params,)."""
+        off = self.z - np.average(self.z, axis=0, weights=self.weight)
+        return np.asarray(np.sqrt(np.average(off**2, axis=0, weights=self.weight)))
+
+    def tempered_weight(self, wanted: float) -> FloatArray:
+        """Return the weights to the largest power, up to 1, that leaves so many effective draws, (n,)."""
+        if self.n_effective >= wanted:
+            return self.weight
+        power, _ = power_bracket(lambda power: power * self.log_weight, 0.0, 1.0, wanted=wanted, n_steps=30)
+        return np.asarray(self.weight**power)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kernels:
+    """A mixture of Student-t kernels: means (k, n_params), precisions (k, n_params, n_params), shares (k,), tails."""
+
+    mean: FloatArray
+    precision: FloatArray
+    share: FloatArray
+    degrees_of_freedom: float
+
+    @cached_property
+    def lower(self) -> FloatArray:
+        """Cholesky factors of the precisions, definite but for rounding."""
+        scale = np.sqrt(np.einsum("kpp->kp", self.precision))
+        unit = self.precision / scale[:, :, None] / scale[:, None] + _ROUNDING * np.eye(self.mean.shape[1])
+        return np.asarray(np.linalg.cholesky(unit) * scale[:, :, None])
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        which = rng.choice(len(self.share), n, p=self.share)
+        white = rng.standard_normal((n, self.mean.shape[1]))
+        white *= np.sqrt(self.degrees_of_freedom / rng.chisquare(self.degrees_of_freedom, (n, 1)))
+        root = np.linalg.inv(self.lower).transpose(0, 2, 1)
+        return np.asarray(self.mean[which] + np.einsum("nij,nj->ni", root[which], white))
+
+    def log_density(self, z: FloatArray) -> FloatArray:
+        n_params, nu = z.shape[1], self.degrees_of_freedom
+        norm = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
+        norm = norm + np.log(self.share) + np.log(np.einsum("kpp->kp", self.lower)).sum(axis=1)
+        blocks = np.array_split(z, max(len(z) * self.mean.size // NUMBERS, 1))
+        squares = (np.sum(((block - self.mean[:, None]) @ self.lower) ** 2, axis=2) for block in blocks)
+        each = (norm[:, None] - 0.5 * (nu + n_params) * np.log1p(square / nu) for square in squares)
+        return np.concatenate([logsumexp(densities, axis=0) for densities in each])
+
+
+def draw_by_importance(
+    problem: ProblemInBlocks, fits: Sequence[Fit], law: NoiseLaw, *, rng: np.random.Generator, progress: Progress
+) -> tuple[Draws, bool]:
+    """Draw from a posterior by adaptive importance sampling from its modes; return the draws, and whether they settled.
+
+    The first proposal has a kernel at each mode, the second kernels along the ridges from there. Each further one has
+    kernels at draws of those before, by their weights, tempered where few have any, and beyond these. All draws count,
+    over the mixture of all proposals and a share of the prior.
+
+    Parameters
+    ----------
+    problem
+        The model, its readings and their noise.
+    fits
+        Its modes, the most probable first.
+    law
+        White noise of the readings.
+    rng, progress
+        Source of randomness; called after each round.
+    """
+    ridge = _Ridge(problem, fits[0], law)
+    sensor, n_params = problem.model.sensor, problem.model.n_params
+    n_draws, n_kernels, n_rounds, enough = _SIZES[sensor.predicts_in_bulk]
+    kernels, proposals = ridge.kernels_at_modes(fits), list[_Kernels]()
+    z, (log_prior, log_likelihood, log_mixture) = np.zeros((0, n_params)), np.zeros((3, 0))
+    before, log_share = (math.inf, np.zeros(n_params)), -math.log(_PER_PRIOR)
+    for k in range(n_rounds):
+        if k:
+            log_mixture = np.logaddexp(log_mixture, np.logaddexp(kernels.log_density(z), log_prior + log_share))
+        proposals.append(kernels)
+        new = np.concatenate([kernels.draw(n_draws, rng=rng), rng.standard_normal((n_draws // _PER_PRIOR, n_params))])
+        prior = problem.prior.log_prob(new)
+        of_all = [np.logaddexp(own.log_density(new), prior + log_share) for own in proposals]
+        z = np.concatenate([z, new])
+        log_prior, log_likelihood = np.append(log_prior, prior), np.append(log_likelihood, problem.log_likelihood(new))
+        log_mixture = np.append(log_mixture, logsumexp(of_all, axis=0))
+        height = np.where((np.abs(z) < FARTHEST).all(axis=1), log_prior + log_likelihood, -np.inf)
+        draws = Draws(z, log_likelihood, height - log_mixture + math.log((1 + 1 / _PER_PRIOR) * len(proposals)))
+        sd = draws.sd()
+        now, share = (draws.log_z, sd), draws.n_effective / len(z)
+        is_sound = draws.n_effective >= enough and (draws.pareto_k < _UNSURE_K or share > _UNIFORM)
+        is_still = abs(now[0] - before[0]) < _SETTLED[0] and np.allclose(sd, before[1], rtol=_SETTLED[1])
+        if is_sound and (is_still or (not k and share > _AS_IT_IS)):
+            return draws, True
+        before = now
+        progress("sampling the posterior", note=f"{draws.n_effective:.0f} effective draws")
+        if not k and sensor.predicts_in_bulk and not sensor.predicts_cheaply_nearby:
+            anchors = rng.permutation(ridge.follow(fits, rng=rng))
+            spread, anchors = np.cov(anchors.T), anchors[:n_kernels]
+        else:
+            weight = draws.tempered_weight(_TEMPERED * n_params)
+            anchors = z[np.unique(resampled_rows(weight, n_kernels, rng))]
+            middle, spread = np.average(z, axis=0, weights=weight), np.cov(z.T, aweights=weight)
+            anchors[1::2] = np.clip(middle + _STRETCHED * (anchors[1::2] - middle), -FARTHEST, FARTHEST)
+        kernels = ridge.kernels_beside(anchors, spread.reshape(n_params, n_params))
+    return draws, False
+
+
+class _Ridge:
+    """The posterior of a problem, linearised at many points at once; white noise of the sd about its best fit."""
+
+    def __init__(self, problem: ProblemInBlocks, best: Fit, law: NoiseLaw) -> None:
+        self.problem, self.law, self.best = problem, law, best
+        self.free = max(law.n_kept - len(best.z), 1)
+        self.degrees_of_freedom = float(np.clip(self.free, _MOST_TAILED, _LEAST_TAILED))
+        self.eye = np.eye(len(best.z))
+
+    def _variance(self, found: Fit) -> float:
+        return max(found.sd, LEAST_SCALE) ** 2 * self.law.n_kept / self.free
+
+    def _linearise(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return slopes (k, n_params, n), residuals (k, n), both in noise sds, precisions, and which are possible."""
+        usable, steps = self.problem.recording.usable, np.where(z > 0, -DIFFERENCE, DIFFERENCE)
+        points = np.concatenate([z[:, None], z[:, None] + steps[:, :, None] * self.eye], axis=1)
+        predicted = self.problem.predict(points.reshape(-1, z.shape[1]))[:, usable]
+        with np.errstate(all="ignore"):
+            left = (
+                self.law((self.problem.recording.readings[usable] - predicted).T).T / self._variance(self.best) ** 0.5
+            )
+            left = left.reshape(len(z), z.shape[1] + 1, -1)
+            slopes, residuals = (left[:, :1] - left[:, 1:]) / steps[:, :, None], left[:, 0]
+        possible = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
+        slopes, residuals = np.where(possible[:, None, None], slopes, 0.0), np.where(possible[:, None], residuals, 0.0)
+        return slopes, residuals, slopes @ slopes.transpose(0, 2, 1) + self.eye, possible
+
+    def _drawn_to_ridge(self, anchors: FloatArray, firmness: FloatArray, n_steps: int) -> FloatArray:
+        """Return points by Gauss-Newton steps towards the mode, held to anchors by a precision (k or 1, p, p)."""
+        z = anchors
+        for _ in range(n_steps):
+            slopes, residuals, precision, _ = self._linearise(z)
+            downhill = np.einsum("kpn,kn->kp", slopes, residuals) - z
+            downhill += ((anchors - z)[:, None] @ firmness)[:, 0]
+            z = np.clip(z + np.linalg.solve(precision + firmness, downhill[:, :, None])[:, :, 0], -FARTHEST, FARTHEST)
+        return z
+
+    def kernels_at_modes(self, fits: Sequence[Fit]) -> _Kernels:
+        """Return Laplace's approximation at fits, with shares by their evidence, a tenth of the largest at least."""
+        slopes = np.stack([self.law(found.slopes).T / math.sqrt(self._variance(found)) for found in fits])
+        log_z = np.array([log_evidence_of(found, self.law) for found in fits])
+        share = np.maximum(np.exp(log_z - log_z.max()), 0.1)
+        precision = slopes @ slopes.transpose(0, 2, 1) + self.eye
+        mean = np.stack([found.z for found in fits])
+        return _Kernels(mean, precision, share / share.sum(), self.degrees_of_freedom)
+
+    def kernels_beside(self, anchors: FloatArray, spread: FloatArray) -> _Kernels:
+        """Return a kernel on the ridge beside each anchor, (k, n_params), with the local shape.
+
+        Along the ridge a kernel is as wide as Silverman's rule says for draws of the covariance `spread`.
+        """
+        n, n_params = anchors.shape
+        width = (4 / (n_params + 2) / n) ** (1 / (n_params + 4))
+        squares, axes = np.linalg.eigh(spread)
+        metric = (axes / np.maximum(squares, _ROUNDING * squares.max())) @ axes.T / width**2
+        z = self._drawn_to_ridge(anchors, metric[None], _PROXIMAL_STEPS)
+        _, _, precision, possible = self._linearise(z)
+        share = np.full(int(possible.sum()), 1 / possible.sum())
+        return _Kernels(z[possible], precision[possible] + metric, share, self.degrees_of_freedom)
+
+    def follow(self, fits: Sequence[Fit], *, rng: np.random.Generator) -> FloatArray:
+        """Return points (n, n_params) along the ridges from modes, to where the density is some nats lower.
+
+        Walkers go a local sd at a time in directions of their own, and return to the ridge after each stride.
+        """
+        modes = np.stack([found.z for found in fits[:_STARTS]])
+        z, out = np.repeat(modes, _WALKERS // len(modes), axis=0), [modes]
+        way = rng.standard_normal(z.shape)
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        lowest = -self._heights(self._linearise(modes)[1], modes).max() + _BELOW + 0.5 * z.shape[1]
+        _, _, precision, _ = self._linearise(z)
+        for _ in range(_STRIDES):
+            lengths, axes = np.linalg.eigh(precision)
+            stride = np.einsum("kij,kj,klj,kl->ki", axes, lengths**-0.5, axes, way)
+            firmness = _FIRM / np.maximum(np.sum(stride**2, axis=1), LEAST_SCALE)[:, None, None] * self.eye
+            z = self._drawn_to_ridge(np.clip(z + stride, -FARTHEST, FARTHEST), firmness, _RETURNS)
+            _, residuals, precision, possible = self._linearise(z)
+            goes = possible & (-self._heights(residuals, z) < lowest)
+            z, way, precision = z[goes], way[goes], precision[goes]
+            if not len(z):
+                break
+            out.append(z)
+        return np.concatenate(out)
+
+    def _heights(self, residuals: FloatArray, z: FloatArray) -> FloatArray:
+        """Return the log density up to a constant, (k,), with the likeliest noise sd."""
+        squares = np.maximum(np.sum(residuals**2, axis=1), LEAST_SCALE)
+        return np.asarray(-0.5 * self.law.n_kept * np.log(squares) - 0.5 * np.sum(z**2, axis=1))

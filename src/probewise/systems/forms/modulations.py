@@ -14,7 +14,7 @@ from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import PHASE, ChangePoints, sine_and_cosine_entries
 from probewise.effects.priors import SharedScalePrior
 from probewise.effects.reference import is_far_from_zero
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import (
     AMPLITUDE,
@@ -244,35 +244,24 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
 
     def form(what: str, unit: str) -> Form:
         def says(mean: FloatArray, sd: FloatArray) -> str:
-            jump = f"{what} jumps by {value_with_sd(mean[0], sd[0], unit)}"
-            until = "and stays there"
-            if by_row:  # a point between two rows, counted from 0
-                if may_end and mean[1] > mean[2]:
-                    until = f"and goes back at row {int(mean[1]) + 3}"
-                return f"{jump} at row {int(mean[-1]) + 3} of the table (the header is row 1) {until}"
-            if may_end and mean[1] > mean[2]:
-                until = f"and goes back at {value_with_sd(mean[1], sd[1], time_unit)}"
-            return f"{jump} at {value_with_sd(mean[-1], sd[-1], time_unit)} {until}"
+            def at(k: int) -> str:  # of rows, a point between two, counted from 0
+                row = f"row {int(mean[k]) + 3} of the table (the header is row 1)"
+                return row if by_row else value_with_sd(mean[k], sd[k], time_unit)
 
-        place, unit_of_place = ("row", "row") if by_row else ("s", time_unit)
-        never = Fixed(first - 2.0, first - 1.0)
-        ends, more = ({f"until_{place}": never}, {"never": never}) if may_end else ({}, {})
-        kind: Any = BlockForm if may_end else StepForm
-        return cast(
-            Form,
-            kind(
-                name="",
-                stage=Stage.OFFSET,
-                parameters={"a": AMPLITUDE, **ends, f"at_{place}": Uniform(first, last)},
-                units=(unit, *(unit_of_place for _ in ends), unit_of_place),
-                covariates=("row",) if by_row else ("time",),
-                act=_unbound,
-                entries=np.array([[[1.0, *(first - 1.5 for _ in ends), 0.5 * (first + last)]]]),
-                says=says,
-                change_points=change_points,
-                **more,
-            ),
-        )
+            then = f"goes back at {at(1)}" if may_end and mean[1] > mean[2] else "stays there"
+            return f"{what} jumps by {value_with_sd(mean[0], sd[0], unit)} at {at(-1)} and {then}"
+
+        place, of_place = ("row", "row") if by_row else ("s", time_unit)
+        never, middle, along = Fixed(first - 2.0, first - 1.0), 0.5 * (first + last), ("row",) if by_row else ("time",)
+        begin: dict[str, Marginal] = {f"at_{place}": Uniform(first, last)}
+        if may_end:
+            priors: dict[str, Marginal] = {"a": AMPLITUDE, f"until_{place}": never, **begin}
+            block = ("", Stage.OFFSET, priors, (unit, of_place, of_place), along, _unbound)
+            return BlockForm(
+                *block, np.array([[[1.0, first - 1.5, middle]]]), says, change_points=change_points, never=never
+            )
+        step = ("", Stage.OFFSET, {"a": AMPLITUDE, **begin}, (unit, of_place), along, _unbound)
+        return StepForm(*step, np.array([[[1.0, middle]]]), says, change_points=change_points)
 
     def jump_in_time(parameter: str) -> ActBetween:
         return lambda between, theta: between.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))

@@ -286,9 +286,11 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     along, bank = (covariate_of_column(name),), np.array([[[1.0, 0.5 * _NONE * low]]])
     form = Form(f"friction:{name}", Stage.OFFSET, priors, (unit, name), along, act, bank, says)
     for sign in about.scaled(form, about.sd):
-        bank = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, _N_SIZES))
-        smooth = replace(sign, parameters={**sign.marginals, "width": LogUniform(low, high)}, entries=bank)
-        yield replace(sign, alternatives=(smooth,) if low < high else ())
+        if low < high:
+            bank = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, _N_SIZES))
+            smooth = replace(sign, parameters={**sign.marginals, "width": LogUniform(low, high)}, entries=bank)
+            sign = replace(sign, alternatives=(smooth,))
+        yield sign
 
 
 def time_since_start_of_run(table: RunTable) -> FloatArray:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -30,10 +30,13 @@ if TYPE_CHECKING:
 
 _INPUTS = "inputs.sha256"  # of the recording, its description, sensor and simulator, and the options
 Outcome = tuple[str, dict[str, bytes]]
+Verb = Callable[[argparse.Namespace], int]
 
 
-def diagnose_each(arguments: argparse.Namespace) -> int:
+def diagnose_each(arguments: argparse.Namespace, diagnose: Verb) -> int:
     """Diagnose each recording into a folder of its own; write table.csv and a page of all; return the exit status.
+
+    `diagnose` runs the verb on the arguments of one recording.
 
     A recording that cannot be diagnosed is a row of the table. Folders that are complete, of the same files and
     options, are not diagnosed again.
@@ -55,7 +58,7 @@ def diagnose_each(arguments: argparse.Namespace) -> int:
         open_executor(arguments) as executor,
     ):
         progress("diagnosing", len(files) - len(left), len(files))
-        for done, (name, (message, results)) in enumerate(_outcomes(arguments, left, executor), start=1):
+        for done, (name, (message, results)) in enumerate(_outcomes(arguments, diagnose, left, executor), start=1):
             if results:
                 results[_INPUTS] = fingerprints[name].encode()
                 with staged_output(folders[name], outdated=("*.svg", "next*.csv", "next*.json")) as stage:
@@ -112,7 +115,7 @@ def _is_done(folder: Path, fingerprint: str) -> bool:
 
 
 def _outcomes(
-    arguments: argparse.Namespace, files: dict[str, Path], executor: Executor | None
+    arguments: argparse.Namespace, diagnose: Verb, files: dict[str, Path], executor: Executor | None
 ) -> Iterator[tuple[str, Outcome]]:
     """Yield each recording's outcome, by the executor as they come, or here, in order."""
     options = [
@@ -124,9 +127,9 @@ def _outcomes(
     options += ["--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
     words = {name: [str(file.absolute()), *options] for name, file in files.items()}
     if executor is None:
-        yield from ((name, _diagnosed(given)) for name, given in words.items())
+        yield from ((name, _diagnosed(diagnose, given)) for name, given in words.items())
         return
-    futures = {executor.submit(_diagnosed, given): name for name, given in words.items()}
+    futures = {executor.submit(_diagnosed, diagnose, given): name for name, given in words.items()}
     try:
         for future in as_completed(futures):
             yield futures[future], future.result()
@@ -134,10 +137,9 @@ def _outcomes(
         raise LinkError("a worker ended before it was done") from error
 
 
-def _diagnosed(words: Sequence[str]) -> Outcome:
+def _diagnosed(diagnose: Verb, words: Sequence[str]) -> Outcome:
     """Diagnose one recording in a temporary folder; return a message, "" if all went well, and the files written."""
     from probewise.cli import parser
-    from probewise.cli.diagnose import run
 
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the page of each recording has them
@@ -145,7 +147,7 @@ def _diagnosed(words: Sequence[str]) -> Outcome:
         arguments = parser(given).parse_args(given)
         arguments.words, message = given, ""
         try:
-            run(arguments)
+            diagnose(arguments)
         except (ProbewiseError, OSError) as error:
             message = " ".join(str(error).split())
         return message, {

@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.each:
         from probewise.cli._each import diagnose_each
 
-        return diagnose_each(arguments)
+        return diagnose_each(arguments, run)
     if arguments.workers > 1 or arguments.scheduler is not None:
         raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
     if arguments.simulator is not None:

@@ -65,7 +65,7 @@ class NamedEffect(Generic[V]):
     words: ClassVar[str] = ""
     """A noun phrase that follows "the model leaves out"; without one the name itself is written."""
 
-    if TYPE_CHECKING:  # each effect has these
+    if TYPE_CHECKING:  # each effect has these; `Effect` says what they are
 
         @property
         def name(self) -> str: ...
@@ -73,41 +73,21 @@ class NamedEffect(Generic[V]):
         def stage(self) -> Stage: ...
         @property
         def prior(self) -> Prior: ...
+        @property
+        def units(self) -> tuple[str, ...]: ...
+        @property
+        def covariates(self) -> tuple[str, ...]: ...
+        @property
+        def counted_from(self) -> str: ...
+        @property
+        def amplitudes(self) -> tuple[int, ...]: ...
+        @property
+        def scans(self) -> tuple[str, ...]: ...
+        @property
+        def patterns(self) -> tuple[str, ...]: ...
         def apply(self, value: V, theta: FloatArray, plan: Plan) -> V: ...
-
-        @property
-        def units(self) -> tuple[str, ...]:
-            """Unit of each parameter, in the order of `prior.names`."""
-
-        @property
-        def covariates(self) -> tuple[str, ...]:
-            """Names of covariates against which the residuals show a trend where the effect is left out."""
-
-        def bank(self) -> FloatArray:
-            """Return the template bank, parameter vectors of shape (n_bank, n_columns, n_params).
-
-            The columns of an entry span the change of the readings to first order; entries differ in
-            the nonlinear parameters. Effects on the noise: equally weighted nodes of the prior.
-            """
-
-        def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-            """Describe the effect in plain words; posterior mean and sd of the parameters, (n_params,) each."""
-
-        @property
-        def counted_from(self) -> str:
-            """From where it counts a time, a place or a column, in words; "" for 0, or if it does not count."""
-
-        @property
-        def amplitudes(self) -> tuple[int, ...]:
-            """Indices of the amplitudes: the readings change in proportion to first order, and 0 means no effect."""
-
-        @property
-        def scans(self) -> tuple[str, ...]:
-            """Names of the scans it is restricted to; () for all."""
-
-        @property
-        def patterns(self) -> tuple[str, ...]:
-            """Names of the patterns it is restricted to; () for all."""
+        def bank(self) -> FloatArray: ...
+        def sentence(self, mean: FloatArray, sd: FloatArray) -> str: ...
 
     else:
         counted_from, amplitudes, scans, patterns = "", (0,), (), ()
@@ -209,11 +189,12 @@ class Effect(NamedEffect[Any]):
         Function of the stage's value, parameters (n_samples, n_params) and plan or table; returns the value with the
         effect.
     entries
-        Template bank: trial settings, (n_entries, n_columns, n_params).
+        Template bank: trial settings, (n_entries, n_columns, n_params). The columns of an entry span the change of the
+        readings to first order; entries differ in the nonlinear parameters.
     says
         Function that describes it in a sentence.
     amplitudes
-        Indices of the parameters that are amplitudes.
+        Indices of the parameters that are amplitudes: the readings change in proportion to first order.
     absent
         Parameter values, by index, at which it has no effect, if these are not zero amplitudes.
     alternatives

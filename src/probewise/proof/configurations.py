@@ -56,14 +56,28 @@ _IN_BATCHES = ("finishing", "information")
 class SearchConfiguration:
     """One configuration of the search.
 
-    `population`: distribution of the circles, which is also the prior: "anywhere" (radius 20 to 150 mm) or "inside" (50
-    to 150 mm, entirely in the field); `model`: the robot's sensor model: "ssf" or "naive" (a point without SSF). The
-    true sensor always has the SSF; `utility`: acquisition function by name (see `inquiry.utility_named`); `noise_sd`:
-    sd of the simulated noise, which the robot knows, LEGO units; `width`: width of the robot's SSF over the true one; 1
-    if right; `learn_sensor`: whether it learns the sensor along with the shape; `batch`: readings chosen together;
-    `method`: method of inference and choice: "particles", or "paper" with the utility "entropy" (see
-    `experiment.paper`); `nested_stop`: stopping rule of nested sampling with the method "paper": "change" or
-    "remaining".
+    Parameters
+    ----------
+    population
+        Distribution of the circles, which is also the prior: "anywhere" (radius 20 to 150 mm) or "inside" (50 to
+        150 mm, entirely in the field).
+    model
+        The robot's sensor model: "ssf" or "naive" (a point without SSF). The true sensor always has the SSF.
+    utility
+        Acquisition function by name (see `inquiry.utility_named`).
+    noise_sd
+        Sd of the simulated noise, which the robot knows, LEGO units.
+    width
+        Width of the robot's SSF over the true one; 1 if right.
+    learn_sensor
+        Whether it learns the sensor along with the shape.
+    batch
+        Readings chosen together.
+    method
+        Method of inference and choice: "particles", or "paper" with the utility "entropy" (see
+        `experiment.paper`).
+    nested_stop
+        Stopping rule of nested sampling with the method "paper": "change" or "remaining".
     """
 
     population: str = "inside"

@@ -34,17 +34,33 @@ _MISFIT = partial(misfit, kind=TrialResult)
 class Summary:
     """One row of the table.
 
-    `n_runs`: number of runs, one per circle; `reached`: share of runs that reached the target precision within the
-    limit of readings, with its 95 % interval; `mean`, `median`: readings needed, a miss counted as the limit; mean with
-    standard error, median with 95 % interval (NaN bounds for fewer than `LEAST_FOR_MEDIAN` runs); `to_white`: readings
-    up to the first one on white, a run without one counted as the limit; `after_white`: readings after the first one on
-    white, over runs that reached the precision; `bits_each`: bits per reading: prior minus posterior differential
-    entropy; `error_mm`: largest error of a length at the stop, median over runs that reached the precision; NaN if none
-    did; `wrong`: number of runs that reached the precision with an error above `WRONG_MM`; `wrong_expected`,
-    `wrong_limit`: number expected from their own posteriors, and the 99 % quantile of a Poisson distribution with that
-    mean; `held`: share of the 95 % intervals at the stop that hold the truth, over runs that reached the precision;
-    `arm_s`: arm time per run in seconds, with the standard error; `cpu_s`: processor time per decision, median over
-    runs of each run's median, in seconds.
+    Attributes
+    ----------
+    n_runs
+        Number of runs, one per circle.
+    reached
+        Share of runs that reached the target precision within the limit of readings, with its 95 % interval.
+    mean, median
+        Readings needed, a miss counted as the limit; mean with standard error, median with 95 % interval (NaN bounds
+        for fewer than `LEAST_FOR_MEDIAN` runs).
+    to_white
+        Readings up to the first one on white, a run without one counted as the limit.
+    after_white
+        Readings after the first one on white, over runs that reached the precision.
+    bits_each
+        Bits per reading: prior minus posterior differential entropy.
+    error_mm
+        Largest error of a length at the stop, median over runs that reached the precision; NaN if none did.
+    wrong
+        Number of runs that reached the precision with an error above `WRONG_MM`.
+    wrong_expected, wrong_limit
+        Number expected from their own posteriors, and the 99 % quantile of a Poisson distribution with that mean.
+    held
+        Share of the 95 % intervals at the stop that hold the truth, over runs that reached the precision.
+    arm_s
+        Arm time per run in seconds, with the standard error.
+    cpu_s
+        Processor time per decision, median over runs of each run's median, in seconds.
     """
 
     n_runs: int

@@ -5,7 +5,7 @@ First linearised, for every form at once; then by full fits of the closest ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
 from probewise.proof.systems.fit import LeastSquaresFit, ModelWithForms, project_out
-from probewise.proof.systems.form import Form, FormWithParameters, TrueSystem, parameter_arrays
+from probewise.proof.systems.form import Form, TrueSystem, parameter_arrays
 from probewise.proof.systems.simulate import apply_reading_effects, simulate_noise_free
 
 TELLING_NATS = 3.0
@@ -22,8 +22,6 @@ TELLING_NATS = 3.0
 _NEAR = 12.0  # nats within which a form is a rival; linearised ones within which a full fit is made
 _COSINE = 0.9
 _MOST_FITS = 6
-_CHUNK = 160  # settings simulated together
-_NEUTRAL = {"level": np.inf, "period": 1.0}
 
 
 def vocabulary_name(form: Form) -> str:
@@ -98,12 +96,13 @@ def linearised_starts(
 
     `left`, (n_points,), are the residuals in noise sds, less what the fit's own coordinates could still absorb.
     """
-    out = []
-    for form, changes in templates_of(true, forms, fitted, model).items():
-        own = []
-        groups = [list(group) for group in form.bank]
-        at = 0
-        for group in groups:
+    x, out = fitted.coordinates[None, :], []
+    inner = [effect for effect in model.effects_at(x) if effect[0].side != "reading"]
+    bare = simulate_noise_free(true.kind, true.table, model.parameters_at(x), inner).readings
+    for form in forms:
+        own, at = [], 0
+        changes = _changes_by_bank(true, form, bare, fitted, model)
+        for group in form.bank:
             columns = project_out(changes[at : at + len(group)].T / true.noise_sd, fitted.slopes)
             at += len(group)
             good = np.isfinite(columns).all(axis=0) & (np.sqrt(np.sum(columns**2, axis=0)) > 1e-6)
@@ -118,91 +117,27 @@ def linearised_starts(
     return out
 
 
-def templates_of(
-    true: TrueSystem, forms: Sequence[Form], fitted: LeastSquaresFit, model: ModelWithForms
-) -> dict[Form, FloatArray]:
-    """Return the change of readings by each setting of a form's bank, about a fit: form to (n_settings, n_points)."""
-    settings = {form: [each for group in form.bank for each in group] for form in forms}
-    x = fitted.coordinates[None, :]
-    parameters, beside = model.parameters_at(x), model.effects_at(x)
-    inner = [e for e in beside if e[0].side != "reading"]
-    outer = [e for e in beside if e[0].side == "reading"]
-    bare = simulate_noise_free(true.kind, true.table, parameters, inner).readings
-    out: dict[Form, FloatArray] = {}
-    with np.errstate(all="ignore"):
-        for form in (f for f in forms if f.side == "reading"):
-            unread = np.repeat(bare, len(settings[form]), axis=0)
-            out[form] = (
-                apply_reading_effects(unread, true.table, [*outer, (form, parameter_arrays(settings[form]))])
-                - fitted.readings
-            )
-        alone, together = _split_by_way_of_simulation(true, [f for f in forms if f.side != "reading"])
-        for form in alone:
-            found = _simulated_or_nan(
-                true, parameters, [*beside, (form, parameter_arrays(settings[form]))], len(settings[form])
-            )
-            out[form] = found - fitted.readings
-        for chunk in _chunks_of_forms(together, settings):
-            out |= _changes_of_chunk(true, chunk, settings, fitted, model)
-    return out
-
-
-def _split_by_way_of_simulation(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
-    """Return forms to be simulated each alone (friction, bounds, or no law), and forms that share one integration."""
-    alone = [f for f in forms if f.sticks or f.stops or true.kind.law is None]
-    return alone, [f for f in forms if f not in alone]
-
-
-def _chunks_of_forms(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]]) -> list[list[Form]]:
-    out: list[list[Form]] = []
-    n = _CHUNK
-    for form in forms:
-        if n + len(settings[form]) > _CHUNK:
-            out.append([])
-            n = 0
-        out[-1].append(form)
-        n += len(settings[form])
-    return out
-
-
-def _changes_of_chunk(
-    true: TrueSystem,
-    forms: Sequence[Form],
-    settings: dict[Form, list[dict[str, float]]],
-    fitted: LeastSquaresFit,
-    model: ModelWithForms,
-) -> dict[Form, FloatArray]:
-    """Return as `templates_of`, for forms simulated at once: each has neutral parameters in the others' samples."""
-    ends = np.cumsum([len(settings[form]) for form in forms])
-    total, x = int(ends[-1]), fitted.coordinates[None, :]
-    placed = []
-    for form, end in zip(forms, ends, strict=True):
-        own = parameter_arrays(settings[form])
-        numbers = {}
-        for name, values in own.items():
-            whole = np.full((total, 1), _NEUTRAL.get(name, 0.0))
-            whole[end - len(values) : end] = values
-            numbers[name] = whole
-        # For screening, a delayed column may be interpolated; a full fit treats its jumps exactly.
-        placed.append((replace(form, late=""), numbers))
-    found = _simulated_or_nan(true, model.parameters_at(x), [*model.effects_at(x), *placed], total) - fitted.readings
-    if len(forms) > 1 and not np.isfinite(found).all():  # one of them diverges, which stops the integration of all
-        return {
-            form: each
-            for own in forms
-            for form, each in _changes_of_chunk(true, [own], settings, fitted, model).items()
-        }
-    return {form: found[end - len(settings[form]) : end] for form, end in zip(forms, ends, strict=True)}
-
-
-def _simulated_or_nan(
-    true: TrueSystem, parameters: Mapping[str, FloatArray], effects: Sequence[FormWithParameters], n: int
+def _changes_by_bank(
+    true: TrueSystem, form: Form, bare: FloatArray, fitted: LeastSquaresFit, model: ModelWithForms
 ) -> FloatArray:
-    """Return noise-free readings, (n, n_points), all NaN if the law diverges."""
+    """Return the change of readings by each setting of a form's bank, (n_settings, n_points); NaN where it diverges.
+
+    `bare`, (1, n_points), are the readings of the model without its effects on readings.
+    """
+    settings = [each for group in form.bank for each in group]
+    # For screening, a delayed column may be interpolated; a full fit treats its jumps exactly.
+    tried = form if true.kind.law is None else replace(form, late="")
+    x, more = fitted.coordinates[None, :], (tried, parameter_arrays(settings))
+    effects = [*model.effects_at(x), more]
     try:
-        return simulate_noise_free(true.kind, true.table, parameters, effects).readings
+        with np.errstate(all="ignore"):
+            if form.side == "reading":
+                readings = apply_reading_effects(np.repeat(bare, len(settings), axis=0), true.table, effects)
+            else:
+                readings = simulate_noise_free(true.kind, true.table, model.parameters_at(x), effects).readings
     except NotConvergedError:
-        return np.full((n, len(true.table)), np.nan)
+        return np.full((len(settings), len(true.table)), np.nan)
+    return readings - fitted.readings
 
 
 _BINS = 20

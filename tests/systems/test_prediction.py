@@ -35,11 +35,26 @@ def test_a_recorded_run_is_predicted_from_its_own_posterior():
     assert (found.sd < 0.6).all()
 
 
-def test_a_new_run_starts_where_its_prior_says():
+def _with_starts(*starts):
+    """The heater with so many recorded runs, whose starts are known exactly; 20,000 samples."""
+    model = fitted()
+    names = ("tau_s", "gain", *(f"start_c[{k + 1}]" for k in range(len(starts))))
+    samples = np.tile([15.0, 3.0, *starts], (20_000, 1))
+    return dataclasses.replace(model, names=names, samples=samples, noise_sd=np.full(20_000, 0.05))
+
+
+def test_a_new_run_starts_where_its_prior_says_beside_two_recorded_ones():
     """At time 0 the reading is the start, normal about 20 with sd 5, and noise of 0.05."""
-    found = predicted(fitted(), runs((20.0,), names="9", n=4))
+    found = predicted(_with_starts(22.0, 23.0), runs((20.0,), names="9", n=4))
     np.testing.assert_allclose(found.mean[0], 20.0, atol=0.05)
     np.testing.assert_allclose(found.sd[0], 5.0, rtol=0.02)
+
+
+def test_a_new_run_starts_as_three_recorded_ones_did():
+    """Starts of mean 23 and sd 1: a Student-t of four degrees of freedom, sd sqrt(2 (1 + 1/3)) about 23."""
+    found = predicted(_with_starts(22.0, 23.0, 24.0), runs((20.0,), names="9", n=4))
+    np.testing.assert_allclose(found.mean[0], 23.0, atol=0.05)
+    np.testing.assert_allclose(found.sd[0], np.sqrt(8 / 3), rtol=0.05)
 
 
 def test_a_new_run_has_an_offset_as_those_of_the_recorded_runs_differ():
@@ -50,7 +65,7 @@ def test_a_new_run_has_an_offset_as_those_of_the_recorded_runs_differ():
         samples[:, names.index(f"offset_per_run.values[{name}]")] = value
     model = dataclasses.replace(model, samples=np.tile(samples, (40, 1)), noise_sd=np.full(20_000, 0.05))
     found = predicted(model, runs((20.0,), names="9", n=4))
-    plain = predicted(fitted(), runs((20.0,), names="9", n=4))
+    plain = predicted(_with_starts(20.0, 21.0, 19.0), runs((20.0,), names="9", n=4))
     np.testing.assert_allclose(found.mean[0] - plain.mean[0], 1.0, atol=0.1)
     np.testing.assert_allclose(np.sqrt(found.sd[0] ** 2 - plain.sd[0] ** 2), np.sqrt(8 / 3), rtol=0.15)
 
@@ -103,7 +118,8 @@ def test_predictions_are_written_row_by_row_with_the_columns_of_the_table(tmp_pa
 
 def test_the_density_of_a_new_run_does_not_hang_on_which_starts_were_drawn():
     """The start is normal about 20 with sd 5: at time 0 a reading has that density, however small its noise."""
-    model = dataclasses.replace(fitted(), noise_sd=np.full(500, 0.001))
+    model = _with_starts(22.0, 23.0)
+    model = dataclasses.replace(model, samples=model.samples[:500], noise_sd=np.full(500, 0.001))
     table = runs((20.0,), names="9", n=4)
     readings = np.array([14.0, 20.0, 23.0, 26.0])
     for reading in readings:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._display import ShowsItself
@@ -33,6 +34,8 @@ from probewise.systems.table import RunRecording, RunTable, column_error, covari
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
+_LEAST_RUNS = 3  # recorded runs whose spread tells what a new one may have
+_EDGE = 1e-12
 _SOME = 200  # samples used to estimate the scatter of predictions in each row
 
 
@@ -101,9 +104,10 @@ def predict_system(
     """Predict every row of a table, and score its readings where there are any.
 
     The predictive distribution of a reading is the mixture, over posterior samples, of each sample's noise about its
-    prediction, with all effects of the model. For a run outside the recording, each sample draws the parameters per
-    run: a `per_run` parameter from its prior; an effect's value per run from a Student-t about the sample's values for
-    the recorded runs, with their scatter as its width, and one degree of freedom more than there are runs. Where no
+    prediction, with all effects of the model. For a run outside the recording, each sample draws an effect's value per
+    run from a Student-t about the sample's values for the recorded runs, with their scatter as its width, and one
+    degree of freedom more than there are runs; and so the `per_run` parameters, if three runs or more were recorded, in
+    the coordinate in which their prior is standard normal, else from their prior. Where no
     time was recorded, a step at a row (`at_row`) counts the rows of the recording: those of a table that neither
     begins with the recording's rows nor is a contiguous part of them, readings included, come after its end. A row that
     lacks a number which the simulator or an effect needs has no prediction (NaN), and with a law the rows after it in
@@ -389,8 +393,14 @@ def _chain_samples_and_whether_drawn(
         elif name in fixed:  # a file of an earlier version lacks it
             out[:, k] = 0.0
         elif name in system.marginals:
-            # One stratified draw from the prior for each sample.
-            out[:, k] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
+            prior = system.marginals[name]
+            known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{name.split('[')[0]}[")]]
+            if known.shape[1] < _LEAST_RUNS:
+                # One stratified draw from the prior for each sample.
+                out[:, k] = prior.from_unit((rng.permutation(n) + rng.random(n)) / n)
+                continue
+            drawn = draw_value_for_new_run(ndtri(np.clip(prior.to_unit(known), _EDGE, 1 - _EDGE)), rng=rng)
+            out[:, k] = prior.from_unit(np.clip(ndtr(drawn), _EDGE, 1 - _EDGE))
         else:
             per_run = (own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}."))
             effect = next(per_run, None)

@@ -26,6 +26,7 @@ Parts = tuple[IntArray, tuple[str, ...]]
 N_BLOCKS = 5
 """Number of parts of readings that have no scans or runs."""
 
+_NO_DENSITY = -690.0  # log density of a reading for which a model predicts no number: that of 1e-300
 _NO_SLOPE = 1e-6  # of a parameter's slope on its own readings: so little on others is rounding of predictions
 _HARDLY_TOLD = 0.5  # variance of a coordinate given the other parts, of 1 before them
 
@@ -63,8 +64,10 @@ def held_out_gain(
         rows = np.zeros(len(plan), dtype=np.bool_)
         rows[np.flatnonzero(usable)[out]] = True
         each = ((repaired, law), (null, law_of_null))
-        repaired_one, null_one = (_refit_log_densities(f, recording, rows, own, out) for f, own in each)
-        return repaired_one - null_one
+        with np.errstate(invalid="ignore"):  # without them a model may predict no number
+            densities = (_refit_log_densities(f, recording, rows, own, out) for f, own in each)
+            repaired_one, null_one = (np.where(np.isnan(each), _NO_DENSITY, each) for each in densities)
+        return np.asarray(repaired_one - null_one)
 
     return mean_gain_over_parts(parts, gain_per_reading, names)
 

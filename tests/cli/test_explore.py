@@ -29,6 +29,16 @@ def explore(sensor_file, tmp_path, quick_frames):
     return call
 
 
+def test_a_simulated_arm_that_lacks_the_effects_of_its_sensor_says_so(explore, sensor_file, capsys):
+    sensor = read_sensor(sensor_file)
+    more = np.tile([0.2, 30.0], (len(sensor.samples), 1))
+    names = (*sensor.names, "gain_drift.frac", "gain_drift.tau_s")
+    with_drift = replace(sensor, names=names, samples=np.hstack([sensor.samples, more]), effects=("gain_drift",))
+    write_sensor(with_drift, sensor_file)
+    assert explore("--trust", 1, "--max-readings", 1)[0] == 0
+    assert "but not its effects: gain drift" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_the_sensor_may_be_learnt_along(explore, capsys):
     status, lines = explore("--learn-sensor", "--max-readings", 1)

@@ -36,6 +36,7 @@ from probewise.cli._common import (
     print_result,
     tables_and_descriptions,
 )
+from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean
 from probewise.experiment import (
     CLEAN,
@@ -475,6 +476,9 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journ
     yield result.summary()
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry and inputs.geometry.accuracy is None:
         yield "arm          nobody has fitted its geometry: its own error is not in these sds"
+    if inputs.sensor.effects and inputs.arm.kind in ("simulated", "emulator"):
+        effects = ", ".join(map(spoken_name, inputs.sensor.effects))
+        yield f"note: the simulated arm has the sensor's SSF, levels and noise, but not its effects: {effects}"
     trust = inputs.experiment.trust
     missing = left_out_after_step(result.last, trust)
     if trust < 1:

@@ -512,10 +512,11 @@ def fit(
     tables: Table | Sequence[Table],
     *,
     simulator: AnySimulator,
+    thorough: bool = False,
     rng: np.random.Generator,
     progress: bool | Progress = True,
 ) -> SystemFit:
-    """Fit a simulator of your own to a table of readings: posterior and evidence, without a diagnosis.
+    """Fit a simulator of your own to a table of readings: mode, posterior and evidence, without a diagnosis.
 
     Parameters
     ----------
@@ -523,6 +524,8 @@ def fit(
         The readings with the simulator's columns: a dict of arrays, or a DataFrame; several are fitted together.
     simulator
         The simulator, `systems.Simulator`, or its FILE.py.
+    thorough
+        Compute the evidence by nested sampling as well.
     rng
         Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise fit --seed`.
     progress
@@ -538,7 +541,7 @@ def fit(
 
     acting, table, notes = _simulator_and_table(simulator, tables)
     with progress_or_bar(progress) as told:
-        return diagnosis.fit_simulator(acting, table, notes=notes, rng=rng, progress=told)
+        return diagnosis.fit_simulator(acting, table, notes=notes, thorough=thorough, rng=rng, progress=told)
 
 
 def diagnose(

@@ -453,7 +453,7 @@ def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so(dia
     assert diagnosis.verdict == "cannot_tell"
     assert TO_SEPARATE not in diagnosis.reason
     for name in ("off that depends on temp_c", "readings that depend on temp_c"):
-        assert f"{name} (0.47)" in diagnosis.reason
+        assert f"{name} (0.48)" in diagnosis.reason
     assert diagnosis.reason.endswith(f"; {nothing}.")
     assert diagnosis.next_measurement is None
 

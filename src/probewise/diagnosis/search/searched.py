@@ -30,7 +30,7 @@ from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.effects.noise import Outliers
 from probewise.sensor import Stage
 
-_TIE = 1e-4  # nats between hypotheses that are one
+_TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gains less than half of it
 _BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
 _NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, as a smaller misfit beside it would
 
@@ -209,8 +209,8 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
 
     for names, noise in log_p:
         log_p[names, noise] += -math.log(n_forms) + log_prior_on_noise(noise, alone=not names)
-    # Exact aliases differ by rounding errors, which depend on the machine: within a ten-thousandth of a nat they tie.
-    # Of those that tie the one with fewer effects, on a reading before a parameter or a rate, comes first.
+    # Exact aliases differ by how far their fits went: within a hundredth of a nat they tie. Of those that tie the one
+    # with fewer effects, on a reading before a parameter or a rate, comes first.
     level = math.inf
     for key in sorted(log_p, key=lambda key: -log_p[key]):
         level = level if level - log_p[key] < _TIE else log_p[key]

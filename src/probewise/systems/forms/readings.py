@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
@@ -11,6 +12,7 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import ROWS_OF_A_SIDE, single_column_bank
+from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reading import decaying_sum
 from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
@@ -33,6 +35,7 @@ _ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what m
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
 _BEND_DEGREE = 4
 _COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
+_VISIBLE = 4.0  # lambda of an effect that a test at level .01 sees more often than not
 _NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
 _OUTLYING = 5.0  # medians of the residual's size
 
@@ -251,14 +254,19 @@ def _curve_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     form = Form(f"curve:{name}", Stage.OFFSET, any_size, (unit,) * len(every), along, act, bank, says, every)
     last = min(len(distinct_values(column[about.has_reading])) - 1, len(every))
     for whole in about.scaled(form, about.sd) if last > 1 else ():
-        first, *others = (_up_to_order(whole, order) for order in range(2, last + 1))
+        first, *others = (_up_to_order(whole, order, int(about.has_reading.sum())) for order in range(2, last + 1))
         yield replace(first, alternatives=tuple(others))
 
 
-def _up_to_order(curve: Form, order: int) -> Form:
-    """Return the variant of a curve whose higher coefficients are 0."""
+def _up_to_order(curve: Form, order: int, n_read: int) -> Form:
+    """Return the variant of a curve whose higher coefficients are 0, and whose highest one can be seen.
+
+    Otherwise it would be the curve of the order below, or a straight line, which has a name.
+    """
     none = Fixed(-_NONE * curve.entries.max(), _NONE * curve.entries.max())
-    priors = {**curve.marginals, **dict.fromkeys(_COEFFICIENTS[order:], none)}
+    highest = cast(HeavyTailedPrior, curve.marginals[_COEFFICIENTS[order - 1]])
+    seen = replace(highest, smallest=max(highest.smallest, min(_VISIBLE / np.sqrt(n_read), 1.0)))
+    priors = {**curve.marginals, _COEFFICIENTS[order - 1]: seen, **dict.fromkeys(_COEFFICIENTS[order:], none)}
     return replace(curve, parameters=priors, entries=curve.entries[:, :order])
 
 

@@ -192,11 +192,13 @@ def judged_and_best_repair(
 
 
 def _corrects_held_out_readings(searched: Searched, best: BestRepair) -> bool:
-    """Return whether a correction by the best basis improves predictions of held-out parts, or of held-out blocks."""
+    """Return whether a correction by the best basis predicts held-out parts better or, where it does not, blocks."""
     prepared, bases = searched.prepared, searched.misfit_templates.unknown_bases
-    parts = prepared.apparatus.held_out_parts(prepared.recording), partition_into_blocks(prepared.recording)
-    corrections = (correct_by_best_basis(best.repaired, best.problem, bases, part) for part, _ in parts)
-    return any(fixed.held_out.per_reading > 0 for fixed in corrections)
+    parts, blocks = prepared.apparatus.held_out_parts(prepared.recording), partition_into_blocks(prepared.recording)
+    fixed = correct_by_best_basis(best.repaired, best.problem, bases, parts[0])
+    if fixed.gains_nothing:
+        fixed = correct_by_best_basis(best.repaired, best.problem, bases, blocks[0])
+    return fixed.held_out.per_reading > 0
 
 
 _ABOUT_EQUAL = 5.0  # nats

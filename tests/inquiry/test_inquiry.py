@@ -203,7 +203,7 @@ def test_a_function_of_numbers_alone_is_asked_setting_by_setting():
 
 def test_an_unknown_sd_is_inferred():
     noise = np.random.default_rng(2)
-    asked = inquiry(noise=LogUniform(0.05, 5.0))
+    asked = inquiry(noise=LogUniform(0.05, 5.0), n_samples=4000)
     for k in range(10):
         asked.tell(float(0.4 * noise.standard_normal()), PLACES[k % 5])
     assert asked.posterior.names[-1] == "noise.sd"

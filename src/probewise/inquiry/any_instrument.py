@@ -24,8 +24,9 @@ from probewise._kinds import checked_finite_number, checked_whole, require_calla
 from probewise.errors import ParameterError, ShapeError, did_you_mean
 from probewise.inquiry.entropy import choose
 from probewise.inquiry.predictive import AnyNoise, ReadingNoise, expected_nats_above_goal, readings_given_noise
-from probewise.nested import Weighted, diversify, make_problem, run
-from probewise.nested.problem import AnyPrior
+from probewise.nested import Evaluator, Weighted, diversify, make_problem, run
+from probewise.nested.importance import draw_and_weigh, fit_wide_and_narrow_proposals
+from probewise.nested.problem import AnyPrior, unbounded_space_of
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Joint, Prior, Product, require_prior
 from probewise.systems.calls import Caller
@@ -40,9 +41,12 @@ _ALLOWED = (
     "by name, all of one length"
 )
 _BLOCK = 2_000_000  # densities held, or readings predicted, at a time
-_KEEP = 0.5  # share of the samples that must count, else they are resampled and moved
+_KEEP = 0.25  # share of the samples that must count, else they are drawn anew
+_N_FITTED = 600  # samples to which the density of draws is fitted
+_SURPRISED = 0.01  # share of the samples that must count for a fit
+_PRIOR_SHARE = 0.1  # of the draws: they find parts without samples, and bound the weights
 _N_MOVES = 10  # steps of each sample
-_LEAST_STEP = 1e-3  # of a reading's likelihood at a time: with less, the samples cannot follow it
+_LEAST_STEP = 1e-5  # of a reading's likelihood at a time: with less, the samples cannot follow it
 _IMPOSSIBLE = 1e200  # nats, of a reading that a sample excludes
 _LOST_NATS = 3.0  # prior samples overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
 _N_PROBED = 3
@@ -302,11 +306,59 @@ def _equal_weights(names: tuple[str, ...], theta: FloatArray, log_likelihood: Fl
     )
 
 
-def updated_posterior(previous: Weighted, readings: ReadingsProblem, *, rng: np.random.Generator) -> Weighted | None:
+def updated_posterior(
+    previous: Weighted, readings: ReadingsProblem, n: int, *, rng: np.random.Generator
+) -> Weighted | None:
     """Update the posterior given all readings but the last by the last; None if the samples cannot follow it.
 
-    Samples are reweighted. Where fewer than half of them would count, the last reading's likelihood is applied in
-    powers, so that half count each time; after each the samples are resampled and moved (`nested.diversify`).
+    Samples are reweighted. Where fewer than a quarter of them would count, new ones are drawn from a density fitted to
+    them and from the prior, and weighted by all readings; where such draws are not reliable, the samples are moved
+    first.
+    """
+    log_density = readings.log_density_of_last(previous.theta)
+    log_weight = previous.log_weight + log_density
+    gained, n_eff = float(logsumexp(log_weight)), n_effective(log_weight)
+    if gained < -0.5 * _IMPOSSIBLE:
+        return None
+    now = _reweighted(previous, log_weight - gained, log_density, gained, n_eff)
+    if n_eff >= _KEEP * len(now.theta):
+        return now
+    found = _drawn_anew(now, readings, n, rng)
+    if found is None:
+        moved = _moved_in_steps(previous, readings, rng)
+        found = None if moved is None else (_drawn_anew(moved, readings, n, rng) or moved)
+    return found
+
+
+def _reweighted(
+    found: Weighted, log_weight: FloatArray, log_density: FloatArray, gained: float, n_eff: float
+) -> Weighted:
+    return replace(
+        found,
+        log_likelihood=found.log_likelihood + log_density,
+        log_weight=log_weight,
+        log_z=found.log_z + gained,
+        log_z_error=math.hypot(found.log_z_error, math.sqrt(max(1 / n_eff - 1 / found.n_eff, 0.0))),
+        n_eff=n_eff,
+        run=None,
+    )
+
+
+def _drawn_anew(found: Weighted, readings: ReadingsProblem, n: int, rng: np.random.Generator) -> Weighted | None:
+    """Draw `n` samples from a density fitted to these; None if their weights are not reliable."""
+    if found.n_eff < max(_SURPRISED * n, 3 * len(found.names)):
+        return None
+    space, evaluate = unbounded_space_of(readings.prior), Evaluator(readings)
+    rows = np.unique(resampled_rows(found.weight, _N_FITTED, rng))
+    proposal = fit_wide_and_narrow_proposals(space.enter(found.theta[rows]), rng=rng)[-1]
+    drawn = draw_and_weigh(proposal, _PRIOR_SHARE, None, space, evaluate, n_draws=n, rng=rng)
+    return drawn if drawn.sound else None
+
+
+def _moved_in_steps(previous: Weighted, readings: ReadingsProblem, rng: np.random.Generator) -> Weighted | None:
+    """Apply the last reading's likelihood in powers, so that a quarter of the samples count each time, and move them.
+
+    After each power the samples are resampled and moved (`nested.diversify`). None if the powers are too small.
     """
     now, power, n = previous, 0.0, len(previous.theta)
     while power < 1.0:
@@ -323,15 +375,7 @@ def updated_posterior(previous: Weighted, readings: ReadingsProblem, *, rng: np.
         log_weight = log_weight_at(step)
         gained, n_eff = float(logsumexp(log_weight)), n_effective(log_weight)
         power = min(power + step, 1.0) if step < 1.0 - power else 1.0
-        now = replace(
-            now,
-            log_likelihood=now.log_likelihood + step * log_density,
-            log_weight=log_weight - gained,
-            log_z=now.log_z + gained,
-            log_z_error=math.hypot(now.log_z_error, math.sqrt(max(1 / n_eff - 1 / now.n_eff, 0.0))),
-            n_eff=n_eff,
-            run=None,
-        )
+        now = _reweighted(now, log_weight - gained, step * log_density, gained, n_eff)
         if power < 1.0:
             moved = _moved(now, replace(readings, last_power=power), rng)
             now = replace(moved, log_z=now.log_z, log_z_error=now.log_z_error)
@@ -532,7 +576,7 @@ class Inquiry(ShowsItself):
         readings = _append_reading(self._readings, self._model, at, value)
         of_prior = self._prior_log_likelihood + readings.log_density_of_last(self._prior_theta)
         by_prior = float(logsumexp(of_prior)) - math.log(self._n_samples)
-        found = updated_posterior(self._posterior, readings, rng=self._rng)
+        found = updated_posterior(self._posterior, readings, self._n_samples, rng=self._rng)
         # Samples of the prior that explain the readings better than the posterior does lie in a part that it has lost.
         if found is None or by_prior - found.log_z > _LOST_NATS + self._lost_nats:
             found = nested_posterior(readings, self._n_samples, self._n_live, rng=self._rng)

@@ -26,7 +26,7 @@ _ALLOWED_SD = (
     "LogUniform(0.1, 10.0)"
 )
 _LOG_2PI = math.log(2 * math.pi)
-_N_LEVELS = 512  # of a reading without noise: near a goal they are finer than a sample's error
+_N_LEVELS = 256  # of a reading without noise: near a goal they are finer than a sample's error
 _N_SDS, _N_LEVELS_EACH = 8, 128  # where the sd of the noise is unknown
 _CELL = 0.4  # sds: wide as a cell of a reading, which loses 1.3 % of a small information
 _REACH = 5.0  # sds beyond the levels that the cells cover

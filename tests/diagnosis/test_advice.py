@@ -25,7 +25,9 @@ from probewise.diagnosis.advice import (
     slopes_split_by_run,
 )
 from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, rows_by_command
-from probewise.diagnosis.arm_scans import (
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.light_sensor import (
+    LightSensorApparatus,
     candidate_scans,
     excerpts_of_scan,
     plan_of_alternatives,
@@ -33,8 +35,6 @@ from probewise.diagnosis.arm_scans import (
     scan_started_after,
     target_swaps,
 )
-from probewise.diagnosis.fit import Model
-from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.sensors import default_sensor
 from probewise.diagnosis.simulator_rows import SimulatorApparatus

@@ -7,14 +7,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from heater import SIMULATOR, runs
-from scipy.linalg import null_space
 
 from probewise.diagnosis.aliases import (
     COUNTS,
     Alias,
-    Amounts,
     EffectEntry,
-    ReadingsWithEffects,
     pairs_with_separating_scans,
 )
 from probewise.diagnosis.apparatus import MOST_READINGS
@@ -104,62 +101,3 @@ def test_a_value_per_run_separates_nothing_that_a_start_of_each_run_absorbs():
     """An offset of each run and a start of each run are the same in a new run too, which has one of each."""
     alias = advised("offset_per_run", "depends:start_c:room_c")
     assert (alias.settle_by, alias.readings) == (NOTHING, 0)
-
-
-def divergence(first_mean, first, second_mean, second):
-    """Kullback-Leibler divergence of two normal distributions, from their means and covariances."""
-    apart, inverse = first_mean - second_mean, np.linalg.inv(second)
-    log_dets = np.linalg.slogdet(second)[1] - np.linalg.slogdet(first)[1]
-    return 0.5 * (np.trace(inverse @ first) - len(apart) + log_dets + apart @ inverse @ apart)
-
-
-@pytest.mark.parametrize("readings", [0, 8, 51])
-def test_a_value_of_a_new_run_is_as_uncertain_as_those_of_recorded_runs_differ(readings):
-    """Gain of each run against a slope with the power; both ways by a dense normal distribution of all that is read."""
-    plan = cast(Any, SCANS[0].plan)
-    n_params, n_new, weight = len(FOUND.z), len(plan), np.sqrt(readings / len(SCANS[0].plan))
-    names = ("differs:gain", "sensitivity:power_w")
-    entries = {name: EffectEntry(PREPARED.effects[name], PREPARED.effects[name].bank()[0]) for name in names}
-    rows = np.arange(len(RECORDING.readings))
-    linear = ReadingsWithEffects.of(PROBLEM, FOUND, entries, usable=rows, plan=plan, apparatus=APPARATUS)
-    values = np.array([3.0, -1.0, 7.0])
-    differs, other = Amounts(names[0], values), Amounts(names[1], np.array([20.0]))
-    taken = linear.in_one_run(np.arange(n_new))
-    at = int(np.searchsorted(COUNTS, readings))
-
-    _, slopes = Model(FOUND.model.sensor, (), plan).predict_and_differentiate(FOUND.z)
-    slopes = weight * slopes / PROBLEM.sd
-    start, slopes[:, 2:] = np.full(n_new, weight * NEW_START), 0.0
-    known = np.block(
-        [
-            [FOUND.slopes / PROBLEM.sd, np.zeros((len(rows), 1))],
-            [slopes, start[:, None]],
-            [np.eye(n_params + 1)],
-        ]
-    )
-    free = null_space(known.T).T  # of all parameters
-    columns = {
-        name: np.concatenate(
-            [linear.old.columns[:, own], weight * linear.further.columns[:, own], np.zeros((n_params + 1, len(own)))]
-        )
-        for name, own in linear.of_effect.items()
-    }
-    like = columns[names[0]][:, :1].copy()  # the first scan repeats the first run
-    like[: len(rows)] = 0.0
-    columns[names[0]][len(rows) :] = like[len(rows) :] / 3
-    new = free @ like
-    spread = np.eye(len(free)) + np.var(values) * new @ new.T
-    a, b = free @ columns[names[0]], free @ columns[names[1]]
-
-    def best(true, covariance, fitted):
-        inverse = np.linalg.inv(covariance)
-        return fitted @ np.linalg.solve(fitted.T @ inverse @ fitted, fitted.T @ inverse @ true)
-
-    slope = b @ [20.0]
-    expected = divergence(slope, np.eye(len(free)), best(slope, spread, a), spread)
-    assert taken.nats_against(other, differs)[at] == pytest.approx(expected, rel=1e-3, abs=1e-6)
-    gains = a @ values
-    expected = divergence(gains, spread, best(gains, np.eye(len(free)), b), np.eye(len(free)))
-    # The one fit to all values takes up part of the new one too, whose spread counts as far as it is left.
-    lost = 0.5 * np.var(values) * float(np.sum((b.T @ new) ** 2) / np.sum(b**2))
-    assert taken.nats_against(differs, other)[at] == pytest.approx(expected - lost, rel=1e-3, abs=1e-6)

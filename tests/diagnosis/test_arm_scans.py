@@ -6,8 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise.diagnosis.arm_scans import candidate_scans, rows_of_distinct_scans
-from probewise.diagnosis.light_sensor import LightSensorApparatus, varying_covariates
+from probewise.diagnosis.light_sensor import (
+    LightSensorApparatus,
+    candidate_scans,
+    rows_of_distinct_scans,
+    varying_covariates,
+)
 from probewise.recordings import two_way_plan
 
 

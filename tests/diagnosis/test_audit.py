@@ -10,9 +10,9 @@ import pytest
 from mixtures import fixed_mixture
 
 from probewise.diagnosis import audit_plan, join
-from probewise.diagnosis.arm_scans import candidate_scans
 from probewise.diagnosis.audit import ExpectedSensor, PlanTemplates, ProjectedTemplates, _curing_step_by_effect
-from probewise.diagnosis.joining import join_plans
+from probewise.diagnosis.light_sensor import candidate_scans
+from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from heater import ABOUT
 
-from probewise.diagnosis.averaging import HypothesisSamples, can_share_one_model, mix_over_hypotheses, mix_over_orders
-from probewise.diagnosis.samples import ModelSamples
+from probewise.diagnosis.samples import HypothesisSamples, ModelSamples, can_share_one_model, mix
 from probewise.diagnosis.search.searched import Posterior
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
@@ -35,7 +34,8 @@ def samples_of(n_gaussians: int, n: int = 500) -> ModelSamples:
 
 def test_a_gaussian_in_halves_predicts_the_same():
     one, three = samples_of(1), samples_of(3)
-    mixed = mix_over_orders([one, three], np.array([1.0, 0.0]), rng=np.random.default_rng(0))
+    null = default_sensor(EXTENT, 3)
+    mixed = mix([one, three], np.array([1.0, 0.0]), null, PLAN, rng=np.random.default_rng(0))
     assert mixed.n_gaussians == 3
     assert mixed.theta.shape == three.theta.shape
     expected = np.sort(one.chain.predict(one.theta, PLAN)[:, 150])
@@ -43,7 +43,8 @@ def test_a_gaussian_in_halves_predicts_the_same():
 
 
 def test_orders_are_mixed_by_their_probability():
-    mixed = mix_over_orders([samples_of(1), samples_of(2)], np.array([0.3, 0.7]), rng=np.random.default_rng(3))
+    null = default_sensor(EXTENT, 2)
+    mixed = mix([samples_of(1), samples_of(2)], np.array([0.3, 0.7]), null, PLAN, rng=np.random.default_rng(3))
     of_one = int(np.sum(mixed.noise_sd == 1.0))
     # Four sd of a binomial of 500: fails by chance once in 16,000 seeds.
     assert of_one == pytest.approx(150, abs=4 * np.sqrt(500 * 0.3 * 0.7))
@@ -52,7 +53,7 @@ def test_orders_are_mixed_by_their_probability():
 
 def test_one_order_alone_stays_as_it_is():
     one = samples_of(2)
-    alone = mix_over_orders([one], np.ones(1), rng=np.random.default_rng(0))
+    alone = mix([one], np.ones(1), default_sensor(EXTENT, 2), PLAN, rng=np.random.default_rng(0))
     np.testing.assert_array_equal(np.sort(alone.theta, axis=0), np.sort(one.theta, axis=0))
 
 
@@ -99,7 +100,7 @@ def test_hypotheses_are_mixed_by_their_probability_and_predict_what_each_does():
     parts[2] = dataclasses.replace(parts[2], noise_sd=np.full(500, 3.0))
     shares = np.array([0.5, 0.3, 0.2])
     null = default_sensor(EXTENT, 2)
-    mixed = mix_over_hypotheses(parts, shares, null, PLAN, rng=np.random.default_rng(4))
+    mixed = mix(parts, shares, null, PLAN, rng=np.random.default_rng(4))
     assert mixed.effects == ("backlash", "lag")
     assert mixed.n_gaussians == 2
     predicted = mixed.chain.predict(mixed.theta, PLAN)
@@ -209,5 +210,5 @@ def test_the_repaired_model_is_the_same_whatever_order_python_gives_to_sets():
         for seed in ("1", "2")
     )
     probabilities = [float(text) for text in one.partition("\n")[0].strip("[]").split(",")]
-    assert min(probabilities) > 0.15
+    assert min(probabilities) > 0.1  # all are in the mixture
     assert one == other

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.held_out import sequential_log_densities
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.noise_memory import innovations_given_rest, walk_given_readings, with_known_wide_readings
+from probewise.diagnosis.noise_models import innovations_given_rest, walk_given_readings, with_known_wide_readings
 from probewise.diagnosis.outlying import outlier_probabilities
 
 _N = 40

@@ -12,7 +12,6 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm import readings_of_recording, recording_of_readings
 from probewise.diagnosis.aliases import Alias, projected_cosine
-from probewise.diagnosis.arm_scans import rows_as_new_scan
 from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,
@@ -22,11 +21,11 @@ from probewise.diagnosis.evidence import (
     block_log_bayes_factors,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
-from probewise.diagnosis.joining import join, join_plans
-from probewise.diagnosis.light_sensor import covariate_of_effect
+from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_new_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
 from probewise.diagnosis.noise_law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
 from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import FreeFormSensor, default_sensor, sensor_from_posterior, theta_to_natural
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities

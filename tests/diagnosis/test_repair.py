@@ -99,8 +99,7 @@ def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_re
         improvement=None,
         problem=SimpleNamespace(law=white_noise(len(rows))),
     )
-    drawn = SimpleNamespace(null=None, repaired=None)
-    found = repair_of(prepared, best, drawn, np.full(len(rows), 2.0))
+    found = repair_of(prepared, best, None, None, np.full(len(rows), 2.0))
     assert found.by_rows
     np.testing.assert_array_equal(found.before.readings, 4.0)
     used = np.isin(np.arange(n), rows)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from heater import heater, runs
 
+from probewise.diagnosis import audit as system_audit
 from probewise.diagnosis import audit_system
-from probewise.diagnosis import simulator_audit as system_audit
 from probewise.errors import ParameterError
 from probewise.systems import Noise, Simulator
 

@@ -17,24 +17,23 @@ from probewise.diagnosis.audit import (
     audit_json,
     audit_plan,
     audit_plan_of_diagnosis,
+    audit_system,
 )
 from probewise.diagnosis.best_repair import Improvement
 from probewise.diagnosis.diagnose_simulator import diagnose_system, notes_on_calls
 from probewise.diagnosis.diagnosis import NEXT_PLAN, Diagnosis, VerdictReport, diagnosis_json, diagnosis_schema
-from probewise.diagnosis.engine import Thorough, diagnose
+from probewise.diagnosis.engine import Thorough, diagnose, model_with
 from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
 from probewise.diagnosis.fit import Null
 from probewise.diagnosis.fit_simulator import Evidence, SystemFit, calibrated_of, fit_json, fit_simulator, repaired_of
-from probewise.diagnosis.joining import join
 from probewise.diagnosis.locate import ALARM, Place
-from probewise.diagnosis.model_with import model_with
+from probewise.diagnosis.prepared import join
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.reason import TO_SEPARATE
 from probewise.diagnosis.repair import PredictionAndResiduals, Repair
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.search.thorough import Weighing, weigh_thoroughly
 from probewise.diagnosis.sensors import SensorPrior
-from probewise.diagnosis.simulator_audit import audit_system
 from probewise.diagnosis.unknown_shape import SensorAndShape
 from probewise.diagnosis.verdict import Hypothesis, Judged, Verdict
 from probewise.diagnosis.words import p_in_words

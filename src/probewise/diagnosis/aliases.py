@@ -5,12 +5,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, NOTHING_NATS, Apparatus, rows_by_command
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks
 from probewise.diagnosis.fit import Fit
@@ -45,143 +44,63 @@ class EffectEntry:
 
 
 @dataclass(frozen=True, eq=False)
-class Amounts:
-    """A change by an effect, as amounts of its columns: `values` (n_columns,)."""
+class _Columns:
+    """The columns of an effect, in noise sds: in `old` readings and `further` ones, (n_points, n_columns) each.
 
-    name: str
-    values: FloatArray
-
-    @property
-    def variance(self) -> float:
-        """Variance of the amounts, and so of one more."""
-        return max(float(np.var(self.values)), 1e-12)
-
-
-@dataclass(frozen=True, eq=False)
-class LinearReadings:
-    """Readings linearised about a fit, in noise sds: `slopes` (n_points, n_params) and `columns` (n_points, n_columns).
-
-    Slopes are by the fit's coordinates, which have a standard normal prior; columns are changes by effects.
+    `of_run`: whether each is the value of one run; then `further` are the columns of the mean of all runs' values.
     """
 
-    slopes: FloatArray
-    columns: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class ReadingsWithEffects:
-    """Old readings and possible further ones, linearised about a fit, with the columns of several effects.
-
-    `old`, `further`: the readings; `of_effect`: numbers of each effect's columns, by name; `of_run`, `columns_of_run`:
-    masks of the coordinates, and of the columns, of which each run has a value of its own.
-    """
-
-    old: LinearReadings
-    further: LinearReadings
-    of_effect: Mapping[str, IntArray]
-    of_run: BoolArray
-    columns_of_run: BoolArray
+    old: FloatArray
+    further: FloatArray
+    of_run: bool
 
     @classmethod
     def of(
         cls,
+        entry: EffectEntry,
         problem: Linearised,
         found: Fit,
-        entries: Mapping[str, EffectEntry],
-        *,
         usable: IntArray,
-        plan: Plan,
+        everywhere: tuple[Plan, FloatArray],
         apparatus: Apparatus,
-    ) -> Self:
-        """Linearise about a fit the readings of its `usable` rows, and those of a `plan` of further ones.
-
-        An effect's columns are scaled to a length of one noise sd in all, on the old readings.
-        """
-        model, predicted = found.model, found.model.predict(found.z[None, :])[0]
-        expected, slopes = replace(model, plan=plan).predict_and_differentiate(found.z)
+    ) -> _Columns:
+        """Linearise the readings of `usable` rows, and those of another plan with its predictions without effects."""
+        model, (plan, expected) = found.model, everywhere
+        old = problem.whiten(entry.changes(found, model.plan, model.predict(found.z[None, :])[0])[usable])
+        length = max(float(np.linalg.norm(old)), 1e-300)
+        further = entry.changes(found, plan, expected) / problem.sd
         n_known = len(apparatus.coordinates_of_new_run(model))
-        old, further, of_run = [], [], []
-        for entry in entries.values():
-            columns = problem.whiten(entry.changes(found, model.plan, predicted)[usable])
-            length = max(float(np.linalg.norm(columns)), 1e-300)
-            old.append(columns / length)
-            further.append(entry.changes(found, plan, expected) / problem.sd / length)
-            varies = len(apparatus.coordinates_of_new_run(model.with_effect(entry.effect))) > n_known
-            of_run.append(np.full(columns.shape[1], varies))
-        ends = np.cumsum([columns.shape[1] for columns in old])
-        return cls(
-            LinearReadings(problem.whiten(found.slopes), np.concatenate(old, axis=1)),
-            LinearReadings(slopes / problem.sd, np.concatenate(further, axis=1)),
-            dict(zip(entries, np.split(np.arange(ends[-1]), ends[:-1]), strict=True)),
-            np.isin(np.arange(model.n_params), apparatus.coordinates_of_new_run(model)),
-            np.concatenate(of_run),
-        )
-
-    def in_one_run(self, rows: IntArray) -> NatsInOneRun:
-        """Return the readings with those further ones alone whose row numbers are these: rows of one run."""
-        further = LinearReadings(self.further.slopes[rows], self.further.columns[rows])
-        return NatsInOneRun(self.old, further, self.of_effect, self.of_run, self.columns_of_run)
+        of_run = len(apparatus.coordinates_of_new_run(model.with_effect(entry.effect))) > n_known
+        if of_run:  # the new run's value is about the mean of the others
+            further = np.repeat(further.mean(axis=1, keepdims=True), further.shape[1], axis=1)
+        return cls(old / length, further / length, of_run)
 
 
-@dataclass(frozen=True, eq=False)
-class NatsInOneRun(ReadingsWithEffects):
-    """Nats that separate effects after any number of readings, evenly spread, of one further run."""
+Amounts = tuple[_Columns, FloatArray]
+"""A change by an effect: its columns, and how much of each, (n_columns,)."""
 
-    def nats_against(self, truth: Amounts, rival: Amounts) -> FloatArray:
-        """Return the expected log Bayes factor of an effect that acts over another, which is refitted, (n_counts,).
 
-        It is a Kullback-Leibler divergence of normal distributions: of an effect with a value per run, that of the
-        further run is normal with the mean and the variance of the others. NaN if an effect has no finite change.
-        """
-        columns, others = self.of_effect[truth.name], self.of_effect[rival.name]
-        own, others_own = self._numbers_of_own_values(columns), self._numbers_of_own_values(others)
-        every, fitted = np.concatenate([columns, own]), np.concatenate([others, others_own])
-        products = self._projected_products
-        among = products[:, fitted[:, None], fitted]
-        along = products[:, fitted[:, None], every]
-        left = products[:, every[:, None], every]
-        if not (np.isfinite(among).all() and np.isfinite(left).all()):
-            return np.full(len(COUNTS), np.nan)
-        prior = np.concatenate([np.full(len(others), _FREE), np.full(len(others_own), 1 / rival.variance)])
-        left = left - along.transpose(0, 2, 1) @ np.linalg.solve(among + np.diag(prior), along)
-        n = len(columns)
-        twice = np.einsum("i,mij,j->m", truth.values, left[:, :n, :n], truth.values)
-        if own.size:
-            spread = np.eye(len(own)) + truth.variance * products[:, own[:, None], own]
-            twice += truth.variance * np.einsum("mii->m", left[:, n:, n:]) - np.linalg.slogdet(spread)[1]
-        if others_own.size:
-            spread = np.eye(len(others_own)) + rival.variance * products[:, others_own[:, None], others_own]
-            absorbed = len(others_own) - np.einsum("mii->m", np.linalg.inv(spread))
-            twice += np.linalg.slogdet(spread)[1] - absorbed
-        return np.asarray(0.5 * twice)
+def nats_against(slopes: Sequence[FloatArray], truth: Amounts, rival: Amounts, rows: IntArray) -> FloatArray:
+    """Return the expected log Bayes factor of an effect that acts over another, which is refitted, (n_counts,).
 
-    def _numbers_of_own_values(self, columns: IntArray) -> IntArray:
-        """Return the numbers, behind all columns, of the columns by the further run's own values of an effect."""
-        number = self.old.columns.shape[1] + np.cumsum(self.columns_of_run) - 1
-        return np.asarray(number[columns[self.columns_of_run[columns]]])
-
-    @cached_property
-    def _projected_products(self) -> FloatArray:
-        """Products of all columns with the parameters, and their prior, projected out, (n_counts, k, k)."""
-        n_old, n_params = self.old.slopes.shape
-        own, own_columns = self.further.slopes[:, self.of_run], self.further.columns[:, self.columns_of_run]
-        shared, shared_columns = self.further.slopes.copy(), self.further.columns.copy()
-        shared[:, self.of_run] = 0.0
-        for numbers in self.of_effect.values():  # the new run's value is about the mean of the others
-            if self.columns_of_run[numbers].all():
-                shared_columns[:, numbers] = shared_columns[:, numbers].mean(axis=1, keepdims=True)
-        absent, absent_columns = np.zeros((n_old, own.shape[1])), np.zeros((n_old, own_columns.shape[1]))
-        before = np.concatenate([self.old.slopes, absent, self.old.columns, absent_columns], axis=1)
-        after = np.concatenate([shared, own, shared_columns, own_columns], axis=1)
-        p = n_params + own.shape[1]
-        products = before.T @ before + COUNTS[:, None, None] * (after.T @ after / len(after))
-        products[:, :p, :p] += np.eye(p)
-        scale = np.sqrt(np.einsum("mii->mi", products[:, :p, :p]))[:, :, None]  # against rounding
-        among, with_columns = products[:, :p, :p] / (scale * scale.transpose(0, 2, 1)), products[:, :p, p:] / scale
-        if not np.isfinite(among).all():
-            return np.full_like(products[:, p:, p:], np.nan)
-        absorbed = with_columns.transpose(0, 2, 1) @ np.linalg.solve(among, with_columns)
-        return np.asarray(products[:, p:, p:] - absorbed)
+    `slopes`: of the old readings, and of those of one further run, by coordinates with a standard normal prior; `rows`:
+    those of the run, of which any number are taken, evenly spread. A rival with a value per run has one more there,
+    known as far as its values scatter. NaN if an effect has no finite change.
+    """
+    (true, values), (other, others), (p, k) = truth, rival, (slopes[0].shape[1], rival[0].old.shape[1])
+    own = other.further[rows, :1] * (k * others.std()) if other.of_run else np.zeros((len(rows), 0))
+    after = np.concatenate([slopes[1], other.further[rows], own, true.further[rows] @ values[:, None]], axis=1)
+    absent = np.zeros((len(slopes[0]), own.shape[1]))
+    before = np.concatenate([slopes[0], other.old, absent, true.old @ values[:, None]], axis=1)
+    products = before.T @ before + COUNTS[:, None, None] * (after.T @ after / len(after))
+    if not np.isfinite(products).all():
+        return np.full(len(COUNTS), np.nan)
+    precision = np.concatenate([np.ones(p), np.full(k, _FREE), np.ones(own.shape[1])])
+    fitted, along = products[:, :-1, :-1] + np.diag(precision), products[:, :-1, -1:]
+    scale = np.sqrt(np.einsum("mii->mi", fitted))[:, :, None]  # against rounding
+    among, along = fitted / (scale * scale.transpose(0, 2, 1)), along / scale
+    absorbed = along.transpose(0, 2, 1) @ np.linalg.solve(among, along)
+    return np.asarray(0.5 * (products[:, -1, -1] - absorbed[:, 0, 0]))
 
 
 ALIAS_COSINE = 0.9
@@ -289,18 +208,27 @@ def pairs_with_separating_scans(
     scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])
     if not (pairs and scans):
         return list(pairs)
-    named = {name: entries[name] for name in sorted({name for pair in pairs for name in pair.effects})}
     everywhere = apparatus.plan_of_alternatives(scans, plan)
-    readings = ReadingsWithEffects.of(problem, found, named, usable=usable, plan=everywhere, apparatus=apparatus)
-    sized = {pair.effects: _collinear_amounts(problem, readings, *pair.effects) for pair in pairs}
+    expected, slopes = replace(found.model, plan=everywhere).predict_and_differentiate(found.z)
+    of_run = apparatus.coordinates_of_new_run(found.model)  # a further run has values of its own of these
+    shared, own = slopes / problem.sd, slopes[:, of_run] / problem.sd
+    shared[:, of_run] = 0.0
+    further, known = np.concatenate([shared, own], axis=1), problem.whiten(found.slopes)
+    before = np.concatenate([known, np.zeros((len(known), len(of_run)))], axis=1)
+    columns = {
+        name: _Columns.of(entries[name], problem, found, usable, (everywhere, expected), apparatus)
+        for name in sorted({name for pair in pairs for name in pair.effects})
+    }
+    sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
     best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
-        taken = readings.in_one_run(rows)
         for effects, (one, other) in sized.items():
-            nats = _gained(taken.nats_against(one, other))
+            gained = [
+                nats_against((before, further[rows]), true, rival, rows) for true, rival in ((one, other), (other, one))
+            ]
+            nats = np.min([nats - nats[0] for nats in gained], axis=0)
             if not nats[-1] > NOTHING_NATS:
                 continue
-            nats = np.minimum(nats, _gained(taken.nats_against(other, one)))
             enough = np.flatnonzero(nats >= ENOUGH_NATS)
             needed = int(COUNTS[enough[0]]) if enough.size else MOST_READINGS + 1
             most = float(nats[enough[0] if enough.size else -1])
@@ -310,19 +238,14 @@ def pairs_with_separating_scans(
     return [alias for _, _, alias in best.values()]
 
 
-def _gained(nats: FloatArray) -> FloatArray:
-    return np.asarray(nats - nats[0])
-
-
-def _collinear_amounts(problem: Linearised, readings: ReadingsWithEffects, *names: str) -> list[Amounts]:
+def _collinear_amounts(problem: Linearised, *effects: _Columns) -> list[Amounts]:
     """Return the most collinear changes by two effects, each of lambda 8."""
-    columns = [readings.old.columns[:, readings.of_effect[name]] for name in names]
-    (first, of_first), (second, of_second) = (_projected_basis(problem, c) for c in columns)
+    (first, of_first), (second, of_second) = (_projected_basis(problem, effect.old) for effect in effects)
     if not (first.size and second.size):
-        return [Amounts(name, np.zeros(c.shape[1])) for name, c in zip(names, columns, strict=True)]
+        return [(effect, np.zeros(effect.old.shape[1])) for effect in effects]
     left, _, right = np.linalg.svd(first.T @ second)
     out = []
-    for name, values, own in zip(names, (of_first @ left[:, 0], of_second @ right[0]), columns, strict=True):
-        seen = max(1.0, LEAST_SHARE * float(np.linalg.norm(own @ values)))
-        out.append(Amounts(name, values * (LAMBDA / seen)))
+    for effect, values in zip(effects, (of_first @ left[:, 0], of_second @ right[0]), strict=True):
+        seen = max(1.0, LEAST_SHARE * float(np.linalg.norm(effect.old @ values)))
+        out.append((effect, values * (LAMBDA / seen)))
     return out

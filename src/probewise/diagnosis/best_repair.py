@@ -25,7 +25,7 @@ from probewise.diagnosis.held_out import (
 )
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.noise_memory import walk_given_readings
+from probewise.diagnosis.noise_models import walk_given_readings
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit
 from probewise.diagnosis.search.searched import Searched

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from probewise._arrays import own_arithmetic
-from probewise._kinds import require_like, require_progress, require_rng
+from probewise._kinds import checked_texts, require_like, require_one_of, require_progress, require_rng
 from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
-from probewise.diagnosis.averaging import NullBestAndRepairedSamples, draw_models
 from probewise.diagnosis.best_repair import BestRepair, improvement_and_correction, judged_and_best_repair
 from probewise.diagnosis.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.findings import EffectFound, effects_found, formula_of, noise_found, remainder_of
@@ -33,17 +32,20 @@ from probewise.diagnosis.reason import (
     reason_of,
 )
 from probewise.diagnosis.repair import locate_effects_and_residuals, repair_of
+from probewise.diagnosis.samples import ModelSamples, draw_models, sample_model
 from probewise.diagnosis.search.refits import effects_out_of_vocabulary
-from probewise.diagnosis.search.search import search, search_with_formulas
+from probewise.diagnosis.search.search import MAX_ORDER, search, search_with_formulas
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.diagnosis.sensors import SensorPrior
 from probewise.diagnosis.verdict import GlobalTest, Judged, judge, run_global_test
 from probewise.diagnosis.words import hypothesis_in_words
-from probewise.effects import VOCABULARY, EffectKind
+from probewise.effects import EFFECTS, VOCABULARY, EffectKind, Extent, NamedEffect
 from probewise.effects.effect import require_effect_kinds, sentence_from_samples
+from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
-from probewise.recordings.plan import Recording
+from probewise.recordings.plan import Recording, require_recording
+from probewise.sensor import Stage
 
 Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]]
 """Function that recomputes the evidence of a search; returns it with better probabilities, and both evidences."""
@@ -136,8 +138,8 @@ def diagnosis_of_search(
     test = run_global_test(searched, rng=rng)
     progress("testing the repair on held-out readings")
     judged, best = judged_and_best_repair(searched, test, judge(searched, test), rng=rng)
-    drawn = draw_models(searched, test, judged, best, rng=rng, progress=progress)
-    found = effects_found(searched, judged.hypotheses, best, drawn.best, rng=rng)
+    null_samples, best_samples, repaired = draw_models(searched, test, judged, best, rng=rng, progress=progress)
+    found = effects_found(searched, judged.hypotheses, best, best_samples, rng=rng)
     progress("locating the residuals")
     where = locate_effects_and_residuals(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
     change = np.zeros(len(prepared.usable_rows))
@@ -148,11 +150,11 @@ def diagnosis_of_search(
     asked = choose_next_measurement(
         searched, test.null, unknown_shows_in=next(iter(where), None), is_unknown=judged.verdict == "unknown"
     )
-    noise = noise_found(searched, best, drawn.best, rng=rng)
+    noise = noise_found(searched, best, best_samples, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
-    formula = formula_of(searched, judged, best, drawn.best)
+    formula = formula_of(searched, judged, best, best_samples)
     grounds = replace(
-        _facts_for_reason(searched, test, judged, best, drawn=drawn, found=found, where=where, asked=asked),
+        _facts_for_reason(searched, test, judged, best, samples=best_samples, found=found, where=where, asked=asked),
         nuisances=noise.nuisances,
     )
     reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
@@ -162,7 +164,7 @@ def diagnosis_of_search(
     return Diagnosis(
         recording=prepared.everything,
         judged=judged,
-        repair=repair_of(prepared, best, drawn, change),
+        repair=repair_of(prepared, best, null_samples, repaired, change),
         where=where,
         next_measurement=asked,
         report=VerdictReport(reason, found, noise, weighings, remainder, formula, is_settled=is_settled(searched)),
@@ -176,7 +178,7 @@ def _facts_for_reason(
     judged: Judged,
     best: BestRepair,
     *,
-    drawn: NullBestAndRepairedSamples,
+    samples: ModelSamples,
     found: Sequence[EffectFound],
     where: Sequence[Place],
     asked: NextMeasurement | None,
@@ -185,7 +187,7 @@ def _facts_for_reason(
     orders = searched.posterior.order_probabilities
     beside = searched.likeliest_fit_beside_unknown(test.noise)
     formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
-    columns = [drawn.best.effect_samples(effect.name) for effect in formulas]
+    columns = [samples.effect_samples(effect.name) for effect in formulas]
     settles, apart = _separating_readings_in_words(searched, judged, asked)
     return Grounds(
         words=prepared.apparatus.words,
@@ -232,3 +234,49 @@ def _separating_readings_in_words(
     if len(labels) < 2:  # formulas for one unknown effect
         return None, ""
     return asked.description, ALL if set(labels) == set(named.values()) else " from ".join(labels)
+
+
+def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:
+    """Fit the sensor with these effects, at the SSF order (number of Gaussians) with the largest evidence.
+
+    Parameters
+    ----------
+    recording
+        What was read.
+    names
+        Names of `EFFECTS`, in the vocabulary or out of it; empty for the calibrated sensor alone.
+    rng
+        Source of randomness, for the posterior samples.
+
+    Returns
+    -------
+    ModelSamples
+        The samples; without any effect on the mean if the search kept no refit with all of them, and without the noise
+        effects (but those beyond doubt) if it kept no noise model of just these.
+
+    Raises
+    ------
+    ParameterError
+        If there is no effect of a name, or it cannot act in this recording.
+    """
+    require_recording(recording)
+    require_rng(rng)
+    names = checked_texts("names", names, "names of effects")
+    extent = Extent.of(recording)
+    effects: dict[str, NamedEffect[Any]] = {}
+    for name in names:
+        require_one_of("names", name, list(EFFECTS))
+        effect = EFFECTS[name].for_extent(extent)
+        if effect is None:
+            raise ParameterError("names", name, "effects of the vocabulary that this recording can show")
+        effects[name] = effect
+    prepared = Prepared(recording, effects, None, LightSensorApparatus(), recording)
+    found = search(prepared, max_order=MAX_ORDER, depth=max(len(names), 1))
+    on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
+    on_noise = tuple(sorted(set(names) - set(on_mean)))
+    noise = on_noise if on_noise in found.noise_models else found.certain
+    best = found.best_refit_of(on_mean, noise) or found.best_refit_of((), noise)
+    assert best is not None  # the calibrated sensor is always fitted
+    if not np.isfinite(best.evidence[noise].log_z):
+        raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that this recording can show")
+    return sample_model(best.found, best.evidence[noise], recording, weights=best.weights, rng=rng)

@@ -21,13 +21,12 @@ class PriorOdds:
     Mean: `clean_mean` for no effect, `unknown` for one out of vocabulary, and the rest divided among combinations by
     size (`by_size`), then equally; `unknown_beside` is the share of those with an additional unknown effect. The share
     `out_of_vocabulary` of the unknown is divided among the effects of `RARE_EFFECTS`; the rest has no formula.
-    Noise: `white`, and the rest divided among noise models by size, then equally; with no effect on the mean, the rest
-    has together the probability `not_white_alone`, by default the same.
+    Noise: `white`, and the rest divided among noise models by size, then equally.
     `complexity_penalty` (nats) is the penalty of an effect per Gaussian of the SSF that it makes superfluous, since
     physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is that of an unknown effect.
-    `unknown_explains_most`: an unknown effect is the verdict only if it has more evidence than each named one alone.
-    `named_needs_half`: effects on the mean are `named` only with half the probability, whatever noise is beside them.
-    `shared_is_named`: effects that nearly all hypotheses share are `named`, whatever is open beside them.
+    `named_needs_half`: effects on the mean are `named` only with half the probability, whatever noise is beside, or
+    if nearly all hypotheses share them, whatever is open beside them; an unknown effect is the verdict only if it has
+    more evidence than each named one alone. Otherwise the leading combination is named.
     `unlikely` are effects in places where hardly anything can be missing: each has `unlikely_weight` times the prior
     probability of another one.
     `twofold` are the effects that may occur twice; `twice` is the probability that one does, given that it occurs;
@@ -44,12 +43,9 @@ class PriorOdds:
     unknown_beside: float = 0.01
     white: float = 0.94
     noise_by_size: tuple[float, ...] = (0.057, 0.0028, 0.0002)
-    not_white_alone: float | None = None
     complexity_penalty: float = 8.0
     unknown_complexity_penalty: float = 24.0
-    unknown_explains_most: bool = False
     named_needs_half: bool = False
-    shared_is_named: bool = False
     twice: float | None = None
     twofold: frozenset[str] = frozenset()
     unlikely: frozenset[str] = frozenset()
@@ -118,12 +114,8 @@ class PriorOdds:
         total = sum(believed.values())
         return {(mean, noise): p / total for mean, p in believed.items()}
 
-    def log_prior_on_noise(self, names: Names, *, alone: bool = False) -> float:
-        """Return the log prior of a noise model by its uncertain effects `names`; `alone`: none is on the mean."""
-        not_white = 1 - self.white
-        if alone and self.not_white_alone is not None:
-            not_white = self.not_white_alone
+    def log_prior_on_noise(self, names: Names) -> float:
+        """Return the log prior of a noise model by its uncertain effects `names`."""
         if not names:
-            return math.log1p(-not_white)
-        share = self.noise_by_size[len(names) - 1] / (1 - self.white)
-        return math.log(not_white * share / math.comb(self.n_noises, len(names)))
+            return math.log(self.white)
+        return math.log(self.noise_by_size[len(names) - 1] / math.comb(self.n_noises, len(names)))

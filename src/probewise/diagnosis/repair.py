@@ -10,12 +10,11 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, read_only_floats
-from probewise.diagnosis.averaging import NullBestAndRepairedSamples
 from probewise.diagnosis.best_repair import BestRepair, Improvement
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.locate import Place, places_of_effect, significant_places
-from probewise.diagnosis.noise_memory import walk_given_readings
+from probewise.diagnosis.noise_models import walk_given_readings
 from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.search.searched import Searched
@@ -137,11 +136,12 @@ class Repair:
         return tuple(out)
 
 
-def repair_of(prepared: Prepared, best: BestRepair, drawn: NullBestAndRepairedSamples, change: FloatArray) -> Repair:
+def repair_of(
+    prepared: Prepared, best: BestRepair, null: ModelSamples, repaired: ModelSamples, change: FloatArray
+) -> Repair:
     """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
 
-    `prepared`, `best`, `drawn`: input of the search; the best fit; samples of the models; `change`: correction of the
-    predictions of the readings that are used, (n_usable,), 0 if there is none.
+    `change`: correction of the predictions of the readings that are used, (n_usable,), 0 if there is none.
     """
     everything, law = prepared.everything, best.problem.law
     used = prepared.usable_rows_of_everything
@@ -161,7 +161,7 @@ def repair_of(prepared: Prepared, best: BestRepair, drawn: NullBestAndRepairedSa
         return PredictionAndResiduals(predicted, prepared.expand_usable_to_all_rows(left - walk[used]), walk)
 
     before, after = shown(best.calibrated, np.zeros(len(everything))), shown(best.repaired, by_rows)
-    return Repair(drawn.null, drawn.repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
+    return Repair(null, repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
 
 
 _SAME = 0.8  # overlap from which two places hold the same rows

@@ -1,32 +1,42 @@
-"""Posterior samples of a model with its effects: the models that a diagnosis returns."""
+"""Posterior samples of a model with its effects, of one hypothesis or averaged over several: what a diagnosis returns.
+
+Predictions must include the uncertainty between hypotheses: for readings unlike the recorded ones, the most probable
+explanation alone would be overconfident.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import PurePath
 from typing import Any, cast
 
 import numpy as np
+from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
 from probewise.calibration.fields import choose_pixel_mm, gaussians_sorted_by_mass, posterior_mean_ssf_field
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
+from probewise.diagnosis.best_repair import BestRepair, predicts_far_worse
 from probewise.diagnosis.evidence import Linearised, NoiseEvidence
-from probewise.diagnosis.fit import FARTHEST, Fit, Predictor, effect_values
+from probewise.diagnosis.fit import FARTHEST, Fit, Null, Predictor, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.posterior import posterior_draws
+from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.search.refits import WeighedFit, effects_out_of_vocabulary
+from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_by_label, templates_of_effect
+from probewise.diagnosis.verdict import GlobalTest, Judged
 from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect
 from probewise.effects.noise import Quantisation, sd_of_estimated_lattice_step
 from probewise.effects.reference import origins_of
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.progress import Progress, silent
 from probewise.recordings import fingerprint
-from probewise.recordings.plan import Recording
-from probewise.sensor import ACCURATE_NODES, Chain
+from probewise.recordings.plan import Plan, Recording
+from probewise.sensor import ACCURATE_NODES, Chain, footprint_of
 
 
 def weights_beside_other_effects(
@@ -245,3 +255,196 @@ def _median_step_mm(recording: Recording) -> float:
     moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
     moves = moves[moves > rounding_error(np.append(plan.x_mm, plan.y_mm))]
     return float(np.median(moves)) if moves.size else max(Extent.of(recording).length_mm / 100, 1e-6)
+
+
+def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
+    """Return whether hypotheses of these effects can be combined in one model.
+
+    Shared effects must change readings alike, bound to the same scans; all others need parameters at which they change
+    nothing.
+    """
+    known = {effect.name: effect for effect in first}
+    shared = {effect.name for effect in second if effect.name in known}
+    alike = all(_change_readings_alike(known[effect.name], effect) for effect in second if effect.name in shared)
+    return alike and all(effect.nothing for effect in (*first, *second) if effect.name not in shared)
+
+
+def _change_readings_alike(one: NamedEffect[Any], other: NamedEffect[Any]) -> bool:
+    """Return whether effects are equal, or variants of one form with the same action: these differ in priors alone."""
+    act = getattr(one, "act", None)
+    return one == other or (act is not None and act is getattr(other, "act", None))
+
+
+def mix(
+    parts: Sequence[ModelSamples], shares: FloatArray, null: Null, plan: Plan, *, rng: np.random.Generator
+) -> ModelSamples:
+    """Mix samples of several hypotheses, or numbers of Gaussians, by their probability, in one model with all effects.
+
+    All are converted to the largest number of Gaussians, by splitting Gaussians into two equal halves. In samples of a
+    hypothesis without an effect, the effect's parameters change nothing and `absent` marks it.
+
+    `parts`: samples of each, in equal numbers; they fit in one model (`can_share_one_model`); `shares`: probability of
+    each, (n_parts,); `null`: the model without effects, that of the part with the most Gaussians.
+    """
+    largest = max(parts, key=lambda part: part.n_gaussians)
+    effects = {e.name: e for part in parts for e in cast(Sequence[NamedEffect[Any]], part.chain.effects)}
+    chain = null.chain(plan, tuple(effects.values()), n_nodes=ACCURATE_NODES)
+    n, names = len(largest.theta), [effect.name for effect in chain.effects]
+    samples = []
+    for part, count in zip(parts, rng.multinomial(n, shares / shares.sum()), strict=True):
+        rows = rng.permutation(n)[:count]
+        head = len(part.chain.names) - sum(part.effect_samples(name).shape[1] for name in names)
+        columns = [_with_more_gaussians(part.theta[rows, :head], part.n_gaussians, largest.n_gaussians)]
+        for name in names:
+            holder = next(other for other in (part, *parts) if name in other.effects)
+            own = holder.effect_samples(name)[rows]
+            if holder is not part:
+                for k, value in (effects[name].nothing or {}).items():
+                    own[:, k] = value
+            columns.append(own)
+        absent = np.tile([name not in part.effects for name in names], (count, 1))
+        samples.append((np.concatenate(columns, axis=1), part.noise_sd[rows], absent))
+    order = rng.permutation(n)
+    theta, noise_sd, absent = (np.concatenate(column)[order] for column in zip(*samples, strict=True))
+    marks = {name: absent[:, k] for k, name in enumerate(names) if absent[:, k].any()}
+    return replace(largest, chain=chain, theta=theta, noise_sd=noise_sd, effects=tuple(names), absent=marks)
+
+
+def _with_more_gaussians(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
+    """Convert each sample's mixture to more Gaussians, by halving the heaviest."""
+    blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
+    rows = np.arange(len(theta))
+    for n in range(n_gaussians, wanted):
+        heaviest = np.argmax(footprint_of(blocks.reshape(len(theta), 6 * n), n).weight[:, 0], axis=1)
+        half = blocks[rows, heaviest].copy()
+        half[:, 0] /= 2
+        blocks = np.concatenate([blocks, half[:, None, :]], axis=1)
+        blocks[rows, heaviest, 0] /= 2
+    return np.concatenate([blocks.reshape(len(theta), 6 * wanted), theta[:, 6 * n_gaussians :]], axis=1)
+
+
+_LEAST_OF_AN_ORDER = 0.2  # probability below which an SSF order is left out of the average
+_LEAST_OF_A_RIVAL = 0.02  # probability below which a hypothesis is left out of the average
+_MOST = 6  # hypotheses in one model
+_LEAST_DOUBT = 0.1  # least weight of the null when an unknown effect is repaired by its most similar form
+_DOUBT_BESIDE = 0.5  # weight of the null for a named effect with an unknown effect beside it
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisSamples:
+    """Cached posterior samples of the hypotheses of a search under one noise model.
+
+    Only hypotheses with SSFs of one form can be averaged: all mixtures of Gaussians, or all free forms.
+    """
+
+    searched: Searched
+    noise: Names
+    rng: np.random.Generator
+    progress: Progress = silent
+    _known: dict[WeighedFit, ModelSamples] = field(default_factory=dict)
+
+    def compatible_probabilities(self, best: WeighedFit) -> dict[Names, float]:
+        """Return the probability of each refitted hypothesis whose SSF has the best candidate's form; sum one.
+
+        They are those of the verdict, over all noise models, so that samples contain what it says as often as it says.
+        A user's own effects are excluded unless the best candidate has them, since a file cannot hold them.
+        """
+        prepared, by_mean = self.searched.prepared, self.searched.posterior.marginal_over_noise
+        own = prepared.apparatus.user_effect_names(prepared.effects)
+        out = {
+            names: by_mean.get(names, 0.0)
+            for names in dict.fromkeys(names for _, names in self.searched.evidences.fits)
+            if self._candidates_of_same_form(best, names) and not own & ({*names} - {*best.names})
+        }
+        total = sum(out.values())
+        return {names: p / total for names, p in out.items()} if total > 0 else {best.names: 1.0}
+
+    def averaged(self, best: WeighedFit, probabilities: Mapping[Names, float] | None = None) -> ModelSamples:
+        """Average samples of a candidate's hypothesis over its numbers of Gaussians, and over its most probable rivals.
+
+        Without `probabilities` there are no rivals. At most six hypotheses; those of a probability below 0.02 are left
+        out.
+        """
+        probabilities = probabilities or {best.names: 1.0}
+        kept = [(best, probabilities[best.names])]
+        rivals = [names for names in probabilities if names != best.names]  # no set: equal ones keep their order
+        for names in sorted(rivals, key=lambda names: -probabilities[names]):
+            if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST:
+                break
+            rival = max(self._candidates_of_same_form(best, names), key=lambda c: c.evidence[self.noise].log_z)
+            if all(can_share_one_model(c.found.model.effects, rival.found.model.effects) for c, _ in kept):
+                kept.append((rival, probabilities[names]))
+        parts = [(self._samples_of(c), p * share) for own, p in kept for c, share in self._orders(own)]
+        if len(parts) == 1:
+            return parts[0][0]
+        null = self.searched.nulls[max(part.n_gaussians for part, _ in parts)]
+        plan = self.searched.prepared.recording.plan
+        return mix([part for part, _ in parts], np.array([share for _, share in parts]), null, plan, rng=self.rng)
+
+    def _orders(self, candidate: WeighedFit) -> list[tuple[WeighedFit, float]]:
+        """List the fits of a candidate's hypothesis with probable numbers of Gaussians, and the share of each."""
+        alike = self._candidates_of_same_form(candidate, candidate.names)
+        noises = [c.possible_noise(self.noise) for c in alike]
+        log_z = np.array([c.evidence[noise].log_z for c, noise in zip(alike, noises, strict=True)])
+        shares = np.exp(log_z - logsumexp(log_z))
+        kept = (shares > _LEAST_OF_AN_ORDER) & np.array([noise == noises[int(np.argmax(log_z))] for noise in noises])
+        return [(alike[k], float(shares[k] / shares[kept].sum())) for k in np.flatnonzero(kept)]
+
+    def _candidates_of_same_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
+        """List the refits of a combination whose SSF has the best candidate's form, one per number of Gaussians."""
+        form = best.found.model.sensor.has_exchangeable_gaussians
+        return [
+            c
+            for (_, key), c in self.searched.evidences.fits.items()
+            if key == names and c.found.model.sensor.has_exchangeable_gaussians == form
+        ]
+
+    def _samples_of(self, candidate: WeighedFit) -> ModelSamples:
+        if candidate not in self._known:
+            evidence = candidate.evidence[candidate.possible_noise(self.noise)]
+            self._known[candidate] = sample_model(
+                candidate.found, evidence, self.searched.prepared.recording,
+                weights=candidate.weights, rng=self.rng, progress=self.progress,
+            )  # fmt: skip
+        return self._known[candidate]
+
+
+def draw_models(
+    searched: Searched,
+    test: GlobalTest,
+    judged: Judged,
+    best: BestRepair,
+    *,
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> tuple[ModelSamples, ModelSamples, ModelSamples]:
+    """Draw from the posteriors of the null, of the best hypothesis, and of the repaired model, an average of several.
+
+    It is over those that the verdict leaves open: the best one alone would be overconfident if the effect is unknown,
+    or if it leads by little.
+    """
+    cached, fit, null = HypothesisSamples(searched, best.noise, rng, progress), best.fit, test.null
+    model = samples = cached.averaged(fit)
+    if judged.verdict == "unknown":
+        doubt = _DOUBT_BESIDE
+        if best.out_of_vocabulary:
+            doubt = max(1 - searched.posterior.marginal_over_noise[best.out_of_vocabulary], _LEAST_DOUBT)
+        model = cached.averaged(fit, {fit.names: 1 - doubt, (): doubt})
+    elif judged.verdict in ("named", "cannot_tell") and fit.names:
+        model = cached.averaged(fit, cached.compatible_probabilities(fit))
+    elif not (judged.too_little or judged.withdrawn):
+        model = _average_of_named_and_null(cached, searched, test, best.noise)
+    return samples if fit is null else cached.averaged(null), samples, model
+
+
+def _average_of_named_and_null(
+    cached: HypothesisSamples, searched: Searched, test: GlobalTest, noise: Names
+) -> ModelSamples:
+    """Average over named hypotheses by probability, and the null for the rest, where the verdict names no effect."""
+    by_mean = searched.posterior.marginal_over_noise
+    named = [names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)]
+    fit = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
+    if fit.names and predicts_far_worse(BestRepair.of(searched, test, fit, noise, rng=cached.rng).improvement):
+        return cached.averaged(test.null)
+    shares = {names: by_mean.get(names, 0.0) for names in cached.compatible_probabilities(fit) if names}
+    return cached.averaged(fit, {**shares, (): max(1 - sum(shares.values()), 0.0)})

@@ -246,14 +246,6 @@ _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
 _MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
-# Prior odds of one, two, three effects on the mean, and of white noise beside them. A second effect is as likely as a
-# fault of the noise, of which a walk takes up much of what a second effect does. Both are so rare that one effect holds
-# the credible set alone where the readings are clear; what is there and visible has far more evidence than that costs.
-_BY_SIZE = (0.329, 0.01, 0.001)
-_WHITE = 0.97
-# Probability that the noise is not white where the law is complete: one departure of a recording, of its law or of its
-# noise, is more likely than one of each.
-_NOT_WHITE_ALONE = 0.2
 _TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
 # Of a term in a rate that is another state by definition, such as that of a position; of a jump at a row of a table
 # that an input sorts; and of a curve of a column that drives the simulator, what is wrong with which has names of its
@@ -367,18 +359,11 @@ class SimulatorApparatus(Apparatus):
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
-        usual = PriorOdds.for_effects(effects)
         curves = {f"curve:{name.removeprefix('input_gain:')}" for name in effects if name.startswith("input_gain:")}
         return replace(
-            usual,
-            by_size=_BY_SIZE,
-            white=_WHITE,
-            noise_by_size=tuple((1 - _WHITE) / (1 - usual.white) * share for share in usual.noise_by_size),
-            not_white_alone=_NOT_WHITE_ALONE,
+            PriorOdds.for_effects(effects),
             twice=_TWICE,
-            unknown_explains_most=True,
             named_needs_half=True,
-            shared_is_named=True,
             unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects) | curves,
             unlikely_weight=_UNLIKELY,
         )

@@ -126,12 +126,24 @@ class TemplateBank:
             norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
             per_column = np.repeat(self.widths, self.widths)
             whitened *= np.sqrt(law.n_kept / per_column) / np.where(norms > 0, norms, 1.0)
-            products = {}
-            for width in map(int, np.unique(self.widths)):
-                blocks = whitened[:, self._template_and_column_indices(width)[1]].transpose(1, 0, 2)
-                products[width] = blocks.transpose(0, 2, 1) @ blocks
-            self._whitened[key] = _WhitenedTemplatesAndGrams(whitened, products)
+            ends = np.append(np.flatnonzero(np.diff(self.widths)) + 1, len(self.widths))
+            products: dict[int, list[FloatArray]] = {}
+            for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
+                width, begin = int(self.widths[first]), int(self._first_columns[first])
+                columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
+                products.setdefault(width, []).append(_gram_matrices(columns))
+            grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
+            self._whitened[key] = _WhitenedTemplatesAndGrams(whitened, grams)
         return self._whitened[key]
+
+
+def _gram_matrices(columns: FloatArray) -> FloatArray:
+    """Return the products of the columns of each template, (n_points, n, width) -> (n, width, width)."""
+    if columns.shape[2] > 2:
+        blocks = columns.transpose(1, 0, 2)
+        return np.asarray(blocks.transpose(0, 2, 1) @ blocks)
+    each = [columns[:, :, k] for k in range(columns.shape[2])]  # without a copy of all columns
+    return np.array([[np.einsum("nt,nt->t", a, b) for a in each] for b in each]).transpose(2, 0, 1)
 
 
 def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -35,6 +35,9 @@ _MOST_GROUPS = 24
 _N_STEPS = 15  # change points of a covariate
 _FEW_SCANS = 6
 _MEMORIES = (3.0, 10.0, 30.0)  # readings
+_TERMS = (3, 8, 20)  # of smooth functions; of a gain or a displacement the first two
+_TERMS_IN_TIME = (3, 8, 24, 64)  # where a wave may be of any frequency
+_WINDOWS = (4, 8, 16)  # parts of a covariate
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,41 +162,38 @@ def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterat
     elif covariate.scan is not None:
         yield _cosine_bases(covariate, ways.adds, 6)
         yield _cosine_bases(covariate, ways.shift, 3)
-        yield from _window_bases(covariate, ways.adds, (4, 8, 16) if ways.n_scans <= _FEW_SCANS else (8,))
+        yield from _window_bases(covariate, ways.adds, _WINDOWS if ways.n_scans <= _FEW_SCANS else _WINDOWS[1:2])
     elif covariate.name == "place":
-        for terms in (3, 8, 20):
-            yield _cosine_bases(covariate, ways.adds, terms)
-            yield _cosine_bases(covariate, ways.shift, terms)
-        yield _cosine_bases(covariate, ways.gain, 3)
-        yield _cosine_bases(covariate, ways.gain, 8)
+        yield from _smooth_bases(covariate, _TERMS, ways.adds, ways.shift)
+        yield from _smooth_bases(covariate, _TERMS[:2], ways.gain)
         yield _cosine_bases(covariate, ways.turned, 3)
         yield _cosine_bases(covariate, ways.turned * ways.shift, 3)
         yield from _step_bases(covariate, ways.shift)
-        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
+        yield from _window_bases(covariate, ways.adds, _WINDOWS)
     elif covariate.name == "time":
-        for terms in (3, 8, 24, 64):
-            yield _cosine_bases(covariate, ways.adds, terms)
+        yield from _smooth_bases(covariate, _TERMS_IN_TIME, ways.adds)
         for way in (ways.gain, ways.shift):
-            yield _cosine_bases(covariate, way, 3)
-            yield _cosine_bases(covariate, way, 8)
+            yield from _smooth_bases(covariate, _TERMS[:2], way)
             yield from _step_bases(covariate, way)
         yield from _step_bases(covariate, ways.adds)
-        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
+        yield from _window_bases(covariate, ways.adds, _WINDOWS)
     elif covariate.name in ("level", "edge_distance"):
-        for terms in (3, 8, 20):
-            yield _cosine_bases(covariate, ways.adds, terms)
+        yield from _smooth_bases(covariate, _TERMS, ways.adds)
         side = np.where(ways.gain > 0.5 * ways.gain.max(), 1.0, -1.0)
-        yield _cosine_bases(covariate, side * ways.adds, 8)
+        yield _cosine_bases(covariate, side * ways.adds, _TERMS[1])
         yield _cosine_bases(covariate, ways.turned, 3)
-        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
+        yield from _window_bases(covariate, ways.adds, _WINDOWS)
     elif covariate.name == "slope":
         yield _cosine_bases(covariate, ways.adds, 3)
         yield _on_all_rows(covariate.values[:, None], covariate, len(ways.adds))
         yield _on_all_rows(np.abs(covariate.values)[:, None], covariate, len(ways.adds))
     else:  # a logged column of the recording
         for way in (ways.adds, ways.gain):
-            yield _cosine_bases(covariate, way, 3)
-            yield _cosine_bases(covariate, way, 8)
+            yield from _smooth_bases(covariate, _TERMS[:2], way)
+
+
+def _smooth_bases(covariate: Covariate, terms: Sequence[int], *ways: FloatArray) -> Iterator[FloatArray]:
+    yield from (_cosine_bases(covariate, way, n) for n in terms for way in ways)
 
 
 def _group_bases(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:

@@ -236,7 +236,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
     )
     if (
         verdict == "unknown"
-        and searched.prior.unknown_explains_most
+        and searched.prior.named_needs_half
         and credible_labels(hypotheses) != ("unknown",)  # otherwise nothing named is left to lead instead
         and searched.evidences.one_name_outweighs_unnamed()
     ):
@@ -254,7 +254,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
         unknown_shares=searched.probabilities_of_unknown_forms(besides=rare),
         too_little=prepared.has_too_little_data,
     )
-    if searched.prior.shared_is_named and not judged.too_little:
+    if searched.prior.named_needs_half and not judged.too_little:
         judged = with_shared_effects(judged, prepared.pure_noise_effect_names, certain=frozenset(searched.certain))
     return judged
 

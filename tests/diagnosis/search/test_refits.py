@@ -317,7 +317,7 @@ def test_the_curve_of_a_slow_column_is_tried_before_a_walk_takes_what_it_explain
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + 0 * u["temp"], time="t_s")
     state = _state(prepare_system(simulator, table))
     assert state.refits.likeliest_law(state.null).has_memory
-    monkeypatch.setattr(stepwise, "LEADING_PLAINLY", 0)
+    monkeypatch.setattr(stepwise, "_LEADING_PLAINLY", 0)
     assert [proposal.added for proposal in stepwise._proposals_under_simplest_noise(state, state.null)] == [
         "curve:temp"
     ]

@@ -63,7 +63,7 @@ def test_orders_are_averaged_over_noises_by_the_prior_of_the_noise():
         (n, ()): Fit(evidence={noise: SimpleNamespace(log_z=log_z) for noise, log_z in own.items()})
         for n, own in by_noise.items()
     }
-    weight = {noise: math.exp(PRIOR.log_prior_on_noise(noise, alone=True)) for noise in ((), ("outliers",))}
+    weight = {noise: math.exp(PRIOR.log_prior_on_noise(noise)) for noise in ((), ("outliers",))}
     first, second = (sum(weight[noise] * math.exp(z) for noise, z in by_noise[n].items()) for n in (1, 2))
     found = posterior_of(Evidences(fits), PRIOR, certain=(), n_forms=2).order_probabilities
     assert found[1] == pytest.approx(first / (first + second))

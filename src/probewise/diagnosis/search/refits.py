@@ -23,17 +23,6 @@ from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_st
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.noise_models import HIDDEN, NoiseModel, least_sd_given_rounding, rough_sd
 from probewise.diagnosis.prior_odds import Names, PriorOdds
-from probewise.diagnosis.search.constants import (
-    ALIASED_NATS,
-    FEW_VARIANTS,
-    HOPELESS,
-    MOST_FAULTS,
-    NOISE_NODES_REFINED_WITHIN,
-    NOISE_PAIR_WITHIN,
-    SAME_MODE,
-    STEERING,
-    VARIANTS_TRIED,
-)
 from probewise.diagnosis.templates import (
     EffectTemplates,
     TemplateBank,
@@ -47,6 +36,23 @@ from probewise.effects.noise import CorrelatedNoise, Quantisation, RandomWalk, l
 from probewise.effects.priors import SharedScalePrior
 from probewise.errors import NotConvergedError
 from probewise.recordings.plan import Recording
+
+# Nats that are expected between two hypotheses, below which readings do not tell them apart: the contract's odds of 20
+# to 1. What has no name was believed half again as often as it was true, 371 times for 250, nearly always where one
+# name had made as much of the readings to within these three nats. As far behind the best, a noise model, SSF order or
+# proposal does not say what to refit next; at a cost: what looked worse by three nats before a refit was seen to be
+# better by eight after it.
+ALIASED_NATS = 3.0
+EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
+SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005
+# Nats behind the best refit of a law: a fit that stays so far behind is given up. Where an effect gains hundreds of
+# nats, others gain some of them slowly, and most steps of a search were theirs.
+_HOPELESS = 40.0
+_FEW_VARIANTS = 2  # of an effect, which are all refitted: screening is no judge of a bound
+_VARIANTS_TRIED = 0.05  # of the leading variant's weight: the next, of an effect bound to scans, is refitted too
+_MOST_FAULTS = 3  # of the noise at once
+# Nats behind the best to which refined nodes must be able to raise a noise model: further back it does not count.
+_NOISE_NODES_REFINED_WITHIN = 10.0
 
 
 def or_impossible(log_z: float) -> float:
@@ -139,7 +145,7 @@ class WeighedFit:
         A missing effect on the mean can look like any noise effect, and be detectable under white noise only.
         """
         best, plain = self.log_z, min(self.evidence, key=len)
-        return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
+        return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - ALIASED_NATS)
 
 
 def expected_log_bayes_factor(first: WeighedFit, second: WeighedFit) -> float:
@@ -228,7 +234,7 @@ class NoiseModels:
         evidence = {names: laplace_evidence(found, model) for names, model in self.models.items()}
         best = max((e.log_z + self.log_prior(names) for names, e in evidence.items()), default=-math.inf)
         return {
-            names: refined(found, own, least=best - self.log_prior(names) - NOISE_NODES_REFINED_WITHIN)
+            names: refined(found, own, least=best - self.log_prior(names) - _NOISE_NODES_REFINED_WITHIN)
             for names, own in evidence.items()
         }
 
@@ -244,11 +250,11 @@ class NoiseModels:
         Returns whether any pair was tried.
         """
         known, singles = dict(evidence), list(evidence)
-        for size in range(1, MOST_FAULTS):
+        for size in range(1, _MOST_FAULTS):
             of_size = {names: e for names, e in known.items() if len(self._uncertain_names(names)) == size}
             first = max(of_size, key=lambda names: of_size[names].log_z, default=self.certain)
             parts = [n for n in known if set(n) < set(first)]
-            if not parts or known[first].log_z < max(known[n].log_z for n in parts) + NOISE_PAIR_WITHIN:
+            if not parts or known[first].log_z < max(known[n].log_z for n in parts) + ALIASED_NATS:
                 return size > 1
             # Beside another effect the likeliest values may be others: nodes about them alone would lie too close.
             of_first = laplace_evidence(found, self.models[first])
@@ -260,7 +266,7 @@ class NoiseModels:
                     continue
                 coarse = self.models[other].coarse_nodes_by_effect()
                 nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
-                least = best - NOISE_PAIR_WITHIN - self.log_prior(both)
+                least = best - ALIASED_NATS - self.log_prior(both)
                 own = refined(found, nearby, least=least)
                 if own.log_z > least:
                     recentred = self._nodes_beside(found, nearby, self._uncertain_names(first))
@@ -489,7 +495,7 @@ class Refits:
         """
         if not model.sensor.predicts_cheaply_nearby:
             return math.inf
-        return min((candidate.found.objective for candidate, _ in self.known.values()), default=math.inf) + HOPELESS
+        return min((candidate.found.objective for candidate, _ in self.known.values()), default=math.inf) + _HOPELESS
 
     def _refit_variant(
         self,
@@ -524,7 +530,7 @@ class Refits:
             plain = self.noises.certain
             for about, scores in seen[1:]:
                 promised = parent.evidence[plain].log_z + log_mean_exp(scores)
-                if fitted[0].evidence[plain].log_z < promised - STEERING:
+                if fitted[0].evidence[plain].log_z < promised - ALIASED_NATS:
                     fitted.append(self.fit_and_weigh(model, np.stack(starts), about.law, beyond=parent))
         return max(fitted, key=lambda candidate: self.noises.average_log_evidence(candidate.log_z_by_noise))
 
@@ -573,9 +579,9 @@ def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[
 
     All of one or two; of more, the best, and the next too if bound to scans and of a twentieth of the best's weight.
     """
-    if len(weights) <= FEW_VARIANTS:
+    if len(weights) <= _FEW_VARIANTS:
         return [int(k) for k in np.argsort(-weights)]
     # Two scans of opposite direction are aliased to first order; a refit shows which one was turned.
     first, *others = np.argsort(-weights)[:2].tolist()
     bound = templates.variants[first].scans or templates.variants[first].patterns
-    return [first, *(k for k in others if bound and weights[k] > VARIANTS_TRIED * weights[first])]
+    return [first, *(k for k in others if bound and weights[k] > _VARIANTS_TRIED * weights[first])]

@@ -24,18 +24,10 @@ from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
-from probewise.diagnosis.search.constants import (
+from probewise.diagnosis.search.refits import (
     ALIASED_NATS,
     EXTENDED_WITHIN,
-    FEW_READINGS,
-    MAX_ORDER,
-    MOST_REFITTED_LATE,
-    NULL_TRIED_AGAIN,
-    REFITTED_LATE,
     SAME_MODE,
-    WITH_UNKNOWN,
-)
-from probewise.diagnosis.search.refits import (
     WITH_MEMORY,
     NoiseModels,
     Refits,
@@ -57,6 +49,15 @@ from probewise.diagnosis.templates import TemplateBank, TemplateCache, log_bayes
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
 from probewise.effects import PROPOSAL, NamedEffect, NoiseEffect
 from probewise.progress import Progress, silent
+
+MAX_ORDER = 3
+"""Gaussians of the SSF that are tried; one more where that is not far behind."""
+
+_FEW_READINGS = 40  # usable readings below which one Gaussian is tried, and no free form
+_NULL_TRIED_AGAIN = 2  # fits of one effect from which a given null is fitted once more
+_REFITTED_LATE = 0.02  # probability by screening alone, from which on a combination is refitted
+_MOST_REFITTED_LATE = 6  # such combinations
+_WITH_UNKNOWN = 4  # refitted combinations that something unknown is weighed beside
 
 Key = tuple[int, Names]
 
@@ -195,7 +196,7 @@ def search(
     """
     recording, effects = prepared.recording, prepared.effects
     if max_order is None:
-        max_order = 1 if len(prepared.usable_rows) < FEW_READINGS else MAX_ORDER
+        max_order = 1 if len(prepared.usable_rows) < _FEW_READINGS else MAX_ORDER
     prior = prior or prepared.apparatus.prior_odds(effects)
     on_mean = {name: effect for name, effect in effects.items() if name not in prepared.noise_effect_names}
     on_noise = {name: cast(NoiseEffect, effect) for name, effect in effects.items() if name not in on_mean}
@@ -257,7 +258,7 @@ def search(
     state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, noises)
     progress("weighing what has no name")
     refitted = [c for c in state.candidates.values() if c.names]
-    unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
+    unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
     unknown.drop_superfluous(state.candidates.values())
     return Searched(
         prepared,
@@ -282,12 +283,12 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
     """
     shortfalls: list[float] = []
     screened = set[WeighedFit]()
-    while len(shortfalls) < MOST_REFITTED_LATE:
-        progress("refitting what screening believes in", len(shortfalls), MOST_REFITTED_LATE)
+    while len(shortfalls) < _MOST_REFITTED_LATE:
+        progress("refitting what screening believes in", len(shortfalls), _MOST_REFITTED_LATE)
         by_mean = posterior().marginal_over_noise
         settled = {(), ("unknown",)} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
-        if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
+        if by_mean.get(names, 0.0) <= _REFITTED_LATE or not names:
             return
         part = state.largest_refitted_part(names)
         if state.null_is_given and part.names and part not in screened:
@@ -307,7 +308,7 @@ def _refit_null_from_effects(state: SearchState) -> None:
     """
     null = state.null
     single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
-    for candidate in sorted(single, key=lambda c: -c.log_z)[:NULL_TRIED_AGAIN]:
+    for candidate in sorted(single, key=lambda c: -c.log_z)[:_NULL_TRIED_AGAIN]:
         start = candidate.found.z[: null.found.model.sensor.n_params]
         again = state.refits.fit_and_weigh(null.found.model, start[None, :], candidate.law)
         if again.log_z > state.null.log_z + SAME_MODE:

@@ -15,8 +15,8 @@ from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
-from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.refits import (
+    ALIASED_NATS,
     Refits,
     WeighedFit,
     effects_out_of_vocabulary,
@@ -133,7 +133,7 @@ class Evidences:
             return False
         null = max(nulls, key=lambda fit: fit.evidence[noise].log_z)
         least = null.evidence[noise].log_z
-        odds = prior.log_prior_on_noise((Outliers.name,), alone=True) - prior.log_prior_on_noise((), alone=True)
+        odds = prior.log_prior_on_noise((Outliers.name,)) - prior.log_prior_on_noise(())
         rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
         if not rivals or not least - max(fit.evidence[certain].log_z for fit in nulls) + odds > _BEYOND_DOUBT:
             return False
@@ -204,11 +204,11 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
     for (names, noise), value in evidences.screened.items() if not outlying else ():
         log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
 
-    def log_prior_on_noise(noise: Names, *, alone: bool) -> float:
-        return prior.log_prior_on_noise(tuple(n for n in noise if n not in certain), alone=alone)
+    def log_prior_on_noise(noise: Names) -> float:
+        return prior.log_prior_on_noise(tuple(n for n in noise if n not in certain))
 
     for names, noise in log_p:
-        log_p[names, noise] += -math.log(n_forms) + log_prior_on_noise(noise, alone=not names)
+        log_p[names, noise] += -math.log(n_forms) + log_prior_on_noise(noise)
     # Exact aliases differ by how far their fits went: within a hundredth of a nat they tie. Of those that tie the one
     # with fewer effects, on a reading before a parameter or a rate, comes first.
     level = math.inf
@@ -219,7 +219,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
     total = float(logsumexp(list(log_p.values())))
     nulls = {n: fit for (n, names), fit in evidences.fits.items() if not names}
     clean_by_order = {
-        n: float(logsumexp([e.log_z + log_prior_on_noise(noise, alone=True) for noise, e in fit.evidence.items()]))
+        n: float(logsumexp([e.log_z + log_prior_on_noise(noise) for noise, e in fit.evidence.items()]))
         for n, fit in nulls.items()
     }
     norm = float(logsumexp(list(clean_by_order.values())))

@@ -112,7 +112,7 @@ def test_medians_and_sds_are_those_of_a_long_chain(name):
     found = fit_simulator(_strd(name), given["columns"], rng=np.random.default_rng(3)).fitted
     center, certified = (np.array([given[each][n] for n in found.names]) for each in ("value", "sd"))
     np.testing.assert_allclose((np.median(found.samples, axis=0) - center) / certified, median, atol=0.2 * max(sd))
-    np.testing.assert_allclose(found.samples.std(axis=0) / certified, sd, rtol=0.15)  # of 2,000 samples with heavy tails
+    np.testing.assert_allclose(found.samples.std(axis=0) / certified, sd, rtol=0.15)  # some have heavy tails
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-9])

@@ -1,6 +1,6 @@
 """Hold `calibrate(quick=True)` against itself over seeds, and against nested sampling of every order.
 
-python benchmarks/quick_calibration.py --seeds 12 --sensors 2 --seed 28 --out docs/results/quick_calibration.json
+python benchmarks/quick_calibration.py --seeds 12 --sensors 2 --seed 28 --out quick_calibration.json
 
 `--seeds` quick calibrations of the shipped paper recording, or of `--recording`, tell whether the stated errors cover
 the scatter: chi-square a run, about the log of the mean evidence. `--sensors` concealed sensors of one Gaussian, and
@@ -31,8 +31,7 @@ from probewise.calibration.coverage import (
     interval_holds_truth_by_quantity,
     simulate_paper_recording,
 )
-from probewise.calibration.order_problems import ProblemsByOrder
-from probewise.calibration.order_search import search_prior_of_order
+from probewise.calibration.search import ProblemsByOrder, search_prior_of_order
 from probewise.errors import DoubtfulResultWarning
 from probewise.recordings import Recording, paper_plan, read_recording, shipped, two_way_plan, write_text_atomically
 from probewise.world import Blob, World, gaussian_spot

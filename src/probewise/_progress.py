@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, NamedTuple, Never
+from typing import NamedTuple, Never
 
 from tqdm import tqdm
 
@@ -15,9 +15,6 @@ from probewise._kinds import require_progress
 from probewise.errors import printable
 from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
-
-if TYPE_CHECKING:
-    from probewise.calibration import TemperatureSummary
 
 _PATIENCE_S = 2.0  # shorter work shows no bar
 _BETWEEN_LINES_S = 5.0
@@ -82,17 +79,14 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         yield progress
 
 
-def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary | TemperatureSummary], None]:
-    """Return a function (run, summary) that reports the state of nested sampling or SMC to a progress function.
+def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary], None]:
+    """Return a function (run, summary) that reports the state of nested sampling to a progress function.
 
     `run` is its name or its number of Gaussians.
     """
 
-    def tell(what: int | str, state: RoundSummary | TemperatureSummary) -> None:
+    def tell(what: int | str, state: RoundSummary) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
-        if not isinstance(state, RoundSummary):
-            progress(stage, note=f"temperature {state.temperature:.3f} of 1, ln Z {state.log_z:.1f}")
-            return
         to_come = state.log_ratio_remaining
         progress(stage, note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come")
 

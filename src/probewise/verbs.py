@@ -83,11 +83,12 @@ def calibrate(
         Live points of a full nested sampling, at least two per parameter (six parameters per Gaussian, and two levels):
         fewer are faster, but make the evidences less precise.
     method
-        "quick" (the default): log-uniform priors of the widths; each number of Gaussians is fitted by sequential Monte
-        Carlo, from the peak of its likelihood or from the posterior of one Gaussian less. Nested sampling of the whole
-        prior with few live points checks the chosen number; a number in doubt gets nested sampling with `n_live`.
+        "quick" (the default): log-uniform priors of the widths; each number of Gaussians is sampled from the
+        peaks of its likelihood, upwards until the evidence has clearly fallen; a note names the numbers not tried.
+        Nested sampling of the whole prior with few live points checks the chosen number; where it missed a part, it
+        gets nested sampling with `n_live`.
         "full": the same priors; every number is fitted by nested sampling, and its evidence refined by importance
-        sampling. Takes two to ten times as long.
+        sampling. Takes several times as long.
         "paper": uniform priors, and the evidence of nested sampling alone. All have the Student-t likelihood.
     nested_stop
         Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or

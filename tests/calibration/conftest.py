@@ -11,11 +11,8 @@ from probewise.calibration import (
     FittedSensor,
     calibrate,
     choose_pixel_mm,
-    default_prior,
     posterior_mean_ssf_field,
 )
-from probewise.calibration.compensation import CompensatedShapeProposal
-from probewise.calibration.order_problems import ProblemsByOrder
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture, mixture_parameter_names
@@ -75,23 +72,3 @@ def recording() -> Recording:
 @pytest.fixture(scope="session")
 def calibration(recording: Recording) -> Calibration:
     return calibrate(recording, orders=(1,), n_live=50, rng=np.random.default_rng(13))
-
-
-@pytest.fixture(scope="session")
-def make_compensation(recording: Recording) -> Callable[..., CompensatedShapeProposal]:
-    def make(n: int, rng: np.random.Generator, *, n_pool: int = 4000, spread: float = 0.02) -> CompensatedShapeProposal:
-        """Learn the answers of N - 1 Gaussians that are known to a share of themselves, more than where they are used.
-
-        The less is left to know, the less they shift.
-        """
-        below = default_prior(recording, n - 1)
-        shapes = np.tile([0.3, 0.5, 1.5, 0.03, 0.08, -0.005, 0.2, -4.0, 2.0, 0.05, 0.02, 0.0][: 6 * (n - 1)], (300, 1))
-        theta = np.concatenate([shapes, np.tile([11.0, 58.0], (300, 1))], axis=1)
-        theta *= 1.0 + spread * rng.standard_normal(theta.shape)
-        rest = below.coordinates.leave(below.coordinates.enter(theta))[0]
-        problems = ProblemsByOrder(recording, default_prior)
-        return CompensatedShapeProposal.from_samples(
-            problems.problem(n - 1), below.coordinates, problems.problem(1), rest, rng=rng, n_pool=n_pool
-        )
-
-    return make

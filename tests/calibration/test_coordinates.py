@@ -1,4 +1,4 @@
-"""The SSF's own coordinates: moments instead of A, B and C, Gaussians sorted by mass."""
+"""Sampling coordinates: moments instead of A, B and C, Gaussians sorted by mass; or the whole's, or without labels."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from probewise.calibration import SSFPrior
+from probewise.calibration.about_peaks import LightContrasts
+from probewise.calibration.coordinates import MomentCoordinates, WholeFootprintCoordinates
 from probewise.priors import LogUniform, Uniform
 
 
@@ -32,32 +34,44 @@ def test_the_unit_cube_is_found_again(n_gaussians: int, by_mass: bool) -> None:
     assert belief.to_unit_cube(belief.from_unit_cube(u)) == pytest.approx(u, abs=1e-9)
 
 
+def coordinates(belief: SSFPrior, *, whole: bool) -> MomentCoordinates | WholeFootprintCoordinates:
+    return WholeFootprintCoordinates(belief, (1.0, 0.5), 20.0) if whole else belief.coordinates
+
+
+WHOLE = pytest.mark.parametrize("whole", [False, True])
+
+
 @CASES
-def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians: int, by_mass: bool) -> None:
+@WHOLE
+def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians: int, by_mass: bool, whole: bool) -> None:
     belief = prior(n_gaussians, by_mass=by_mass)
+    space = coordinates(belief, whole=whole)
     theta = belief.from_unit_cube(np.random.default_rng(2).random((50, len(belief.names))))
-    x = belief.coordinates.enter(theta)
-    back, log_density = belief.coordinates.leave(x)
+    x = space.enter(theta)
+    back, log_density = space.leave(x)
     assert np.isfinite(log_density).all()
     g = back[:, :-2].reshape(50, n_gaussians, 6)
     mass = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
     assert (np.diff(mass, axis=1) <= 0).all()
     # The same Gaussians in another order.
     ours, theirs = np.sort(g[..., 1], axis=1), np.sort(theta[:, :-2].reshape(50, n_gaussians, 6)[..., 1], axis=1)
-    assert ours == pytest.approx(theirs, abs=1e-9)
-    assert belief.coordinates.enter(back) == pytest.approx(x, abs=1e-9)
+    assert ours == pytest.approx(theirs, rel=1e-9, abs=1e-9)
+    assert space.enter(back) == pytest.approx(x, abs=1e-9)
 
 
 @CASES
-def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_gaussians: int, by_mass: bool) -> None:
+@WHOLE
+def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(
+    n_gaussians: int, by_mass: bool, whole: bool
+) -> None:
     """The Jacobian by central differences; N! for the labellings that became one."""
     belief = prior(n_gaussians, by_mass=by_mass)
-    n_params = len(belief.names)
-    for row in belief.coordinates.enter(belief.from_unit_cube(np.random.default_rng(3).random((5, n_params)))):
+    space = coordinates(belief, whole=whole)
+    for row in space.enter(belief.from_unit_cube(np.random.default_rng(3).random((5, len(belief.names))))):
         step = 1e-6 * np.maximum(1.0, np.abs(row))
-        ahead, behind = (belief.coordinates.leave(row + sign * np.diag(step))[0] for sign in (1, -1))
+        ahead, behind = (space.leave(row + sign * np.diag(step))[0] for sign in (1, -1))
         stretch = np.linalg.slogdet((ahead - behind) / (2 * step[:, None])).logabsdet
-        theta, log_density = belief.coordinates.leave(row[None])
+        theta, log_density = space.leave(row[None])
         expected = belief.log_prob(theta)[0] + stretch + math.lgamma(n_gaussians + 1)
         assert log_density[0] == pytest.approx(expected, abs=1e-6)
 
@@ -71,3 +85,54 @@ def test_nothing_is_dense_where_no_prior_is() -> None:
         theta, log_density = belief.coordinates.leave(outside)
         assert log_density[0] == -np.inf, (column, value)
         assert np.isfinite(theta).all() or not np.isfinite(log_density[0])
+
+
+@WHOLE
+def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole: bool) -> None:
+    belief = prior(3, by_mass=True)
+    space = coordinates(belief, whole=whole)
+    x = space.enter(belief.from_unit_cube(np.random.default_rng(7).random((20, 20))))
+    heavier, swapped = x.copy(), x.copy()
+    heavier[:, 6] = 0.1
+    swapped[:, [6, 12]] = swapped[:, [12, 6]]
+    assert (space.leave(heavier)[1] == -np.inf).all()
+    assert (space.leave(swapped)[1] == -np.inf).all()
+
+
+def test_the_whole_of_gaussians_nearby_has_their_mean_and_covariance() -> None:
+    """Far less is tapered there than a hundredth; the moments of a mixture by another route."""
+    theta = np.array([[0.05, 1.0, 0.5, 0.05, 0.06, 0.01, 0.01, 2.0, 0.0, 0.08, 0.05, 0.0, 10.0, 60.0]])
+    g = theta[0, :-2].reshape(2, 6)
+    light = g[:, 0] / np.sqrt(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
+    share = light / light.sum()
+    mean = share @ g[:, 1:3]
+    whole = np.zeros((2, 2))
+    for s, (_, u, v, a, b, c) in zip(share, g, strict=True):
+        off = np.array([u, v]) - mean
+        whole += s * (0.5 * np.linalg.inv([[a, c], [c, b]]) + np.outer(off, off))
+    x = coordinates(prior(2, by_mass=True), whole=True).enter(theta)[0]
+    np.testing.assert_allclose(x[1:3], mean, atol=0.01)
+    np.testing.assert_allclose(x[3:5], np.log(np.diag(whole)), atol=0.01)
+    assert x[5] == pytest.approx(np.arctanh(whole[0, 1] / np.sqrt(whole[0, 0] * whole[1, 1])), abs=0.01)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_without_labels_parameters_come_back_but_for_the_light_of_all(n: int) -> None:
+    """Readings depend on ratios of light alone, so that the sum of its logs may differ; labels change no density."""
+    belief = prior(n, by_mass=True)
+    space = LightContrasts(belief)
+    theta = belief.from_unit_cube(np.random.default_rng(1).uniform(0.02, 0.98, (50, 6 * n + 2)))
+    y = space.enter(theta)
+    back, log_density = space.leave(y)
+    assert np.isfinite(log_density).all()
+    ratio = (back / theta)[:, :-2:6]
+    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1], ratio.shape), rtol=1e-6)
+    shapes = np.setdiff1d(np.arange(6 * n + 2), np.arange(0, 6 * n, 6))
+    np.testing.assert_allclose(back[:, shapes], theta[:, shapes], rtol=1e-6)
+    labelled = space.relabelled(y)
+    assert len(labelled) == math.factorial(n)
+    for each in labelled:
+        other, log_other = space.leave(each)
+        np.testing.assert_allclose(log_other, log_density, rtol=1e-9)
+        np.testing.assert_allclose(np.sort(other[:, 1:-2:6]), np.sort(theta[:, 1:-2:6]), rtol=1e-9)
+        np.testing.assert_allclose(np.sort(other[:, :-2:6]), np.sort(back[:, :-2:6]), rtol=1e-9)

@@ -19,7 +19,7 @@ from probewise.calibration.coverage import (
     simulate_log_z_lead_of_one_gaussian,
     simulate_paper_recording,
 )
-from probewise.calibration.deduplicated_model import DeduplicatedModel
+from probewise.calibration.search import DeduplicatedModel
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import EvidenceChange, RoundSummary

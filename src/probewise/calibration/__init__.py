@@ -8,8 +8,6 @@ the weighted mean of sampled SSF fields.
 from probewise.calibration.fields import choose_pixel_mm, mixture_moments, posterior_mean_ssf_field
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
 from probewise.calibration.noise import ScanNoise, draw_pooled_sd, draw_sd, noise_by_scan
-from probewise.calibration.order_problems import problem_for
-from probewise.calibration.order_search import OrderPosterior
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (
     PriorRow,
@@ -20,8 +18,8 @@ from probewise.calibration.priors import (
     paper_prior,
     scan_geometry,
 )
+from probewise.calibration.search import OrderPosterior, problem_for
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
-from probewise.calibration.smc import SMCResult, TemperatureSummary
 from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
 
 __all__ = [
@@ -32,11 +30,9 @@ __all__ = [
     "OrderPosterior",
     "PriorRow",
     "QuantitySummary",
-    "SMCResult",
     "SSFPrior",
     "ScanGeometry",
     "ScanNoise",
-    "TemperatureSummary",
     "blind_axis_rad",
     "calibrate",
     "choose_pixel_mm",

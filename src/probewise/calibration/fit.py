@@ -24,15 +24,13 @@ from probewise.calibration.fields import (
     posterior_mean_ssf_field,
 )
 from probewise.calibration.noise import draw_pooled_sd, noise_by_scan
-from probewise.calibration.order_problems import ProblemsByOrder
-from probewise.calibration.order_search import OrderPosterior, Progress, search_prior_of_order
 from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
-from probewise.calibration.quick_fit import fit_orders_quickly
+from probewise.calibration.quick import fit_orders_quickly
+from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progress, search_prior_of_order
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
-from probewise.calibration.smc import SMCResult
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
-from probewise.nested import NestedResult, StopRule, least_live
+from probewise.nested import NestedResult, StopRule, Weighted, least_live
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_patterns_described, require_recording
 from probewise.sensor import SSFField
@@ -52,8 +50,8 @@ class OrderFit:
     sensor: FittedSensor
 
     @property
-    def result(self) -> NestedResult | SMCResult:
-        """The posterior samples: a nested sampling run, or the SMC run of a quick calibration."""
+    def result(self) -> NestedResult | Weighted:
+        """The posterior samples: a nested sampling run, or the weighted samples of a quick calibration."""
         return self.found.result
 
     @property
@@ -146,12 +144,11 @@ def calibrate(
     rng
         Source of randomness; spawned for each order.
     quick
-        Whether to reach each order by sequential Monte Carlo, from the peak of its likelihood or from the order below
-        (a climb); one search of the prior checks the chosen order. An order whose climb is doubtful is searched by
-        nested sampling, and a note says so. `probewise.calibrate` does this by default.
+        Whether to sample each order from the peaks of its likelihood, upwards until the evidence has clearly fallen,
+        with one search of the prior for the chosen order; notes name the orders not tried, or searched in full.
+        `probewise.calibrate` does this by default.
     progress
-        Called with the order and a `RoundSummary` after every round of nested sampling, or a `TemperatureSummary` after
-        every temperature of a climb; not with a process pool.
+        Called with the order and a `RoundSummary` after every round of nested sampling; not with a process pool.
     prior
         Function that makes the prior from the recording and an order; `paper_prior` is the paper's.
     stop
@@ -170,7 +167,7 @@ def calibrate(
     Returns
     -------
     Calibration
-        With a `sensor` for each order; the chosen order has the greatest evidence.
+        With a `sensor` for each order that was fitted; the chosen order has the greatest evidence.
 
     Raises
     ------
@@ -204,12 +201,13 @@ def calibrate(
     search = partial(search_prior_of_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
     one = partial(_fit_order, problems, search, pixel_mm=pixel_mm, n_samples=n_samples)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
-    climbed: dict[int, OrderPosterior] = {}
-    why: tuple[str, ...] = ()
+    quickly: dict[int, OrderPosterior] = {}
+    note = ""
     if quick:
-        climbing = rng.spawn(1)[0]
-        climbed, why = fit_orders_quickly(problems, wanted, search=search, rng=climbing, progress=progress)
-    each = {n: partial(one, n, streams[n], found=climbed.get(n), why=why) for n in wanted}
+        quickly, note = fit_orders_quickly(problems, wanted, search=search, rng=rng.spawn(1)[0], progress=progress)
+        wanted = tuple(n for n in wanted if n in quickly) or wanted
+    why = (note,) if note else ()
+    each = {n: partial(one, n, streams[n], found=quickly.get(n), why=why) for n in wanted}
     if executor is None:
         fits = [fit() for fit in each.values()]
     else:
@@ -261,7 +259,7 @@ def _fit_order(
         warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
     if found is None:
         found = search(n_gaussians, rng)
-        notes = (*notes, *why)
+    notes = (*notes, *why)
     sensor = _sensor_from_posterior(
         recording,
         problems.problem(n_gaussians),
@@ -270,6 +268,7 @@ def _fit_order(
         pixel_mm=pixel_mm,
         step_mm=geometry.step_mm,
         notes=(*notes, *found.notes),
+        doubts=found.doubts,
         rng=rng,
     )
     return OrderFit(n_gaussians, problems.prior_of(n_gaussians), found, sensor)
@@ -278,12 +277,13 @@ def _fit_order(
 def _sensor_from_posterior(
     recording: Recording,
     problem: SensorProblem,
-    result: NestedResult | SMCResult,
+    result: NestedResult | Weighted,
     *,
     n_samples: int,
     pixel_mm: float | None,
     step_mm: float,
     notes: tuple[str, ...],
+    doubts: tuple[str, ...],
     rng: np.random.Generator,
 ) -> FittedSensor:
     """Make a fitted sensor from a posterior: its samples, noise and mean field."""
@@ -296,8 +296,7 @@ def _sensor_from_posterior(
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
     pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
-    # Samples of an SMC run have equal weights, so those that are kept suffice for the field.
-    theta, weight = (samples, None) if isinstance(result, SMCResult) else (result.theta, result.weight)
+    theta, weight = (samples, None) if isinstance(result, Weighted) else (result.theta, result.weight)
     blind = blind_axis_rad(recording)
     silent = _names_of_unconstrained_moments(samples, prior, rng)
     if blind is not None:
@@ -324,7 +323,7 @@ def _sensor_from_posterior(
         fingerprint=fingerprint(recording),
         source=PurePath(recording.source).name,
         priors=prior.table_rows(),
-        notes=(*notes, *result.warnings),
+        notes=(*notes, *doubts),
     )
 
 

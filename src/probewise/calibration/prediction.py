@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray, floats, own_arithmetic
-from probewise.calibration.deduplicated_model import DeduplicatedModel
+from probewise.calibration.search import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
 from probewise.effects import EFFECTS, Origin
 from probewise.effects.noise_distribution import PredictiveMixture

@@ -44,9 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=("quick", "full", "paper"),
         default=CALIBRATION,
-        help="quick (default): sequential Monte Carlo from the peaks of the likelihood, vouched for by one search of "
-        "the prior; full: the whole prior of every number of Gaussians is searched by nested sampling, and each "
-        "evidence refined by importance sampling; paper: uniform priors, evidence by nested sampling alone",
+        help="quick (default): samples from the peaks of the likelihood, until the evidence has clearly fallen, one "
+        "search of the prior that vouches; full: the whole prior of every number of Gaussians is searched by nested "
+        "sampling, and each evidence refined by importance sampling; paper: uniform priors, evidence by nested "
+        "sampling alone",
     )
     parser.add_argument(
         "--nested-stop",

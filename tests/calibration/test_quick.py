@@ -1,0 +1,195 @@
+"""The quick way: climbs to peaks, draws about them, a density near the posterior to start from, and the search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probewise._arrays import FloatArray
+from probewise.calibration import Calibration, OrderPosterior, calibrate, default_prior, quick
+from probewise.calibration.about_peaks import (
+    LightContrasts,
+    _MixtureAboutPeaks,
+    _StudentTDensity,
+)
+from probewise.calibration.coordinates import WholeFootprintCoordinates
+from probewise.calibration.peaks import _split, climb, starts_of_climbs
+from probewise.calibration.quick import (
+    _NearPosterior,
+    fit_orders_quickly,
+)
+from probewise.calibration.search import ProblemsByOrder, search_prior_of_order
+from probewise.nested import Weighted
+from probewise.recordings import Disc, HalfPlane, Plan, Recording, paper_plan
+from probewise.world import Blob, World, gaussian_spot
+
+
+@pytest.fixture(scope="module")
+def two_lobes() -> Recording:
+    """A sensor of two spots of equal light, 8 mm apart."""
+    spot = gaussian_spot([Blob(0.5, (3.5, 2.0), (2.5, 3.0)), Blob(0.5, (-3.5, -2.0), (2.5, 3.0))])
+    return World(spot, noise_sd=0.4).simulate(paper_plan(), rng=np.random.default_rng(8))
+
+
+@pytest.fixture(scope="module")
+def mirrored() -> Recording:
+    """Edges along x and y, and discs about the origin: a footprint at 45 degrees looks like its mirror image."""
+    along, still = np.linspace(-15.0, 15.0, 41), np.zeros(41)
+    pattern = np.repeat(np.arange(5), [41, 41, 4, 4, 4])
+    discs = {f"disc {r} mm": Disc((0.0, 0.0), r, inside=1.0, outside=0.0) for r in (1.5, 2.5, 4.0)}
+    patterns = {"x": HalfPlane(0.0, 0.0, 1.0, 0.0), "y": HalfPlane(np.pi / 2, 0.0, 1.0, 0.0), **discs}
+    plan = Plan(
+        x_mm=np.concatenate([along, still, np.zeros(12)]),
+        y_mm=np.concatenate([still, along, np.zeros(12)]),
+        orientation_rad=np.zeros(94),
+        time_s=np.arange(94.0),
+        scan=np.minimum(pattern, 2),
+        scan_names=("along x", "along y", "discs"),
+        pattern=pattern,
+        pattern_names=tuple(patterns),
+        patterns=patterns,
+    )
+    spot = gaussian_spot([Blob(1.0, (0.0, 0.0), (4.0, 1.2), 0.78)])
+    return World(spot, noise_sd=0.15).simulate(plan, rng=np.random.default_rng(5))
+
+
+def climbed(recording: Recording, order: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Climb from the starts of each order up to `order`; return ends and ln L of the last."""
+    problems, rng = ProblemsByOrder(recording, default_prior), np.random.default_rng(seed)
+    ends = np.empty((0, 8))
+    for n in range(1, order + 1):
+        problem = problems.problem(n)
+        ends, high = climb(problem, problems.problem(1), starts_of_climbs(problem, ends[:3], rng))
+    return ends, high
+
+
+def test_the_peak_of_one_gaussian_is_no_lower_than_the_truth(recording: Recording, truth: FloatArray) -> None:
+    problem = ProblemsByOrder(recording, default_prior).problem(1)
+    ends, high = climbed(recording, 1, 9)
+    assert high[0] >= problem.log_likelihood(truth[None])[0]
+    assert high[0] == pytest.approx(problem.log_likelihood(ends[:1])[0])
+
+
+def test_two_lobes_are_climbed(two_lobes: Recording) -> None:
+    assert climbed(two_lobes, 2, 13)[1][0] > climbed(two_lobes, 1, 13)[1][0] + 50
+    centres = climbed(two_lobes, 2, 13)[0][0, [1, 2, 7, 8]].reshape(2, 2)
+    np.testing.assert_allclose(np.abs(centres), [[3.5, 2.0], [3.5, 2.0]], atol=0.4)
+
+
+def test_a_split_keeps_light_centre_and_covariance(recording: Recording) -> None:
+    rng = np.random.default_rng(10)
+    prior = default_prior(recording, 1)
+    theta = prior.from_unit_cube(rng.uniform(0.05, 0.95, (30, 8)))
+
+    def moments(rows: np.ndarray) -> np.ndarray:
+        g = rows[:, :-2].reshape(len(rows), -1, 6)
+        det = g[..., 3] * g[..., 4] - g[..., 5] ** 2
+        light = g[..., 0] / np.sqrt(det)
+        u, v = g[..., 1], g[..., 2]
+        second = [0.5 * g[..., 4] / det + u * u, 0.5 * g[..., 3] / det + v * v, -0.5 * g[..., 5] / det + u * v]
+        return np.stack([(light * part).sum(axis=1) for part in (np.ones_like(u), u, v, *second)], axis=1)
+
+    np.testing.assert_allclose(moments(_split(theta, rng)), moments(theta), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_prior_integrates_to_one_by_draws_about_a_peak(recording: Recording, n: int) -> None:
+    """Draws of a Student-t that is fitted to the prior weigh one on average; five errors."""
+    prior, rng = default_prior(recording, n), np.random.default_rng(3)
+    space = LightContrasts(prior)
+    y = space.enter(prior.from_unit_cube(rng.random((4000, 6 * n + 2))))
+    density = _StudentTDensity(y.mean(axis=0), np.linalg.cholesky(np.cov(y, rowvar=False)))
+    weight = np.exp(-_MixtureAboutPeaks(space, [density], np.ones(1)).draw(40_000, rng)[2])
+    error = weight.std() * np.sqrt(len(weight)) / 40_000
+    assert abs(weight.sum() / 40_000 - 1.0) < 5 * error < 0.3
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_prior_integrates_to_one_by_draws_near_a_posterior(recording: Recording, n: int) -> None:
+    """Place, size and levels are as wide as the prior's. Five errors.
+
+    Of two Gaussians, draws count where the second has less than a twentieth of the light, a known share of the prior:
+    brighter ones move the whole so far that few draws weigh.
+    """
+    prior, rng = default_prior(recording, n), np.random.default_rng(3)
+    space = WholeFootprintCoordinates(prior, (0.0, 0.0), 80.0)
+    whole = space.enter(prior.from_unit_cube(rng.random((4000, 6 * n + 2))))[:, quick._WHOLE]
+    near = _NearPosterior(prior, space, whole.mean(axis=0)[None], np.linalg.cholesky(np.cov(whole, rowvar=False)))
+    x = near.draw(100_000, rng=rng)
+    log_prior = space.leave(x)[1]
+    counted = np.isfinite(log_prior) & (x[:, 6:-2:6] < np.log(0.05)).all(axis=1)
+    weight = np.exp(log_prior[counted] - near.log_density(x[counted]))
+    error = weight.std() * np.sqrt(len(weight)) / 100_000
+    share = 0.05 ** (n - 1)
+    assert abs(weight.sum() / 100_000 - share) < 5 * error < 0.5 * share
+
+
+@pytest.fixture
+def with_evidences(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float]], None]:
+    """Return a function that gives each order its evidence, by draws and by nested sampling."""
+
+    def give(log_z: dict[int, float]) -> None:
+        def drawn(problem: Any, *_: Any, **__: Any) -> tuple[Weighted, Callable[[FloatArray], FloatArray]]:
+            n = problem.prior.n_gaussians
+            made = Weighted(
+                problem.prior.names,
+                problem.prior.from_unit_cube(np.full((300, 6 * n + 2), 0.5)),
+                log_likelihood=np.zeros(300),
+                log_weight=np.full(300, -np.log(300.0)),
+                log_z=log_z[n],
+                log_z_error=1.0,
+                n_eff=300.0,
+                n_calls=1,
+                pareto_k=0.0,
+            )
+            return made, lambda theta: np.zeros(len(theta))
+
+        monkeypatch.setattr(quick, "weigh_draws_about_peaks", drawn)
+        monkeypatch.setattr(quick, "_sample", lambda nearby, *_: drawn(nearby.problem)[0])
+
+    return give
+
+
+def test_orders_are_fitted_until_the_evidence_has_clearly_fallen(
+    recording: Recording, with_evidences: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fall by 2 is not clear with an error of 1; one by 4 is."""
+    monkeypatch.setattr(quick, "_missed_part_in_words", lambda *_: "")
+    with_evidences({1: -100.0, 2: -102.0, 3: -104.0, 4: -90.0})
+    found = calibrate(recording, orders=(1, 2, 3, 4), quick=True, rng=np.random.default_rng(2))
+    assert [o.n_gaussians for o in found.orders] == [1, 2, 3]
+    assert found.chosen.n_gaussians == 1
+    assert any("order 4 not tried" in note for note in found.sensor.notes)
+
+
+def test_the_order_that_missed_a_peak_and_those_above_are_searched(
+    calibration: Calibration, recording: Recording, with_evidences: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three the second is chosen; the first stays as it is."""
+    searched: list[int] = []
+
+    def search(n: int, _: np.random.Generator) -> OrderPosterior:
+        searched.append(n)
+        return calibration.chosen.found
+
+    with_evidences({1: -1000.0, 2: 900.0, 3: 899.0})
+    monkeypatch.setattr(quick, "_missed_part_in_words", lambda *_: "it lies elsewhere")
+    problems, rng = ProblemsByOrder(recording, default_prior), np.random.default_rng(0)
+    found, note = fit_orders_quickly(problems, (1, 2, 3), search=search, rng=rng)
+    assert searched == [2, 3]
+    assert not note
+    assert not found[1].notes
+    assert all(f"order {n} was searched in full, since the quick way missed" in found[n].notes[-1] for n in (2, 3))
+
+
+def test_few_readings_are_searched_in_full(recording: Recording) -> None:
+    problems = ProblemsByOrder(recording.take(np.arange(60)), default_prior)
+    search = partial(search_prior_of_order, problems, n_live=50)
+    assert fit_orders_quickly(problems, (1,), search=search, rng=np.random.default_rng(1)) == (
+        {},
+        "searched in full: 60 usable readings, fewer than 80",
+    )

@@ -21,9 +21,6 @@ def test_the_page_runs_as_printed(capsys):
     assert names["calibration"].sensor.n_gaussians in (1, 2)
     assert names["diagnosis"].verdict in capsys.readouterr().out
     assert len(names["run"].readings) == 5
-    slope, offset, _ = names["result"].mean()
-    assert abs(slope - 2.0) < 4 * names["result"].sd()[0]
-    assert abs(offset - 1.0) < 4 * names["result"].sd()[1]
 
 
 @pytest.mark.slow

@@ -30,8 +30,8 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.experiment import ArmReachAndTravel, Experiment, Step, explore
+from probewise.experiment.evidence import nested_sampling_from_scratch
 from probewise.experiment.inquire import predict_readings_and_utilities
-from probewise.experiment.reestimation import nested_sampling_from_scratch
 from probewise.experiment.smc import Particles, update
 from probewise.inquiry import Grid
 from probewise.proof.configurations import REFERENCE

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
-from probewise.experiment.reestimation import bridged_evidence, sampled_about_points
+from probewise.experiment.evidence import sampled_about_points
 from probewise.experiment.smc import (
     THOROUGH,
     LocalKernels,
@@ -167,16 +167,6 @@ def test_a_missing_reading_changes_nothing(small):
     after = update(before, problem, rng=rng(), fall_back=never)
     np.testing.assert_allclose(after.weighted.log_weight, before.weighted.log_weight)
     assert after.log_z == pytest.approx(before.log_z)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [2, 5])
-def test_a_bridge_finds_the_evidence_anew(small, lattice, n):
-    """Whatever evidence was carried: within five stated errors, and 0.05 for the lattice."""
-    posterior = replace(carried(small, steps=n, fall_back=None), log_z=123.0)
-    found = bridged_evidence(posterior, problem_of(small, n), rng=rng(5), n_draws=3000)
-    assert found.error < 0.1
-    assert found.log_z == pytest.approx(by_lattice(small, lattice, n)[0], abs=5 * found.error + 0.05)
 
 
 @pytest.mark.slow

@@ -198,7 +198,11 @@ def next_poses(
     """
     plan, grid = given.plan, experiment.grid
     reach_mm = _MISSING_REACH * math.hypot(grid.width_mm, grid.height_mm)
-    chance = chance_of_value(readings, np.stack([plan.x_mm, plan.y_mm], axis=1), reach_mm=reach_mm)
+    places_mm = np.stack([plan.x_mm, plan.y_mm], axis=1)
+    chance = chance_of_value(readings, places_mm, reach_mm=reach_mm)
+    if experiment.trust < 1 and readings:
+        again = worth_beside_earlier_readings(readings, places_mm, experiment.footprint_mm)
+        chance = again if chance is None else chance * again
     if experiment.batch > 1 and utilities.label == InformationGain.label:
         weight = None if chance is None else chance[given.rows]
         rows = choose_several(given, experiment.batch, rng=rng, chance=weight)
@@ -229,6 +233,18 @@ def chance_of_value(readings: Sequence[Reading], places_mm: FloatArray, *, reach
     square = ((places_mm[:, None] - _places_of(readings)) ** 2).sum(axis=2) + _SAME_MM**2
     weight = reach_mm**2 / square
     return np.asarray((1.0 + weight[:, ~missing].sum(axis=1)) / (1.0 + weight.sum(axis=1)))
+
+
+def worth_beside_earlier_readings(
+    readings: Sequence[Reading], places_mm: FloatArray, footprint_mm: float
+) -> FloatArray:
+    """Return the factor of a reading's worth at each place, (n_places, 2) -> (n_places,): 1 away from earlier readings.
+
+    A reading within a footprint of n others counts 1/(1 + n): kinds that fail in a way that none of them has would say
+    that it tells more, again and again.
+    """
+    square = ((places_mm[:, None] - _places_of(readings)) ** 2).sum(axis=2)
+    return np.asarray(1.0 / (1.0 + (square < footprint_mm**2).sum(axis=1)))
 
 
 def utilities_near_end(

@@ -33,7 +33,7 @@ _FEWER = 3  # times
 SUSPECTED = ((0.2, 2), (0.02, 4), (0.0, 6))  # probability from which on a rival has which fraction of the samples
 _LEAST_SAMPLES = 100
 
-FAULT_ODDS_FACTOR = 12.0
+FAULT_ODDS_FACTOR = 14.0
 """Factor on the odds that the sensor model is incomplete, wherever something is concluded: choice of readings, stopping
 rule, reported shape and its error, credible set. By the plain odds a fault that a dozen readings can hardly show would
 be right one time in ten, and whatever is concluded of a run that has it would miss."""

@@ -165,6 +165,7 @@ def step(
         pace=Pace.from_readings(readings),
         arm_error=judged.arm_error,
         checks_sensor=judged.may_stop and checks,
+        unexplained=judged.unexplained,
     )
     return replace(state, readings=readings, posterior=kinds, next_pose=pose, planned=tuple(planned)), info
 

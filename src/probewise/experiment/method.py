@@ -10,12 +10,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
+from probewise.experiment.evidence import nested_sampling_from_scratch, with_evidence_from_prior
 from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, Posterior, n_samples_of_kind
-from probewise.experiment.reestimation import (
-    nested_sampling_from_scratch,
-    reestimated_after_reading,
-    reestimated_before_end,
-)
 from probewise.experiment.smc import BRIEF, STEADY, THOROUGH, resample_and_move, update
 from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
@@ -88,7 +84,7 @@ class SequentialMonteCarlo:
             )
         )
         now = replace(previous, particles=updated)
-        now = reestimated_after_reading(now, problems, self.n_particles, self.n_live, rng=rng)
+        now = with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=False, rng=rng)
         if not np.isfinite(now.log_odds).any():
             raise NotConvergedError("no hypothesis of any kind could have given these readings")
         particles = list(now.particles)
@@ -102,7 +98,9 @@ class SequentialMonteCarlo:
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """Return the posterior with kinds sampled again whose samples may have lost the truth."""
         problems = [kind.problem(recording) for kind in posterior.kinds]
-        return reestimated_before_end(posterior, problems, self.n_particles, self.n_live, rng=rng)
+        # From a generator of its own: if no mode was lost, the run goes on as without the search.
+        search = rng.spawn(1)[0]
+        return with_evidence_from_prior(posterior, problems, self.n_particles, self.n_live, at_end=True, rng=search)
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator

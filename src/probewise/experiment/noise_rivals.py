@@ -26,6 +26,7 @@ from probewise.priors import LogUniform
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
+_FACTORS = LogUniform(0.25, 6.0).from_unit((np.arange(12) + 0.5) / 12)  # of the noise since the calibration
 _NODES = (np.arange(6)[:, None] + 0.5) / 6  # of a prior of one parameter
 _EXACT = 1e-3  # of the noise sd: within which a value counts as the same, lost to black or rounded
 _PHASES = 7
@@ -128,6 +129,7 @@ def noise_likelihoods(noise: DeclaredNoise, levels: tuple[float, float]) -> dict
     """Return the noise models, {name of the effect in the vocabulary: likelihood}; `levels` are black and white."""
     amplitude = HeavyTailedPrior(0.01 * abs(levels[1] - levels[0]), positive=True)
     laws: dict[str, Callable[[FloatArray, FloatArray], FloatArray]] = {
+        "noise_sd": partial(_changed_sd, noise),
         "outliers": partial(_outliers, noise, Outliers().bank()[:, 0]),
         "dropouts": partial(_lost_readings, noise, levels),
         "correlated_noise": partial(_correlated, noise),
@@ -136,6 +138,12 @@ def noise_likelihoods(noise: DeclaredNoise, levels: tuple[float, float]) -> dict
         "quantisation": partial(_coarser_rounding, noise),
     }
     return {name: NoiseLikelihood(law) for name, law in laws.items()}
+
+
+def _changed_sd(noise: DeclaredNoise, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Another sd of the noise than at the calibration; a node is the factor."""
+    sds = (noise.sd * _FACTORS).tolist()
+    return _log_mean_over_nodes([noise.log_density(readings, predicted, sd=sd).sum(axis=1) for sd in sds])
 
 
 def _outliers(

@@ -20,7 +20,7 @@ from probewise.effects import spoken_name
 from probewise.experiment.arm_error import ArmError
 from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import HypothesisKind, Posterior
-from probewise.experiment.rivals import WITH_CARDS, Pace
+from probewise.experiment.rivals import SINCE_CALIBRATION, Pace
 from probewise.experiment.setup import Experiment, largest_sd_mm
 from probewise.experiment.simulated import HiddenShape
 from probewise.experiment.stopping import probability_of_length_off
@@ -41,7 +41,8 @@ OFF_MM = 12.0
 
 _POLYGONS = {3: "triangle", 4: "square", 5: "pentagon", 6: "hexagon", 8: "octagon"}
 
-CLEAN = "clean"
+CLEAN, UNKNOWN = "clean", "unknown"
+UNKNOWN_SHARE = 0.5  # stated probability of `UNKNOWN`, from which on a diagnosis calls it so too
 _CREDIBLE = 0.95
 _NAMED = 0.5
 # Effects in the time of one run, which do not belong to the sensor.
@@ -98,6 +99,8 @@ class Step(ShowsItself):
         Pace of the run so far.
     arm_error
         Effect of the arm's own error; None far from the end of a run, or if that error is not known.
+    unexplained
+        With what the residuals of the best hypothesis change, in words; "" if they show no trend.
     checks_sensor
         Whether the stopping rule is met, and the run goes on only to check what the sensor model may leave out.
     """
@@ -124,6 +127,7 @@ class Step(ShowsItself):
     pace: Pace = field(default_factory=Pace)
     arm_error: ArmError | None = None
     checks_sensor: bool = False
+    unexplained: str = ""
 
     @property
     def log_z(self) -> float:
@@ -230,7 +234,7 @@ class Exploration(ShowsItself):
     @property
     def reached(self) -> bool:
         """Whether the target precision was reached, arm included, with a hypothesis that explains the readings."""
-        trusted = not self.experiment.fit_is_doubtful(self.last.p_value)
+        trusted = not self.experiment.fit_is_doubtful(self.last.p_value) and not self.last.unexplained
         return trusted and self.experiment.may_stop(self.sd, self.last.shapes, self.last.chance_off)
 
     @property
@@ -391,7 +395,7 @@ def samples_csv(run: Exploration) -> str:
 class LeftOutEffects:
     """Probability of each effect that the sensor model may leave out, most probable first ("clean": none); a sentence.
 
-    `raised` holds the same probabilities with the odds of every effect multiplied by 12 (`kinds.FAULT_ODDS_FACTOR`).
+    `raised` holds the same probabilities with the odds of every effect multiplied by 14 (`kinds.FAULT_ODDS_FACTOR`).
     """
 
     probability: Mapping[str, float]
@@ -425,15 +429,20 @@ def left_out_after_step(last: Step, trust: float) -> LeftOutEffects:
     """Summarise the probabilities of left-out effects after a step, in a run with this `Experiment.trust`."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     raised = {name or CLEAN: p for name, p in last.kinds.with_raised_fault_odds().left_out.items()}
+    if last.unexplained:  # what leads fails its check: none of the names is more than a part of the answer
+        shares = [(UNKNOWN_SHARE, UNKNOWN), *((p * (1.0 - UNKNOWN_SHARE), name) for p, name in shares)]
+        raised |= {UNKNOWN: 1.0}
     known = LeftOutEffects({name: p for p, name in shares}, raised)
     if trust == 1:
         return replace(known, sentence="The sensor model was taken for complete, as it was told to be.")
     name = known.leading
     p = known.probability[name]
     others = [spoken_name(other) for other in known.credible_set[1:] if other != CLEAN]
-    aliases = _ALIASES if WITH_CARDS.keys().isdisjoint(last.left_out) else ""
+    aliases = _ALIASES if "sensor_tilt" not in last.left_out else ""
     beside = f" Not excluded: {', '.join(others)}." if others else ""
-    if name == CLEAN:
+    if name == UNKNOWN:
+        said = f"No effect that is known here explains the readings: what is left of them {last.unexplained}."
+    elif name == CLEAN:
         said = f"The sensor model leaves nothing out that shows (probability {p:.3g})."
     elif p < _NAMED:
         said = f"Something may be left out, most probably {spoken_name(name)} (probability {p:.3g})."
@@ -473,18 +482,28 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
     if not name or p < _NAMED:
         return sensor
     kind, samples = _best_kind_with(last, name)
-    effect = kind.effect
+    effect, dark, bright = kind.effect, *(sensor.names.index(level) for level in ("I_min", "I_max"))
     note = f"a run that explored with it found {spoken_name(name)} (probability {p:.3g})"
     if name in sensor.absent and effect is not None and name not in _OF_THE_RUN:
         sensor = sensor.with_leading_effects()  # the run's own model, which did not hold it
+    if name in {form.name for form in SINCE_CALIBRATION}:  # the levels themselves have changed
+        change, own = samples.samples(len(sensor.samples), rng=rng)[:, -1], sensor.samples.copy()
+        if name == "dark_level":
+            own[:, [dark, bright]] += change[:, None]
+        else:
+            own[:, bright] += change * (own[:, bright] - own[:, dark])
+        return replace(sensor, samples=own, notes=(*sensor.notes, f"{note}, which its levels now include"))
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
     # What the sensor knew keeps its origins; the effect that was found has none, since a run's model counts from 0.
     n_own, n = len(effect.prior.names), len(sensor.samples)
     own = last.pace.in_seconds(effect, samples.samples(n, rng=rng)[:, -n_own:])
+    parameters = effect.prior.names
+    if name == "position_scale" and len(parameters) == 1:  # the vocabulary's effect has the other axis too
+        own, parameters = own * np.array([parameters == (axis,) for axis in "xy"]), ("x", "y")
     return replace(
         sensor,
-        names=(*sensor.names, *(f"{name}.{parameter}" for parameter in effect.prior.names)),
+        names=(*sensor.names, *(f"{name}.{parameter}" for parameter in parameters)),
         samples=np.concatenate([sensor.samples, own], axis=1),
         effects=(*sensor.effects, name),
         notes=(*sensor.notes, note),

@@ -18,6 +18,7 @@ from typing import Any, Protocol, Self, cast
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise._words import value_with_sd
 from probewise.arm.instrument import Reading
 from probewise.effects import (
     VOCABULARY,
@@ -30,6 +31,7 @@ from probewise.effects import (
 )
 from probewise.effects.known import WrappedEffect
 from probewise.effects.optics import PatchPrior
+from probewise.effects.pose import backlash
 from probewise.effects.reading import gain_drift
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
@@ -76,6 +78,10 @@ _DURATION_S = 150.0
 _SCAN_MM = 100.0
 _SMALLEST = 4.0  # sd of an effect's size, in typical sizes of a recording: a smaller one hardly moves the shape
 _POWERS_OF_S = {"at_s": 1, "tau_s": 1, "per_hour": -1}
+_SCALE_SAYS = (
+    "the arm moves {} % too far along {}, or as much too short along {}: the shape is in the arm's own lengths"
+)
+_STILL_MM = 1e-6  # a smaller step of an axis is rounding
 _CHANGE_POINT = LogUniform(0.5 * EACH_S, 100.0 * EACH_S)
 
 
@@ -112,6 +118,10 @@ def rivals_of(
         effect = cast(LightEffect, VOCABULARY[name]).for_extent(extent)
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, extent, field_mm)]
+    extent = Extent(min(dark, bright), max(dark, bright), _plan_there_and_back(_SCAN_MM, height_mm))
+    forms = SINCE_CALIBRATION if cards_of(model) or "position_scale" in carried else ONLY_IN_RUNS
+    in_any_run = [effect for form in forms if (effect := form.for_extent(extent)) is not None]
+    found += [SensorModelRival(form.name, effect=EffectWithRunPrior(form, field_mm)) for form in in_any_run]
     noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
         found += [
@@ -123,6 +133,9 @@ def rivals_of(
 def _forms_of_effect_in_run(effect: Effect, extent: Extent, field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """Return the forms in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
     in_run = EffectWithRunPrior(effect, field_mm)
+    if effect.name == "backlash":
+        of_axes = EffectWithRunPrior(cast(Effect, play_of_axes.for_extent(extent)), field_mm)
+        return [in_run, FromRest(in_run), of_axes, FromRest(of_axes)]
     if effect.name in OF_MOTION:
         return [in_run, FromRest(in_run)]
     if effect.name not in _IN_TIME:
@@ -166,6 +179,84 @@ def gain_loss(kind: LightEffect, of: Extent) -> Effect:
         )
 
     return replace(cast(Effect, gain_drift.build(kind, of)), act=act, says=says)
+
+
+@light_effect("dark_level", Stage.OFFSET, "another dark level than at the calibration", ("level",))
+def dark_level(kind: LightEffect, of: Extent) -> Effect:
+    """Another dark level than at the calibration: reading + offset."""
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        way = "higher" if mean[0] > 0 else "lower"
+        return f"since the calibration every reading is {value_with_sd(abs(mean[0]), sd[0])} {way}: other light"
+
+    return kind.linear(of, {"offset": "reading"}, 0.01 * of.span, lambda value, theta, plan: value + theta[:, :1], says)
+
+
+@light_effect("gain", Stage.GAIN, "another gain than at the calibration", ("level",))
+def gain(kind: LightEffect, of: Extent) -> Effect:
+    """Another gain than at the calibration: signal x (1 + frac)."""
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        changed = value_with_sd(abs(mean[0]), sd[0], factor=100)
+        way = "stronger" if mean[0] > 0 else "weaker"
+        return f"since the calibration the signal is {changed} % {way}: the lamp, its battery or the paper"
+
+    return kind.linear(of, {"frac": "1"}, 0.02, lambda value, theta, _: value * np.maximum(1 + theta[:, :1], 0.0), says)
+
+
+@light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
+def scale_of_x(kind: LightEffect, of: Extent) -> Effect:
+    """Return a wrong scale of X alone, which no circle can imitate."""
+    return kind.linear(
+        of,
+        {"x": "1"},
+        0.01,
+        lambda value, theta, plan: replace(value, x_mm=value.x_mm * (1 + theta[:, :1])),
+        lambda mean, sd: _SCALE_SAYS.format(value_with_sd(mean[0], sd[0], factor=100), "X", "Y"),
+    )
+
+
+@light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
+def scale_of_y(kind: LightEffect, of: Extent) -> Effect:
+    """Return a wrong scale of Y alone, which no circle can imitate."""
+    return kind.linear(
+        of,
+        {"y": "1"},
+        0.01,
+        lambda value, theta, plan: replace(value, y_mm=value.y_mm * (1 + theta[:, :1])),
+        lambda mean, sd: _SCALE_SAYS.format(value_with_sd(mean[0], sd[0], factor=100), "Y", "X"),
+    )
+
+
+SINCE_CALIBRATION = (dark_level, gain)
+"""Changes of the levels since the calibration, constant in a run."""
+
+ONLY_IN_RUNS = (*SINCE_CALIBRATION, scale_of_x, scale_of_y)
+"""Effects that only a run without cards has as rivals, besides those in `ON_FIELD`."""
+
+
+@light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
+def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
+    """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
+
+    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        x, y = (theta[:, :1] / 2 * side for side in _side_of_each_axis(plan))
+        return replace(value, x_mm=value.x_mm - x, y_mm=value.y_mm - y)
+
+    return replace(cast(Effect, backlash.build(kind, of)), act=act)
+
+
+def _side_of_each_axis(plan: Plan) -> FloatArray:
+    """Return the sign of each axis' last motion within the scan, (2, n_points); before the first, that of the first."""
+    sides = np.zeros((2, len(plan)))
+    for rows in plan.rows_by_scan():
+        for side, place in zip(sides, (plan.x_mm[rows], plan.y_mm[rows]), strict=True):
+            signs = np.sign(np.where(np.abs(np.diff(place)) > _STILL_MM, np.diff(place), 0.0))
+            moved = np.flatnonzero(signs)
+            if moved.size:
+                last = np.searchsorted(moved, np.arange(-1, len(signs)), side="right") - 1
+                side[rows] = signs[moved[np.maximum(last, 0)]]
+    return sides
 
 
 class DescribedEffect(AnyEffect, Protocol):

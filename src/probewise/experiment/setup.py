@@ -38,6 +38,7 @@ from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Instrumentation
 from probewise.scene import Card
 from probewise.scene.shapes import AnyOf, Shape, require_shape
+from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
 
 
@@ -293,6 +294,19 @@ class Experiment:
             return None
         names = zip(self.shape_columns.tolist(), self.shape.prior.names, strict=True)
         return Goal(tuple(column for column, name in names if name.endswith("_mm")), self.stop_sd_mm)
+
+    @cached_property
+    def footprint_mm(self) -> float:
+        """Twice the largest sd of the calibrated footprint along the sensor's axes; 0 for a model without one."""
+        if not isinstance(self.model, Chain):
+            return 0.0
+        footprint = self.model.ssf.footprint(np.empty((1, 0)))
+        share, u_mm, v_mm = footprint.weight, footprint.u_mm, footprint.v_mm
+        variances = [
+            float((share * (var + (at - (share * at).sum()) ** 2)).sum() / share.sum())
+            for at, var in ((u_mm, footprint.var_u), (v_mm, footprint.var_v))
+        ]
+        return 2.0 * math.sqrt(max(variances))
 
     @cached_property
     def forecast(self) -> Forecast:

@@ -33,7 +33,6 @@ _SURPRISED = 12.5  # nats by which even the best sample misses the last reading:
 _STIFF = 0.5  # accepted steps per sample below which the moves are unreliable
 _MOST_ROUNDS = 6
 _MANY_DEGREES = 4
-_SEARCH_HOLDS = 5  # readings for which a search from scratch is good, if its samples follow them with ease
 _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 _MOST_KERNELS = 250
@@ -85,15 +84,8 @@ class Particles:
     hurried
         Whether, since that start, a reading needed four temperatures or more: then few samples were near the new
         posterior, and the product of mean weights is nearly always too small.
-    refitted
-        Whether the samples come from fits to all readings or from scratch, and have followed later readings with ease.
-    log_z_limit
-        Upper limit of the log evidence of a kind far below the best kind, by fits or by a search from scratch; infinite
-        for others.
-    limit_is_searched
-        Whether a search from scratch gave that limit. Fits alone may all have missed the best fit.
     searched_at
-        Number of readings at the last search from scratch; -inf if there was none.
+        Number of readings at the last search of the prior; -inf if there was none.
     """
 
     weighted: Weighted
@@ -102,17 +94,15 @@ class Particles:
     n_resampled: int = 0
     strained: bool = False
     hurried: bool = False
-    refitted: bool = False
-    log_z_limit: float = math.inf
-    limit_is_searched: bool = False
     searched_at: float = -math.inf
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
 
-    def is_search_old(self, n_readings: int) -> bool:
-        """Return whether a search from scratch is due: none in five readings, or samples strained or hurried."""
-        return self.strained or self.hurried or n_readings >= self.searched_at + _SEARCH_HOLDS
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the samples may have lost the truth, and their evidence be wrong."""
+        return self.strained or self.hurried
 
     @property
     def log_z(self) -> float:
@@ -192,7 +182,6 @@ def update(
     given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
     """
     last = _LastReadingEvaluator(problem)
-    previous = replace(previous, log_z_limit=previous.log_z_limit + last.perfect_log_likelihood)
     before = previous.weighted
     n = len(before.theta)
     least = effort.least_share * n
@@ -255,7 +244,6 @@ def update(
         n_resampled=n_resampled,
         strained=strained,
         hurried=previous.hurried or degrees >= _MANY_DEGREES,
-        refitted=previous.refitted and degrees <= 1 and not strained,
     )
 
 

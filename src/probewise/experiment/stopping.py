@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, ndtr, ndtri
+from scipy.stats import rankdata
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
@@ -28,6 +29,9 @@ OFF_SDS = 3.0
 MOST_MISSING = 8
 """Missing readings (NaN) in a row after which a run ends."""
 
+_TREND_P = 1e-3  # p-value of the residuals' strongest trend, every look counted, below which no kind is believed
+_FEWEST_FOR_TREND = 12  # readings
+_WHOLE = 1.0 - 1e-12  # a correlation beyond which rounding rules
 _ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on the shape
 
 
@@ -43,6 +47,8 @@ class Judgement:
         Whether the stopping rule is met, arm included; probability that a length is off by three times its sd.
     p_value, notes
         p-value of the best hypothesis, None if it was not tested; warnings.
+    unexplained
+        With what the residuals of the best hypothesis change, in words; "" if they show no trend.
     arm_error
         Effect of the arm's own error; None far from the end of a run, or if that error is not known.
     """
@@ -54,6 +60,7 @@ class Judgement:
     chance_off: float
     p_value: float | None
     notes: tuple[str, ...]
+    unexplained: str = ""
     arm_error: ArmError | None = None
 
 
@@ -72,8 +79,11 @@ def judge(
     mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     p_value, notes = None, () if posterior.run is None else posterior.run.warnings
     leader, samples = kinds.kinds[kinds.most_probable_kind_index], kinds.particles[kinds.most_probable_kind_index]
+    problem = leader.problem(experiment.problem(readings).recording)
+    unexplained = "" if experiment.trust == 1 else trend_of_residuals(samples.weighted, problem)
+    if unexplained:
+        notes = (*notes, f"no hypothesis explains the readings: what the best leaves of them {unexplained}")
     if leader.likelihood is experiment.likelihood:  # chi-square is of this noise
-        problem = leader.problem(experiment.problem(readings).recording)
         p_value, worst = p_value_and_worst_reading(experiment, samples.weighted, problem)
         if experiment.fit_is_doubtful(p_value):
             doubt = (
@@ -83,7 +93,7 @@ def judge(
             )
             notes = (*notes, doubt)
     may_stop, off = may_stop_and_chance_off(experiment, posterior)
-    judged = Judgement(mean, sd, shapes, may_stop, off, p_value, notes)
+    judged = Judgement(mean, sd, shapes, may_stop, off, p_value, notes, unexplained)
     if largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm:
         return with_arm_error(judged, experiment, kinds, posterior, readings, rng=rng)
     return judged
@@ -231,6 +241,30 @@ def p_value_and_worst_reading(experiment: Experiment, posterior: Weighted, probl
     return float(chdtrc(max(int(recording.usable.sum()), 1), float(z @ z))), int(np.argmax(np.abs(z)))
 
 
+def trend_of_residuals(posterior: Weighted, problem: SensorProblem) -> str:
+    """Say with what the residuals of the most likely hypothesis change: place, way, direction, time; "" if with none.
+
+    Their normal scores, which any law of the noise leaves normal, are correlated with each, whatever the noise.
+    """
+    plan, usable = problem.recording.plan, problem.recording.usable
+    if (n := int(usable.sum())) < _FEWEST_FOR_TREND:
+        return ""
+    best = posterior.theta[[int(posterior.log_likelihood.argmax())]]
+    left = (problem.recording.readings - problem.model.predict(best, plan)[0])[usable]
+    scores = ndtri((rankdata(left) - 0.5) / n)
+    way = np.hypot(np.diff(plan.x_mm, prepend=plan.x_mm[0]), np.diff(plan.y_mm, prepend=plan.y_mm[0]))
+    along = {"the place along X": plan.x_mm, "the place along Y": plan.y_mm, "the time": plan.time_s, "the way": way}
+    along |= {f"the direction along {name}": plan.direction_of_motion[:, k] for k, name in enumerate("XY")}
+    trends = {}
+    for name, column in along.items():
+        rank = rankdata(column[usable])
+        if np.ptp(rank) > 0 and np.ptp(scores) > 0:
+            size = min(abs(float(np.corrcoef(rank, scores)[0, 1])), _WHOLE)
+            trends[name] = math.atanh(size) * math.sqrt(n - 3)  # Fisher (1915): normal, of sd 1
+    name = max(trends, key=trends.__getitem__, default="")
+    return f"changes with {name}" if name and len(trends) * 2 * ndtr(-trends[name]) < _TREND_P else ""
+
+
 def n_missing_at_end(readings: Sequence[Reading]) -> int:
     """Count the missing readings since the last value."""
     return sum(1 for _ in itertools.takewhile(lambda reading: math.isnan(reading.value), reversed(readings)))
@@ -251,7 +285,7 @@ def stop_reason(
     `must_continue`: whether it goes on for a check though the lengths are known. `n_missing`: missing readings in a
     row, if they are too many, else 0.
     """
-    names, known = experiment.shape.prior.names, judged.may_stop and not must_continue
+    names, known = experiment.shape.prior.names, judged.may_stop and not must_continue and not judged.unexplained
     included, of_arm, sd = "", 0.0, judged.sd
     if judged.arm_error is not None:
         included, of_arm = ", the arm's own error included", largest_sd_mm(names, judged.arm_error.sd)

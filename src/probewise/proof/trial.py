@@ -150,7 +150,7 @@ def timed_steps(
 def has_reached_target(last: Step, experiment: Experiment) -> bool:
     """Return whether a run reached the target precision with a posterior that fits its readings."""
     known = experiment.may_stop(last.sd, last.shapes, last.chance_off)
-    return known and not experiment.fit_is_doubtful(last.p_value)
+    return known and not experiment.fit_is_doubtful(last.p_value) and not last.unexplained
 
 
 def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:

@@ -1,0 +1,178 @@
+"""The evidence of kinds of hypotheses, from the prior.
+
+Samples that are carried from reading to reading keep only the modes that they have, and their evidence accumulates
+errors. One rule sets that right: at every doubt, and before a run ends, the kinds that could matter are solved from the
+prior, whatever their samples say, those that were ruled out among them. A quick run of nested sampling finds the modes;
+importance sampling about its samples and the carried ones gives evidence and samples.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.errors import DoubtfulResultWarning, NotConvergedError
+from probewise.experiment.kinds import Posterior, n_samples_of_kind
+from probewise.experiment.smc import BRIEF, LocalKernels, evenly_weighted, particles_from_posterior
+from probewise.inference.problem import SensorProblem
+from probewise.nested import LIVE_PER_PARAM, KernelMove, NestedResult, RemainingEvidence, Weighted, pareto_k, run
+from probewise.nested.weights import n_effective
+
+_MATTERS = 1e-3  # probability, by the raised odds, of a kind that is solved at a doubt
+_HAS_A_SAY = 0.02  # probability of a kind that is searched for lost modes where no effect can be left out
+_HOLDS = 5  # readings for which an evidence from the prior is good, if the samples follow them with ease
+_PER_READING = 3  # kinds that are solved after a reading in any case, in turn, while the sensor is in doubt
+_BEHIND = 20.0  # nats behind what the prior's search found, from which on carried samples are not drawn about
+_LOST_SHARE = 0.05  # of a posterior that may lie outside the samples' range, besides what chance leaves there
+_FOUND, _WELL_FOUND = 15.0, 100.0  # effective draws from which on importance sampling counts, and need not go on
+_ROUNDS = 3  # of importance sampling, each about the draws of those before
+_DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
+_WIDE, _OF_WIDE = 3.0, 0.15  # factor on the width of some kernels, beyond the samples they are fitted to; their share
+
+
+def nested_sampling_from_scratch(problem: SensorProblem, *, n_live: int, rng: np.random.Generator) -> NestedResult:
+    """Solve a problem, all readings at once, by nested sampling."""
+    return run(
+        problem,
+        rng=rng,
+        n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
+        move=KernelMove(),
+        stop=RemainingEvidence(_DLOGZ),
+        max_cost=1.0,  # speed matters, since the robot waits
+        return_interrupted=False,
+    )
+
+
+def with_evidence_from_prior(
+    now: Posterior,
+    problems: list[SensorProblem],
+    n_particles: int,
+    n_live: int,
+    *,
+    at_end: bool,
+    rng: np.random.Generator,
+) -> Posterior:
+    """Return the posterior with the kinds in doubt solved from the prior; before a run ends, all but recent ones.
+
+    `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. After a
+    reading, the probable kinds are solved whose samples followed it with difficulty; if these hold most of the
+    posterior, every such kind. Where no effect can be left out, the end changes samples only if they had lost a mode.
+    """
+    n_readings, possible = len(problems[0].recording), np.isfinite(now.log_odds).any()
+    raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
+    doubtful = np.array([p.is_doubtful for p in now.particles])
+    if at_end:
+        due = doubtful | np.array([n_readings >= p.searched_at + _HOLDS for p in now.particles])
+        due &= now.doubts_sensor | (raised > _HAS_A_SAY)
+    else:
+        due = doubtful & ((raised > _MATTERS) | (raised[doubtful].sum() > 0.5))
+        if now.doubts_sensor and possible and now.left_out[""] < 0.5:
+            longest_ago = np.argsort([p.searched_at for p in now.particles], kind="stable")
+            due[longest_ago[:_PER_READING]] = True
+    particles = list(now.particles)
+    for k in np.flatnonzero(due).tolist():
+        own, kind, problem = particles[k], now.kinds[k], problems[k]
+        n = max(len(own.ancestor), n_samples_of_kind(kind, float(raised[k]), n_particles))
+        found = posterior_from_prior(own.weighted, problem, n, n_live, rng)
+        keep = not own.is_doubtful and not now.doubts_sensor and not (found and _has_lost_mode(own.weighted, found))
+        if found is None:
+            particles[k] = replace(own.with_zero_evidence(), strained=False, hurried=False, searched_at=n_readings)
+        elif keep:
+            particles[k] = replace(own, searched_at=n_readings)
+        else:
+            fresh = particles_from_posterior(found, n, problem, rng=rng, effort=BRIEF)
+            particles[k] = replace(fresh, searched_at=n_readings)
+    return replace(now, particles=tuple(particles))
+
+
+def posterior_from_prior(
+    own: Weighted, problem: SensorProblem, n: int, n_live: int, rng: np.random.Generator
+) -> Weighted | None:
+    """Return samples and evidence of a problem by a search of the prior; None if nothing could give the readings.
+
+    `own` are samples that were carried, for modes that the search may miss. Where importance sampling has few effective
+    draws (modes too many or too bent), the better of search and carried samples counts as it is.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtfulResultWarning)  # its samples are only where draws are made
+            result = nested_sampling_from_scratch(problem, n_live=n_live // 2, rng=rng)
+    except NotConvergedError:
+        return None
+    points = result.samples(n, rng=rng)
+    at = problem.log_likelihood(points)
+    log_z, error = result.log_z, result.log_z_error
+    best = evenly_weighted(problem.prior.names, points, at, log_z=log_z, log_z_error=error, n_calls=0)
+    if own.log_z > result.log_z - _BEHIND:
+        best = max(best, own, key=lambda found: found.log_z)
+        points = np.concatenate([points, own.samples(n // 2, rng=rng)])
+    for _ in range(_ROUNDS):
+        drawn = sampled_about_points(points, problem, 2 * n, rng)
+        if drawn is None:
+            break
+        if drawn.n_eff > _FOUND:
+            best = drawn
+        if drawn.n_eff > _WELL_FOUND:
+            break
+        points = np.concatenate([points, drawn.samples(n, rng=rng)])
+    return replace(best, n_calls=own.n_calls + result.n_calls + 2 * n)
+
+
+def _has_lost_mode(own: Weighted, found: Weighted) -> bool:
+    """Return whether 5 % more of a posterior than by chance lies outside the samples' range in some parameter."""
+    kept = own.theta[own.weight > 0]
+    outside = ((found.theta < kept.min(axis=0)) | (found.theta > kept.max(axis=0))).any(axis=1)
+    return bool(found.weight[outside].sum() - 2 * kept.shape[1] / (len(kept) + 1) > _LOST_SHARE)
+
+
+def sampled_about_points(
+    points: FloatArray, problem: SensorProblem, n_draws: int, rng: np.random.Generator
+) -> Weighted | None:
+    """Sample a posterior by draws from kernels about points near it, (n_points, n_params); None if none is possible."""
+    density = _KernelDensity.fitted_to(points, rng=rng)
+    draws = density.draw(n_draws, rng=rng)
+    theta = draws[np.isfinite(problem.prior.log_prob(draws))]
+    log_likelihood = problem.log_likelihood(theta) if len(theta) else np.empty(0)
+    alive = np.isfinite(log_likelihood)
+    if not alive.any():
+        return None
+    theta, log_likelihood = theta[alive], log_likelihood[alive]
+    log_ratio = problem.prior.log_prob(theta) + log_likelihood - density.log_density(theta)
+    log_sum = float(logsumexp(log_ratio))
+    n_eff = n_effective(log_ratio - log_sum)
+    return Weighted(
+        problem.prior.names,
+        theta,
+        log_likelihood=log_likelihood,
+        log_weight=log_ratio - log_sum,
+        log_z=log_sum - math.log(n_draws),
+        log_z_error=math.sqrt(max(1.0 / n_eff - 1.0 / n_draws, 0.0)),
+        n_eff=n_eff,
+        n_calls=n_draws,
+        pareto_k=pareto_k(log_ratio),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _KernelDensity:
+    """A density of local kernels, mixed with the same kernels three times as wide (15 %)."""
+
+    near: LocalKernels
+    far: LocalKernels
+
+    @classmethod
+    def fitted_to(cls, points: FloatArray, *, rng: np.random.Generator) -> _KernelDensity:
+        return cls(LocalKernels.fitted_to(points, rng=rng), LocalKernels.fitted_to(points, rng=rng, widened=_WIDE))
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        n_far = round(_OF_WIDE * n)
+        return np.concatenate([self.near.draw(n - n_far, rng=rng), self.far.draw(n_far, rng=rng)])
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        near, far = self.near.log_density(points), self.far.log_density(points)
+        return np.asarray(np.logaddexp(near + math.log1p(-_OF_WIDE), far + math.log(_OF_WIDE)))

@@ -65,11 +65,20 @@ def test_tables_with_cards_laid_over_them_are_the_chain(chain, plan):
 
 def test_a_card_tells_a_tilt_and_an_error_of_scale_from_another_shape(chain):
     plain = experiment_of(REFERENCE)
-    names = {
-        with_card: {rival.name for rival in rivals_of(model, plain.likelihood, (1048.0, 520.0))}
-        for with_card, model in ((True, chain), (False, plain.model))
-    }
-    assert names[True] - names[False] == {"sensor_tilt", "position_scale"}
+    with_card, without = (
+        {
+            (rival.name, rival.effect.prior.names)
+            for rival in rivals_of(model, plain.likelihood, (1048.0, 520.0))
+            if rival.effect is not None
+        }
+        for model in (chain, plain.model)
+    )
+    assert {name for name, _ in with_card} - {name for name, _ in without} == {"sensor_tilt"}
+    assert {names for name, names in with_card if name == "position_scale"} == {("x", "y")}
+    assert {names for name, names in without if name == "position_scale"} == {
+        ("x",),
+        ("y",),
+    }  # no circle imitates these
 
 
 def test_an_outlook_knows_that_a_card_tells_nothing_of_the_shape(chain):

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from probewise._arrays import FloatArray, varies
 from probewise._words import value_with_sd
@@ -477,6 +476,8 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
 
 def _integral_since_start_of_run(values: FloatArray, rows: RunTable, *, in_time: bool) -> FloatArray:
     """Return the integral of values over time from the start of each row's run, (n_points,); or their sum over rows."""
+    from scipy.integrate import cumulative_trapezoid  # here, since it loads SciPy's optimisers
+
     out = np.zeros(len(rows))
     for own in rows.rows_by_scan():
         if own.size:

@@ -26,6 +26,7 @@ from probewise.diagnosis.held_out import (
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.noise_models import walk_given_readings
+from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit
 from probewise.diagnosis.search.searched import Searched
@@ -170,7 +171,9 @@ def judged_and_best_repair(
             if best.improvement.heldout_log_density_per_reading > 0:
                 return judged, best
         best = BestRepair.of(searched, test, searched.likeliest_fit_beside_unknown(noise) or null, noise, rng=rng)
-        if not _corrects_held_out_readings(searched, best):
+        # Outlying readings that cluster change no mean: there is nothing of them to predict.
+        clusters = sum(share for form, share in judged.unknown_shares.items() if form.endswith(FAR_OUT))
+        if clusters < 0.5 and not _corrects_held_out_readings(searched, best):
             on_noise, prior = searched.prepared.noise_effect_names, searched.prior
             mean_is_right = sum(h.probability for h in judged.hypotheses if {*h.effects} <= on_noise)
             if mean_is_right > 1 - SETTLED:

@@ -18,7 +18,7 @@ from probewise.proof.trial import experiment_of
 from probewise.scene import Circle, Field
 
 NAMES = ("", "ambient_step", "backlash", "dark_level", "dropouts", "saturation")
-STUCK = Path("/work/shared/faults/robot")
+STUCK = Path(__file__).parents[3] / "shared" / "faults" / "robot"
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.calibration.priors import SSFPrior
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested import Weighted, pareto_k
-from probewise.nested.weights import n_effective, power_bracket
+from probewise.nested.weights import n_effective, tempering_power
 from probewise.priors import Coordinates
 
 MOST_RELABELLED = 5
@@ -126,9 +126,7 @@ class _StudentTDensity:
     def refitted(self, y: FloatArray, log_weight: FloatArray) -> _StudentTDensity:
         """Fit to weighted draws; the fewer are effective, the more of the present covariance is kept."""
         least = _LEAST_PER_COORDINATE * y.shape[1]
-        if n_effective(log_weight) < least:
-            power = power_bracket(lambda p: p * log_weight, 0.0, 1.0, wanted=least, n_steps=30)[0]
-            log_weight = power * log_weight
+        log_weight = tempering_power(log_weight, least) * log_weight
         weight = np.exp(log_weight - logsumexp(log_weight))
         mean = weight @ y
         off = y - mean

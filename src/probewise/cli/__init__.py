@@ -23,7 +23,7 @@ from types import ModuleType
 
 from probewise._signals import Stopped, stoppable
 from probewise._writing import NotDrawnError
-from probewise.cli._common import OneLineParser, print_complaint, print_warning
+from probewise.cli._common import OneLineParser, error_in_one_line, print_complaint, print_warning
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _discard_unwritable_output()
             return 1
         except (ProbewiseError, OSError) as error:
-            _write_complaint(verb, _error_in_one_line(error))
+            _write_complaint(verb, error_in_one_line(error))
             _discard_unwritable_output()
             return 2
 
@@ -125,12 +125,6 @@ def _discard_unwritable_output() -> None:
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _error_in_one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
 
 
 def _write_warning(

@@ -176,6 +176,13 @@ def print_complaint(text: str) -> None:
         write_to_terminal(sys.stderr, text + "\n")
 
 
+def error_in_one_line(error: Exception) -> str:
+    """Return an error's message on one line; of the system's about a file, its path and what is wrong."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
 def print_warning(text: str) -> None:
     """Write a warning to standard error, even with --quiet."""
     print_complaint(f"warning: {text}")

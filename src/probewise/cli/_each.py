@@ -8,20 +8,19 @@ import hashlib
 import json
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, Executor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise._progress import progress_shown
 from probewise._signals import reporting_what_is_kept
+from probewise._tasks import results_as_tasks_end
 from probewise._version import __version__
 from probewise._writing import Drawings, StagedFiles, checked_output_directory, staged_output
-from probewise.cli._common import finish, message_to_resume
+from probewise.cli._common import error_in_one_line, finish, message_to_resume
 from probewise.cli._executor import open_executor
-from probewise.errors import LinkError, ParameterError, ProbewiseError
+from probewise.errors import ParameterError, ProbewiseError
 from probewise.recordings.table import csv_text
 from probewise.report import each as report
 
@@ -46,7 +45,8 @@ def diagnose_each(arguments: argparse.Namespace, diagnose: Verb) -> int:
     files = dict(zip(folders, arguments.recordings, strict=True))
     fingerprints = {name: _fingerprint(arguments, file) for name, file in files.items()}
     left = {name: file for name, file in files.items() if not _is_done(folders[name], fingerprints[name])}
-    refused: dict[str, str] = {}
+    options, refused = _options_for_each(arguments), dict[str, str]()
+    words = {name: [str(file.absolute()), *options] for name, file in left.items()}
 
     def kept() -> str:
         n = sum(_is_done(folders[name], fingerprints[name]) for name in files)
@@ -56,9 +56,10 @@ def diagnose_each(arguments: argparse.Namespace, diagnose: Verb) -> int:
         reporting_what_is_kept(kept),
         progress_shown(quiet=arguments.quiet) as progress,
         open_executor(arguments) as executor,
+        results_as_tasks_end(partial(_diagnosed, diagnose), words, executor) as ended,
     ):
         progress("diagnosing", len(files) - len(left), len(files))
-        for done, (name, (message, results)) in enumerate(_outcomes(arguments, diagnose, left, executor), start=1):
+        for done, (name, (message, results)) in enumerate(ended, start=1):
             if results:
                 results[_INPUTS] = fingerprints[name].encode()
                 with staged_output(folders[name], outdated=("*.svg", "next*.csv", "next*.json")) as stage:
@@ -114,27 +115,11 @@ def _is_done(folder: Path, fingerprint: str) -> bool:
     return False
 
 
-def _outcomes(
-    arguments: argparse.Namespace, diagnose: Verb, files: dict[str, Path], executor: Executor | None
-) -> Iterator[tuple[str, Outcome]]:
-    """Yield each recording's outcome, by the executor as they come, or here, in order."""
-    options = [
-        word
-        for name in ("sensor", "simulator")
-        if (path := getattr(arguments, name)) is not None
-        for word in (f"--{name}", str(path.absolute()))
-    ]
-    options += ["--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
-    words = {name: [str(file.absolute()), *options] for name, file in files.items()}
-    if executor is None:
-        yield from ((name, _diagnosed(diagnose, given)) for name, given in words.items())
-        return
-    futures = {executor.submit(_diagnosed, diagnose, given): name for name, given in words.items()}
-    try:
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    except (BrokenProcessPool, CancelledError) as error:
-        raise LinkError("a worker ended before it was done") from error
+def _options_for_each(arguments: argparse.Namespace) -> list[str]:
+    """Return the options that the diagnosis of every recording has."""
+    given = ((name, getattr(arguments, name)) for name in ("sensor", "simulator"))
+    files = [word for name, path in given if path is not None for word in (f"--{name}", str(path.absolute()))]
+    return [*files, "--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
 
 
 def _diagnosed(diagnose: Verb, words: Sequence[str]) -> Outcome:
@@ -149,7 +134,7 @@ def _diagnosed(diagnose: Verb, words: Sequence[str]) -> Outcome:
         try:
             diagnose(arguments)
         except (ProbewiseError, OSError) as error:
-            message = " ".join(str(error).split())
+            message = error_in_one_line(error)
         return message, {
             path.name: path.read_bytes() for path in Path(folder).iterdir() if path.is_file() and path.name[0] != "."
         }

@@ -197,10 +197,11 @@ def judged_and_best_repair(
 def _corrects_held_out_readings(searched: Searched, best: BestRepair) -> bool:
     """Return whether a correction by the best basis predicts held-out parts better or, where it does not, blocks."""
     prepared, bases = searched.prepared, searched.misfit_templates.unknown_bases
-    parts, blocks = prepared.apparatus.held_out_parts(prepared.recording), partition_into_blocks(prepared.recording)
-    fixed = correct_by_best_basis(best.repaired, best.problem, bases, parts[0])
+    parts, _ = prepared.apparatus.held_out_parts(prepared.recording)
+    fixed = correct_by_best_basis(best.repaired, best.problem, bases, parts)
     if fixed.gains_nothing:
-        fixed = correct_by_best_basis(best.repaired, best.problem, bases, blocks[0])
+        blocks, _ = partition_into_blocks(prepared.recording)
+        fixed = correct_by_best_basis(best.repaired, best.problem, bases, blocks)
     return fixed.held_out.per_reading > 0
 
 

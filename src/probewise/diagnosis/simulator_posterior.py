@@ -21,7 +21,7 @@ from probewise.diagnosis.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.simulator_fit import log_evidence_of
 from probewise.nested import pareto_k
-from probewise.nested.weights import n_effective, power_bracket, resampled_rows
+from probewise.nested.weights import n_effective, resampled_rows, tempering_power
 from probewise.progress import Progress
 
 NUMBERS = 4_000_000
@@ -102,10 +102,7 @@ class Draws:
 
     def tempered_weight(self, wanted: float) -> FloatArray:
         """Return the weights to the largest power, up to 1, that leaves so many effective draws, (n,)."""
-        if self.n_effective >= wanted:
-            return self.weight
-        power, _ = power_bracket(lambda power: power * self.log_weight, 0.0, 1.0, wanted=wanted, n_steps=30)
-        return np.asarray(self.weight**power)
+        return np.asarray(self.weight ** tempering_power(self.log_weight, wanted))
 
 
 @dataclass(frozen=True, eq=False)

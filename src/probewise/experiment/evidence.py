@@ -18,9 +18,10 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.experiment.kinds import Posterior, n_samples_of_kind
-from probewise.experiment.smc import BRIEF, LocalKernels, evenly_weighted, particles_from_posterior
+from probewise.experiment.smc import BRIEF, LocalKernels, particles_from_posterior
 from probewise.inference.problem import SensorProblem
 from probewise.nested import LIVE_PER_PARAM, KernelMove, NestedResult, RemainingEvidence, Weighted, pareto_k, run
+from probewise.nested.importance import evenly_weighted
 from probewise.nested.weights import n_effective
 
 _MATTERS = 1e-3  # probability, by the raised odds, of a kind that is solved at a doubt
@@ -107,7 +108,7 @@ def posterior_from_prior(
     points = result.samples(n, rng=rng)
     at = problem.log_likelihood(points)
     log_z, error = result.log_z, result.log_z_error
-    best = evenly_weighted(problem.prior.names, points, at, log_z=log_z, log_z_error=error, n_calls=0)
+    best = evenly_weighted(problem.prior.names, points, at, log_z=log_z, log_z_error=error)
     if own.log_z > result.log_z - _BEHIND:
         best = max(best, own, key=lambda found: found.log_z)
         points = np.concatenate([points, own.samples(n // 2, rng=rng)])

@@ -207,25 +207,25 @@ def gain(kind: LightEffect, of: Extent) -> Effect:
 @light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
 def scale_of_x(kind: LightEffect, of: Extent) -> Effect:
     """Return a wrong scale of X alone, which no circle can imitate."""
-    return kind.linear(
-        of,
-        {"x": "1"},
-        0.01,
-        lambda value, theta, plan: replace(value, x_mm=value.x_mm * (1 + theta[:, :1])),
-        lambda mean, sd: _SCALE_SAYS.format(value_with_sd(mean[0], sd[0], factor=100), "X", "Y"),
-    )
+    return _scale_of_axis(kind, of, "x", "y")
 
 
 @light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
 def scale_of_y(kind: LightEffect, of: Extent) -> Effect:
     """Return a wrong scale of Y alone, which no circle can imitate."""
-    return kind.linear(
-        of,
-        {"y": "1"},
-        0.01,
-        lambda value, theta, plan: replace(value, y_mm=value.y_mm * (1 + theta[:, :1])),
-        lambda mean, sd: _SCALE_SAYS.format(value_with_sd(mean[0], sd[0], factor=100), "Y", "X"),
-    )
+    return _scale_of_axis(kind, of, "y", "x")
+
+
+def _scale_of_axis(kind: LightEffect, of: Extent, axis: str, other: str) -> Effect:
+    place = f"{axis}_mm"
+
+    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        return replace(value, **{place: getattr(value, place) * (1 + theta[:, :1])})
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        return _SCALE_SAYS.format(value_with_sd(mean[0], sd[0], factor=100), axis.upper(), other.upper())
+
+    return kind.linear(of, {axis: "1"}, 0.01, act, says)
 
 
 SINCE_CALIBRATION = (dark_level, gain)

@@ -26,6 +26,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
 from probewise.inference.problem import SensorProblem, checked_log_prob
 from probewise.nested import NestedResult, Weighted, pareto_k
+from probewise.nested.importance import evenly_weighted
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Prior
 
@@ -126,32 +127,6 @@ class Particles:
         return replace(self, weighted=replace(self.weighted, log_z=-math.inf, log_z_error=math.inf))
 
 
-def evenly_weighted(
-    names: tuple[str, ...],
-    theta: FloatArray,
-    log_likelihood: FloatArray,
-    *,
-    log_z: float,
-    log_z_error: float,
-    n_calls: int,
-    run: NestedResult | None = None,
-) -> Weighted:
-    """Return equally weighted samples with an evidence; theta (n, n_params), log_likelihood (n,)."""
-    n = len(theta)
-    return Weighted(
-        names,
-        theta,
-        log_likelihood=log_likelihood,
-        log_weight=np.full(n, -math.log(n)),
-        log_z=log_z,
-        log_z_error=log_z_error,
-        n_eff=float(n),
-        n_calls=n_calls,
-        pareto_k=-math.inf,
-        run=run,
-    )
-
-
 def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Particles:
     """Draw equally weighted samples of the prior, with evidence 1; ParameterError for a prior without mass."""
     theta = prior.from_unit_cube(rng.random((n_particles, len(prior.names))))
@@ -161,7 +136,7 @@ def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator)
             prior.names,
             "one with mass: its draws must have a density above zero. Do its bounds leave room for anything?",
         )
-    drawn = evenly_weighted(prior.names, theta, np.zeros(n_particles), log_z=0.0, log_z_error=0.0, n_calls=0)
+    drawn = evenly_weighted(prior.names, theta, np.zeros(n_particles))
     return Particles(drawn, np.arange(n_particles))
 
 

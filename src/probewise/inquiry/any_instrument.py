@@ -25,7 +25,7 @@ from probewise.errors import ParameterError, ShapeError, did_you_mean
 from probewise.inquiry.entropy import choose
 from probewise.inquiry.predictive import AnyNoise, ReadingNoise, expected_nats_above_goal, readings_given_noise
 from probewise.nested import Evaluator, Weighted, diversify, make_problem, run
-from probewise.nested.importance import draw_and_weigh, fit_wide_and_narrow_proposals
+from probewise.nested.importance import draw_and_weigh, evenly_weighted, fit_wide_and_narrow_proposals
 from probewise.nested.problem import AnyPrior, unbounded_space_of
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Joint, Prior, Product, require_prior
@@ -288,22 +288,7 @@ class ReadingsProblem:
 
 def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:
     """Draw `n` equally weighted samples of the prior, as the posterior without readings: its evidence is one."""
-    return _equal_weights(prior.names, prior.from_unit_cube(rng.random((n, len(prior.names)))), np.zeros(n))
-
-
-def _equal_weights(names: tuple[str, ...], theta: FloatArray, log_likelihood: FloatArray) -> Weighted:
-    n = len(theta)
-    return Weighted(
-        names,
-        theta,
-        log_likelihood=log_likelihood,
-        log_weight=np.full(n, -math.log(n)),
-        log_z=0.0,
-        log_z_error=0.0,
-        n_eff=float(n),
-        n_calls=0,
-        pareto_k=-math.inf,
-    )
+    return evenly_weighted(prior.names, prior.from_unit_cube(rng.random((n, len(prior.names)))), np.zeros(n))
 
 
 def updated_posterior(
@@ -386,14 +371,14 @@ def _moved(found: Weighted, problem: ReadingsProblem, rng: np.random.Generator) 
     """Resample and move the samples of a problem's posterior."""
     rows = resampled_rows(found.weight, len(found.theta), rng)
     theta, _ = diversify(found.theta[rows], problem, rng=rng, n_steps=_N_MOVES)
-    return _equal_weights(found.names, theta, problem.log_likelihood(theta))
+    return evenly_weighted(found.names, theta, problem.log_likelihood(theta))
 
 
 def nested_posterior(readings: ReadingsProblem, n: int, n_live: int, *, rng: np.random.Generator) -> Weighted:
     """Return `n` samples of the posterior by nested sampling of all readings with `n_live` points."""
     found = run(readings, rng=rng, n_live=n_live)
     theta = found.samples(n, rng=rng)
-    start = _equal_weights(found.names, theta, readings.log_likelihood(theta))
+    start = evenly_weighted(found.names, theta, readings.log_likelihood(theta))
     return replace(_moved(start, readings, rng), log_z=found.log_z, log_z_error=found.log_z_error, run=found)
 
 

@@ -111,6 +111,32 @@ class Weighted(Samples):
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.doubts)])
 
 
+def evenly_weighted(
+    names: tuple[str, ...],
+    theta: FloatArray,
+    log_likelihood: FloatArray,
+    *,
+    log_z: float = 0.0,
+    log_z_error: float = 0.0,
+    n_calls: int = 0,
+    run: NestedResult | None = None,
+) -> Weighted:
+    """Return equally weighted samples, theta (n, n_params) and log_likelihood (n,), and an evidence, by default one."""
+    n = len(theta)
+    return Weighted(
+        names,
+        theta,
+        log_likelihood=log_likelihood,
+        log_weight=np.full(n, -math.log(n)),
+        log_z=log_z,
+        log_z_error=log_z_error,
+        n_eff=float(n),
+        n_calls=n_calls,
+        pareto_k=-math.inf,
+        run=run,
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Proposal:
     """A mixture of Student-t kernels, of one shape within each cluster.

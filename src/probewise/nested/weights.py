@@ -34,6 +34,13 @@ def power_bracket(
     return low, high
 
 
+def tempering_power(log_weight: FloatArray, wanted: float) -> float:
+    """Return the largest power up to 1 of weights, (n,), that leaves an effective sample size of `wanted`."""
+    if n_effective(log_weight) >= wanted:
+        return 1.0
+    return power_bracket(lambda power: power * log_weight, 0.0, 1.0, wanted=wanted, n_steps=30)[0]
+
+
 def resampled_rows(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
     """Draw rows by weight with systematic resampling, (n_weights,) -> (n,): counts are n w rounded up or down.
 

@@ -7,17 +7,17 @@ of the tasks, so that nothing depends on the executor.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeAlias, TypeVar
 
+from probewise._tasks import results_as_tasks_end
 from probewise._writing import write_and_sync
-from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, shown
+from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
 
@@ -97,7 +97,7 @@ def run_campaign(
         left = {key: task for key, task in tasks.items() if key not in done}
         with (
             _ResultLog(path, wanted, fresh=before is None) as lines,
-            _results_as_tasks_end(work, left, executor) as ended,
+            results_as_tasks_end(work, left, executor) as ended,
         ):
             progress(noun, len(done), len(tasks))
             for key, result in ended:
@@ -168,31 +168,3 @@ class _ResultLog:
             ) from error
         write_and_sync(self._file, self._path, line.encode() + b"\n")
         return line
-
-
-@contextlib.contextmanager
-def _results_as_tasks_end(
-    work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
-) -> Iterator[Iterator[tuple[str, Result]]]:
-    """Yield an iterator over (key, result), in the order in which tasks end; at exit, cancel tasks not begun."""
-    if executor is None:
-        yield ((key, work(task)) for key, task in tasks.items())
-        return
-    futures: dict[Future[Result], str] = {executor.submit(work, task): key for key, task in tasks.items()}
-    try:
-        yield ((futures[future], _result_of_future(future)) for future in as_completed(futures))
-    finally:
-        for future in futures:
-            future.cancel()
-
-
-def _result_of_future(future: Future[Result]) -> Result:
-    """Return a task's result; raise NotConvergedError if its worker died, LinkError if its executor dropped it."""
-    try:
-        return future.result()
-    except CancelledError as error:
-        raise LinkError("the executor dropped its tasks: the connection to its scheduler was lost") from error
-    except BrokenExecutor as error:
-        raise NotConvergedError(
-            f"a worker died ({error}); finished results are kept, and the same command continues from there"
-        ) from error

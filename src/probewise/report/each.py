@@ -58,13 +58,17 @@ def _cell(value: str | float | None) -> str:
 
 def summary(rows: Sequence[DeviceRow]) -> str:
     """Say how many devices have what, most frequent first."""
-    counts = Counter(row.ails for row in in_order(rows)).most_common()
+    counts = _counts(rows)
     return f"{count_with_noun(len(rows), 'recording')}: {', '.join(f'{ails} ({n})' for ails, n in counts)}"
+
+
+def _counts(rows: Sequence[DeviceRow]) -> list[tuple[str, int]]:
+    return Counter(row.ails for row in in_order(rows)).most_common()
 
 
 def counts_svg(rows: Sequence[DeviceRow]) -> bytes:
     """Draw the number of devices by what ails them; return an SVG."""
-    counts = Counter(row.ails for row in in_order(rows)).most_common()[::-1]
+    counts = _counts(rows)[::-1]
     (ax,) = stack_of_axes([0.7 + 0.3 * len(counts)])
     ax.barh([ails for ails, _ in counts], [n for _, n in counts], color=BLUE)
     ax.set_xlabel("recordings")

@@ -2,10 +2,11 @@
 Five systems, and what their simulators leave out
 =================================================
 
-Shows one diagnosis for five kinds of instrument: a load cell, an oven, a linear stage, a thermometer and a filter. The
-load cell is real: Pontius's calibration of a load cell, 40 readings in two passes, from the Statistical Reference
-Datasets of NIST, which are in the public domain. NIST fits it with a parabola; the simulator here is a straight line.
-The other four are recorded here with one effect concealed in each, which no simulator knows.
+Shows one diagnosis for five kinds of instrument: a load cell, an ozone monitor, a linear stage, a thermometer and a
+photodiode. The first two are real, from the Statistical Reference Datasets of NIST, which are in the public domain:
+Pontius's calibration of a load cell, 40 readings in two passes, and Norris's of an ozone monitor, 36 readings. NIST
+fits the first with a parabola and the second with a line; the simulator of both is a line. The other three are recorded
+here with one effect concealed in each, which no simulator knows.
 """
 
 # %%
@@ -44,24 +45,31 @@ passes = {
 }
 
 # %%
-# Four are recorded here. The temperature of the oven's room varies, which its simulator does not use; the stage has
-# backlash; the thermometer lags behind the bath; the photodiode's amplifier saturates at 2.5 V.
+# The ozone monitor of Norris: what it shows (ppm) beside a standard (ppm), in the order of recording.
+
+SHOWN_AND_STANDARD_PPM = """
+.1 .2 338.8 337.4 118.1 118.2 888.0 884.6 9.2 10.1 228.1 226.5 668.5 666.3 998.5 996.3 449.1 448.6 778.9 777.0
+559.2 558.2 .3 .4 .1 .6 778.1 775.5 668.8 666.9 339.3 338.0 448.9 447.5 10.8 11.6 557.7 556.0 228.3 228.1 998.0 995.8
+888.8 887.6 119.6 120.2 .3 .3 .6 .3 557.6 556.8 339.3 339.1 888.0 887.2 998.5 999.0 778.9 779.0 10.2 11.1 117.6 118.3
+228.9 229.2 668.4 669.1 449.2 448.9 .2 .5
+"""
+ozone_monitor = Simulator(
+    "shown_ppm",
+    "ppm",
+    {"offset_ppm": (-20, 20), "slope": (0.5, 1.5)},
+    noise=Noise(step=0.1),
+    simulate=lambda p, data: p["offset_ppm"] + p["slope"] * data["standard_ppm"],
+)
+shown_ppm, standard_ppm = np.array(SHOWN_AND_STANDARD_PPM.split(), dtype=float).reshape(-1, 2).T
+comparison = {"standard_ppm": standard_ppm, "shown_ppm": shown_ppm}
+
+# %%
+# Three are recorded here. The stage has backlash; the thermometer lags behind the bath; the photodiode's amplifier
+# saturates at 2.5 V.
 
 N = 120
 TIME_S = 10.0 * np.arange(N)
 noisy = partial(rng.normal, size=N)
-
-room_c = 20 + 2 * np.sin(TIME_S / 300) + 0.2 * noisy(0, 1)
-power_w = np.repeat(rng.uniform(0, 80, N // 10), 10)
-oven_recording = {"t_s": TIME_S, "power_w": power_w, "room_c": room_c}
-oven_recording["temp_c"] = 22 + 0.9 * power_w + 0.8 * (room_c - 20) + noisy(0, 0.5)
-oven = Simulator(
-    "temp_c",
-    "degC",
-    {"start_c": (0, 50), "gain_c_per_w": (0, 3)},
-    time="t_s",
-    simulate=lambda p, data: p["start_c"] + p["gain_c_per_w"] * data["power_w"],
-)
 
 asked_mm = 40 + 40 * np.sin(TIME_S / 110) + 15 * np.sin(TIME_S / 37)
 half_mm, there_mm = 0.06, [asked_mm[0]]
@@ -100,15 +108,15 @@ photodiode = Simulator(
 )
 
 # %%
-# The same call for each. After a colon, a name says on which column or parameter the effect acts, as in
-# "sensitivity:room_c". Names that these readings cannot tell apart are given together.
+# The same call for each. After a colon, a name says on which parameter or column the effect acts, as in "steps:slope".
+# Names that these readings cannot tell apart are given together.
 
 systems = {
-    "load cell (NIST, Pontius)": (load_cell, passes, "load_lb", "load (lb)"),
-    "oven": (oven, oven_recording, "room_c", "room (degC)"),
-    "linear stage": (stage, stage_recording, "t_s", "time (s)"),
-    "thermometer": (thermometer, bath_recording, "t_s", "time (s)"),
-    "photodiode": (photodiode, diode_recording, "distance_mm", "distance (mm)"),
+    "load cell (NIST, Pontius)": (load_cell, passes, passes["load_lb"], "load (lb)"),
+    "ozone monitor (NIST, Norris)": (ozone_monitor, comparison, np.arange(36), "row, in the order of recording"),
+    "linear stage": (stage, stage_recording, TIME_S, "time (s)"),
+    "thermometer": (thermometer, bath_recording, TIME_S, "time (s)"),
+    "photodiode": (photodiode, diode_recording, distance_mm, "distance (mm)"),
 }
 found = {name: diagnose_system(own, table, rng=rng) for name, (own, table, _, _) in systems.items()}
 for name, diagnosis in found.items():
@@ -118,11 +126,11 @@ for name, diagnosis in found.items():
 # The residuals of each simulator, and those of the repaired one.
 
 fig, axes = plt.subplots(len(systems), 1, figsize=(8, 11))
-for ax, (name, (own, table, column, label)) in zip(axes, systems.items(), strict=True):
+for ax, (name, (own, _, covariate, label)) in zip(axes, systems.items(), strict=True):
     repair = found[name].repair
     ax.axhline(0.0, color="0.8", linewidth=1)
-    ax.plot(table[column], repair.before.residuals, "o", markersize=3, color="tab:orange", label="as written down")
-    ax.plot(table[column], repair.after.residuals, "o", markersize=3, color="tab:blue", label="repaired")
+    ax.plot(covariate, repair.before.residuals, "o", markersize=3, color="tab:orange", label="as written down")
+    ax.plot(covariate, repair.after.residuals, "o", markersize=3, color="tab:blue", label="repaired")
     ax.set_title(f"{name}: {' or '.join(found[name].judged.credible[:2])}", loc="left", fontsize=10)
     ax.set_xlabel(label)
     ax.set_ylabel(f"residual ({own.unit})")

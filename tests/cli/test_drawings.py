@@ -56,7 +56,7 @@ class InThisProcess(Executor):
 @pytest.fixture
 def short_demo(monkeypatch):
     """A demo of few readings."""
-    monkeypatch.setattr("probewise.cli._workers.worker_pool", lambda n: InThisProcess())
+    monkeypatch.setattr("probewise.cli._executor.worker_pool", lambda n: InThisProcess())
     for name, n in (("N_LIVE", 80), ("N_LIVE_ROBOT", 40), ("MAX_READINGS", 3), ("MAX_READINGS_DOUBT", 2)):
         monkeypatch.setattr(demo, name, n)
 

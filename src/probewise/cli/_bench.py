@@ -62,9 +62,6 @@ from probewise.recordings import (
     Ramp,
     Stripes,
     Uniform,
-    paper_plan,
-    read_plan,
-    two_way_plan,
 )
 
 if TYPE_CHECKING:
@@ -338,11 +335,6 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
 
 
 # Adapting a plan to an arm: unit, range and step of its readings, and the columns that can be commanded
-
-
-def read_or_shipped_plan(text: str) -> Plan:
-    """Return the shipped plan "paper" or "two_way", or read a plan from the file of that name."""
-    return paper_plan() if text == "paper" else two_way_plan() if text == "two_way" else read_plan(text)
 
 
 def plan_for_own_instrument(

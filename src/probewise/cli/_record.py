@@ -31,7 +31,7 @@ from probewise.arm import (
 )
 from probewise.arm.carry_out import BY_HAND_S, duration_s, reachable_places_of
 from probewise.arm.geometry import wrapped_to_pi
-from probewise.cli._arm import SHIPPED, parse_arm, parse_place
+from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
 from probewise.cli._arm_tasks import (
     confirm_lowering,
     nxt_port,
@@ -43,7 +43,6 @@ from probewise.cli._bench import (
     plan_for_lego_arm,
     plan_for_own_instrument,
     prompter_for_answer,
-    read_or_shipped_plan,
     shifted_pattern,
     without_measured_covariates,
 )

@@ -71,13 +71,7 @@ def _module_of(verb: str) -> ModuleType:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb of the command line and return the exit status.
-
-    Parameters
-    ----------
-    argv
-        Arguments without the program's name; None takes those of the process.
-    """
+    """Run one verb of the command line, by default on the process's arguments, and return the exit status."""
     words = sys.argv[1:] if argv is None else list(argv)
     _replace_closed_streams()
     try:

@@ -105,21 +105,9 @@ def open_arm_and_bench(
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
     """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
 
-    Parameters
-    ----------
-    chosen
-        The arm, from `parse_arm`.
-    geometry, geometry_file
-        Geometry of the LEGO arm, and its file if given; with a file, the simulated arm has its reach.
-    sensor, scene, seed
-        For a simulated or emulated arm: the file of its sensor, the initial target, the seed of the noise.
-    start_s, n_taken
-        Time at the start, and number of readings of an earlier session.
-
-    Raises
-    ------
-    ParameterError
-        If the brick cannot read in the sensor's unit.
+    With a `geometry_file`, the simulated arm has the geometry's reach. A simulated or emulated arm has the sensor of
+    the file `sensor`, the initial target `scene`, and noise of this `seed`, after the `n_taken` readings of an earlier
+    session. Raises ParameterError if the brick cannot read in the sensor's unit.
     """
     if chosen.is_real:
         return open_real_arm(chosen, geometry, start_s=start_s), None
@@ -229,18 +217,8 @@ class MarkQuestion(str):
 class SimulatedBench:
     """A table under a simulated or an emulated arm, on which the program itself lays the patterns.
 
-    Parameters
-    ----------
-    world
-        World of the sensor.
-    scene
-        Initial target, in the format of `emulate-nxt`.
-    scale
-        Rounding and range of the simulated arm's readings.
-    seed
-        Seed of the noise.
-    n_taken
-        Number of readings of an earlier session, after which the noise continues.
+    `scene` is the initial target, in the format of `emulate-nxt`; `scale` rounding and range of the simulated arm's
+    readings; `seed` that of the noise, which continues after the `n_taken` readings of an earlier session.
     """
 
     def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
@@ -273,10 +251,7 @@ class SimulatedBench:
     def answer_at_mark(self, question: MarkQuestion) -> str:
         """Answer like a person who watches the emulated arm's sensor over a mark: "ok", or moves such as "x 5 down 2".
 
-        Raises
-        ------
-        ParameterError
-            If the arm is not an emulated one.
+        Raises ParameterError if the arm is not an emulated one.
         """
         if self._stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")

@@ -32,8 +32,7 @@ def refuse_sensor(sensor: Path | None) -> None:
 def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
     """Read tables of one system; return them joined, and notes on their columns.
 
-    Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,
-    ParameterError if two tables are the same.
+    Raises FileError for one that cannot be read or used, or lacks a column, ParameterError if two are the same.
     """
     from probewise.systems import as_recording, concatenate_tables, read_table_for
 

@@ -110,16 +110,8 @@ def figure_drawers(
 ) -> dict[str, Callable[[], bytes]]:
     """List all figures of the demo but the diagnosis's by file name, as functions that draw PNGs.
 
-    Parameters
-    ----------
-    calibration, recording, prediction
-        The sensor model, the recording it was fitted to, and its prediction of that recording.
-    searches
-        The naive and the SSF robot's search from an empty field.
-    started_alike
-        Both robots' searches from the same first reading, with places chosen by the paper's rule.
-    geometry
-        Of the arm.
+    `searches` are the naive and the SSF robot's from an empty field, `started_alike` from the same first reading, with
+    places chosen by the paper's rule.
     """
     hidden = started_alike[0].truth_mm
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
@@ -189,24 +181,11 @@ def page_html(
     seed: int,
     seconds: float,
 ) -> str:
-    """Return the HTML of the demo's page.
+    """Return the HTML of the demo's page, of what `figure_drawers` takes and more.
 
-    Parameters
-    ----------
-    calibration, recording, prediction, searches, started_alike
-        See `figure_drawers`.
-    frames
-        PNG of each step of each search.
-    diagnosis
-        Of the second recording.
-    doubt
-        The search of the robot that trusts its sensor model, and of the one that doubts it.
-    drawn
-        From `figure_drawers`, `diagnosis_figure_drawers` and `doubt_figure_drawers`.
-    concealed
-        Name of the effect that the simulated world concealed in the second recording.
-    seed, seconds
-        Seed and duration of this run.
+    `frames` has a PNG of each step of each search; `doubt` the search of the robot that trusts its sensor model, and of
+    the one that doubts it; `drawn` all figures by name; `concealed` names the effect that the simulated world concealed
+    in the second recording, whose `diagnosis` this is.
     """
     sections = [
         _sensor_section(calibration, recording, prediction, drawn, seed),

@@ -47,24 +47,11 @@ def draw_robot_view(
     lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the robot's view of the field after a step, as in the paper; return the axes.
+    """Draw the robot's view of the field after a step of an experiment, as in the paper; return the axes.
 
-    Parameters
-    ----------
-    step, experiment
-        Posterior after the step, and the experiment it belongs to.
-    readings
-        x_mm, y_mm and value of the readings up to this step.
-    levels
-        Readings over black and white.
-    truth_mm
-        Outline of the true shape, (n_vertices, 2), where known.
-    drawn
-        The map drawn; by default that from which the robot chose.
-    title
-        Title; by default the number of readings and of bits known.
-    lego_scale
-        Whether to add the paper's coordinates at the top.
+    `readings` are x_mm, y_mm and value up to this step, `levels` the readings over black and white; `truth_mm` is the
+    outline of the true shape, (n_vertices, 2), where known; `drawn` the map, by default that from which the robot
+    chose; `lego_scale` adds the paper's coordinates at the top.
     """
     seen = np.asarray(readings, dtype=np.float64).reshape(-1, 3)
     pose, drawn = step.next_pose, drawn or step.map
@@ -109,7 +96,7 @@ def robot_views_by_model_png(
 ) -> bytes:
     """Draw the posteriors of several sensor models from the same readings, one below the other; return a PNG.
 
-    Each of `views` is a title, a step and the experiment it belongs to; the rest is as in `draw_robot_view`.
+    Each of `views` is a title, a step and its experiment; the rest is as in `draw_robot_view`.
     """
     axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
@@ -129,8 +116,8 @@ def live_page_html(
 ) -> str:
     """Return the HTML of a running exploration's page after `step`; it reloads every second until the run ends.
 
-    `picture` is a PNG. If `trust` in the sensor model is below 1, the probabilities of its possible faults follow,
-    after each of the `earlier` steps and this one; `draw` makes their figure.
+    If `trust` in the sensor model is below 1, the probabilities of its possible faults follow, after each of the
+    `earlier` steps and this one; `draw` makes their figure.
     """
     reason = stop_reason_with_checks((*earlier, step))
     state = "The robot works" if reason is None else f"The robot has stopped: {reason}"
@@ -200,10 +187,7 @@ def summary_sentence(run: Exploration) -> str:
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
-    """Build the table of the shape that an exploration found.
-
-    Columns: each parameter's unit, mean, sd, the arm's part of the sd if known, 95 % interval; the truth if given.
-    """
+    """Build the table of the shape that an exploration found, with the arm's part of the sd and the truth, if known."""
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm_error is not None else ()
@@ -257,9 +241,8 @@ def page_html(
 ) -> str:
     """Return the HTML of an exploration's page.
 
-    `frames` are PNGs of the steps; `model` is the name of the sensor model; `truth` are the parameters of the true
-    shape by name, where known; `beside` are steps of other sensor models, updated with the same readings, by name of
-    the model; `unit` is the readings'; `draw` makes the curves.
+    `frames` are PNGs of the steps; `truth` are the parameters of the true shape by name, where known; `beside` are
+    steps of other sensor models, updated with the same readings, by the model's name; `draw` makes the curves.
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}

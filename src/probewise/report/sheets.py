@@ -88,14 +88,8 @@ class Tile:
 def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     """Split a sheet into pages, portrait or landscape, whichever needs fewer; `paper` is "a4" or "letter".
 
-    Returns
-    -------
-    The tiles row by row from below, each row from the left.
-
-    Raises
-    ------
-    ParameterError
-        If it needs more than 400 pages, or the paper size is unknown.
+    Return the tiles row by row from below, each row from the left. ParameterError if it needs more than 400 pages, or
+    the paper is unknown.
     """
     if paper not in PAPERS_MM:
         raise ParameterError("paper", paper, " or ".join(PAPERS_MM))
@@ -124,14 +118,9 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
-    """Make one sheet per pattern, which reaches 40 mm or more beyond the plan's readings.
+    """Make one sheet per pattern that the plan uses, which reaches 40 mm or more beyond the plan's readings.
 
-    Parameters
-    ----------
-    patterns
-        By name.
-    plan
-        The plan; patterns that it does not use are left out. None: the sheets show each pattern's own extent.
+    Without a plan, the sheets show each pattern's own extent.
     """
     sheets = []
     for name, pattern in patterns.items():

@@ -41,8 +41,7 @@ def arm_and_sensor(
 ) -> AxesGrid:
     """Draw the arm as it reads at a place, from the side and from above, and its sensor from below (paper, figure 1).
 
-    `outline_mm`, (n_vertices, 2), is that of the target on the field. Return the axes, (1, 3). ReachError if the arm
-    cannot read at `place_mm`.
+    `outline_mm`, (n_vertices, 2), is the target's. Return the axes, (1, 3). ReachError if `place_mm` is out of reach.
     """
     base, shoulder, elbow = geometry.angles_rad(np.array([place_mm]), geometry.read_height_mm)[0].tolist()
     if not np.isfinite(base):
@@ -63,8 +62,7 @@ def arm_and_sensor(
 def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring; return the axes.
 
-    The sensor reads at the distance `away_mm` from the base's axis, by default in the middle of its reach; ReachError
-    if it cannot.
+    The sensor reads `away_mm` from the base's axis, by default in the middle of its reach; ReachError if it cannot.
     """
     away = (geometry.nearest_mm + geometry.farthest_mm) / 2 if away_mm is None else away_mm
     middle = (geometry.base.low_rad + geometry.base.high_rad) / 2
@@ -135,8 +133,8 @@ def draw_sensor_face(
 ) -> None:
     """Draw the sensor seen from below: package, photodiode (white), LED (red) and the ridge between them.
 
-    `center` and `size` are the middle and the width of the package in the axes' units. It is turned anticlockwise in
-    the drawing; at 0 the photodiode is at the top. `zorder` is that of the lowest part.
+    `size` is the width of the package in the axes' units; it is turned anticlockwise, at 0 the photodiode is at the
+    top.
     """
     turn = Affine2D().scale(size).rotate(turned_rad).translate(*center) + ax.transData
     parts = (
@@ -212,8 +210,8 @@ def reach_map(
 ) -> Axes:
     """Draw an arm's reach over the field, coloured by the sensor's orientation.
 
-    `orientation_rad`, (n_y, n_x), lower row first, is NaN out of reach; `x_mm`, (n_x,), and `y_mm`, (n_y,), are the
-    places of columns and rows; `axis_mm` is that of the arm's axis.
+    `orientation_rad`, (n_y, n_x), lower row first, at the places `x_mm` and `y_mm`, is NaN out of reach; `axis_mm` is
+    the place of the arm's axis.
     """
     ax = axes_or_new(ax, size_in=(8.2, 5.0))
     degrees = _unwrapped_about_mean_deg(np.degrees(orientation_rad))

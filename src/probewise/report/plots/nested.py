@@ -113,11 +113,10 @@ def corner_plot(
 ) -> AxesGrid:
     """Draw the marginal posterior of each parameter, and 68 % and 95 % regions of each pair.
 
-    Intervals of single parameters are central ones; up to six parameters also have their median and 95 % interval
-    written above. Regions of pairs are those of highest density, from a histogram of the weighted samples
-    smoothed by a kernel that narrows as the effective sample size grows. Up to six parameters fit the width of a page;
-    with more, the figure grows and its text does not shrink. `parameters` are the names to draw, in this order;
-    default: all.
+    Intervals of single parameters are central ones; up to six parameters, which fit the width of a page, also have
+    their median and 95 % interval written above. Regions of pairs are those of highest density, from a histogram of the
+    weighted samples smoothed by a kernel that narrows as the effective sample size grows. `parameters` are the names to
+    draw, in this order; default: all.
 
     Return the axes, (n, n), of the n parameters drawn; None above the diagonal, where axes given are hidden.
     ParameterError for an unknown name or none.

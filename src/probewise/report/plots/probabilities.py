@@ -154,19 +154,9 @@ def audit_matrix(
     """Draw the detectable share of each effect, and how well every other effect imitates it; fine effects come first.
 
     The matrix is not symmetric: the row is the effect that is present, at typical parameters; the column is the effect
-    it may be mistaken for, at its best-fitting parameters.
-
-    Parameters
-    ----------
-    names, detectability
-        Names of the effects, and whether each is "fine", "aliased" or "invisible".
-    cosines
-        Cosine of the row's change with the column's best imitation, (n_effects, n_effects), 0 where not compared; the
-        detectable share on the diagonal.
-    alias
-        Cosine from which two effects are aliased, and marked.
-    axes
-        Axes to draw on, (1, 2), with one y axis, which are returned; a new figure without.
+    it may be mistaken for, at its best-fitting parameters. `detectability` is "fine", "aliased" or "invisible";
+    `cosines`, (n_effects, n_effects), 0 where not compared, has the detectable share on the diagonal; from the cosine
+    `alias` on two effects are aliased, and marked. Return the axes, (1, 2), which share the y axis.
     """
     order = sorted(range(len(names)), key=lambda k: (list(_DETECTABILITY).index(detectability[k]), -cosines[k, k]))
     labels = [spoken_name(names[k]) for k in order]

@@ -217,9 +217,8 @@ def predicted_and_recorded_by_scan(
     """Draw recorded and predicted readings with the 95 % band of new readings (paper, figure 7).
 
     Each panel shows a scan over one pattern, the last one all single readings; of more than eight panels, evenly spaced
-    ones are drawn. `mean` is the predicted reading of each row and `sd` that of one new reading, (n_points,).
-
-    Return the axes, (n_rows, 3) (two columns where there are two or four panels, one for one panel).
+    ones are drawn. `mean` is the predicted reading of each row and `sd` that of one new reading, (n_points,). Return
+    the axes, (n_rows, 3) (two columns where there are two or four panels, one for one panel).
     """
     require_recording(recording)
     tracks, alone = tracks_and_single_rows(recording.plan)
@@ -290,10 +289,9 @@ def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArra
 def residuals_by_scan(
     recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9, columns: int = 3
 ) -> AxesGrid:
-    """Draw the residuals of two models along the `most` scans that the repair changes most, a panel each.
+    """Draw the residuals of two models along the `most` scans that the repair changes most, a panel each, on one scale.
 
-    `before` and `after` are the predictions of the calibrated and of the repaired model, (n_points,). All panels have
-    the same scales. Return the axes, (n_rows, columns); those without a scan are hidden.
+    `before` and `after` are predictions, (n_points,). Return the axes, (n_rows, columns).
     """
     require_recording(recording)
     tracks, _ = tracks_and_single_rows(recording.plan)
@@ -319,10 +317,8 @@ def readings_before_and_after_repair(
 ) -> AxesGrid:
     """Draw readings with the curves of two models, and below them the residuals, around where the models differ.
 
-    `rows`, (n_rows,), are those of one scan, or of several over one pattern in one orientation; `before` and `after`
-    are predictions, (n_points,); `name` is the title. Return the axes, (2, 1).
-
-    ParameterError if no three of the readings lie along a line.
+    `rows` are those of one scan, or of several over one pattern in one orientation; `before` and `after` are
+    predictions, (n_points,). Return the axes, (2, 1). ParameterError if no three of the readings lie along a line.
     """
     require_recording(recording)
     tracks, _ = tracks_and_single_rows(recording.plan.take(rows))

@@ -65,20 +65,9 @@ def mean_residuals_along(
 ) -> Axes:
     """Draw mean residuals against a covariate, the 95 % band of chance, and the interval that is significant.
 
-    Parameters
-    ----------
-    means
-        From `mean_residuals`.
-    label, unit
-        Label of the covariate with its unit; unit of the readings.
-    each
-        Covariate and residual of every reading, (n_points,) each, drawn as dots behind.
-    window
-        Ends of the significant interval, shaded unless it takes up most of the axis.
-    names
-        Names of the values 0, 1, 2 ... of a categorical covariate.
-    after
-        Name of the later of the two models.
+    `each` holds covariate and residual of every reading, (n_points,) each, drawn as dots behind; `window` is the
+    significant interval, shaded unless it takes up most of the axis; `names` are those of the values 0, 1, 2 ... of a
+    categorical covariate; `after` is the name of the later of the two models.
     """
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     if each is not None:
@@ -120,11 +109,10 @@ def scan_with_residuals(
     label: str,
     unit: str,
 ) -> AxesGrid:
-    """Draw the readings of one scan with each model's predictions, and below them the residuals.
+    """Draw the readings of one scan with each model's predictions, and below them the residuals; return the axes, (2,).
 
     `along`, `readings` and the predictions of the `models` (name and predictions, the calibrated model first) have the
-    shape (n_rows,), NaN where there is no usable reading. Without `joined`, no curve joins the rows. `label` is that of
-    the x axis with its unit, `unit` the readings'. Return the two axes, (2,).
+    shape (n_rows,), NaN where there is no usable reading. Without `joined`, no curve joins the rows.
     """
     axes = stack_of_axes([2.5, 2.0])
     above, below = axes
@@ -160,8 +148,7 @@ def residuals_against_covariates(
 ) -> AxesGrid:
     """Draw all residuals against each covariate, with running means, one panel per covariate; return the axes, (n,).
 
-    `covariates` are labels with units, and values, (n_points,); `models` names and residuals, (n_points,), NaN where
-    there is no usable reading, the calibrated model first; `unit` is the readings'.
+    `covariates` are labels and values, `models` names and residuals, (n_points,), the calibrated model first.
     """
     axes = stack_of_axes([2.2] * len(covariates))
     for ax, (label, at) in zip(axes, covariates, strict=True):

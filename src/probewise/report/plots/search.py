@@ -65,16 +65,12 @@ def playing_field(
         Utility of a reading at each place, such as its bits, (n_y, n_x), lower row first; NaN out of the arm's reach.
     x_mm, y_mm
         Places of the columns and rows, shapes (n_x,) and (n_y,).
-    outlines_mm
-        Outline of each sampled hypothesis, shape (n_vertices, 2) each.
+    outlines_mm, truth_mm
+        Outline of each sampled hypothesis, and of the true target, drawn dashed, (n_vertices, 2) each.
     places_mm, readings
         Places of the readings, shape (n_readings, 2), and their values, (n_readings,).
     levels
         Reading of black and of white, for the brightness of the squares.
-    next_mm
-        The place chosen next.
-    truth_mm
-        Outline of the true target, drawn dashed; None if unknown.
     cards_mm
         Corners of each card whose place and albedo are known, (4, 2).
     utility_max

@@ -202,7 +202,7 @@ def _draw_sheet_part(
     """Draw the part of a sheet between two corners: pattern, lines, crosses and texts.
 
     `place` maps points, (n, 2), from the sheet to the page; nothing is drawn beyond the patch `clip`; without `named`,
-    crosses have their numbers only, and other texts are left out.
+    crosses have their numbers only.
     """
     for corners, albedo in _outlines_with_albedo(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))

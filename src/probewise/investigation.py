@@ -19,13 +19,7 @@ import numpy as np
 
 from probewise._arrays import own_arithmetic
 from probewise._display import ShowsItself
-from probewise._kinds import (
-    checked_number,
-    checked_whole,
-    require_accepts_positional,
-    require_kind,
-    require_rng,
-)
+from probewise._kinds import checked_number, checked_whole, require_accepts_positional, require_kind, require_rng
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
@@ -123,11 +117,7 @@ def investigate(
 
 
 def _rounds_until_stop(
-    record: Record,
-    plan: Plan,
-    diagnosed: Callable[..., Diagnosis],
-    budget: Budget,
-    rngs: list[np.random.Generator],
+    record: Record, plan: Plan, diagnosed: Callable[..., Diagnosis], budget: Budget, rngs: list[np.random.Generator]
 ) -> Generator[Round, None, None]:
     """Yield the rounds; `diagnosed` diagnoses all recordings so far, `rngs` has one generator per round."""
     recordings: list[Recording] = []

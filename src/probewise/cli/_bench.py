@@ -31,13 +31,7 @@ from probewise.arm import (
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli._arm import SCENE, ArmName
-from probewise.cli._common import (
-    DEFAULT_SEED,
-    CommandError,
-    parse_numbers,
-    print_warning,
-    write_to_terminal,
-)
+from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_warning, write_to_terminal
 from probewise.emulator import (
     EmulatedBench,
     SensorPose,
@@ -124,13 +118,7 @@ def open_arm_and_bench(
 
 
 def open_emulated_arm_and_bench(
-    geometry: Geometry,
-    geometry_file: Path | None,
-    world: World,
-    surface: Surface,
-    *,
-    seed: int,
-    start_s: float = 0.0,
+    geometry: Geometry, geometry_file: Path | None, world: World, surface: Surface, *, seed: int, start_s: float = 0.0
 ) -> tuple[LegoArm, EmulatedBench]:
     """Open the LEGO arm on an emulated brick over a simulated table; return the arm and the bench.
 

@@ -52,13 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     kept = partial(message_to_resume_campaign, cases, "case", arguments)
     with executor_and_progress(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
-            arguments.cases,
-            seed=arguments.seed,
-            work=work,
-            of=of,
-            path=cases,
-            executor=executor,
-            progress=progress,
+            arguments.cases, seed=arguments.seed, work=work, of=of, path=cases, executor=executor, progress=progress
         )
     rows = scored(results)
     options = ["--systems"] if arguments.systems else []

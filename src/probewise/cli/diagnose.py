@@ -77,14 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
     if arguments.simulator is not None:
         return _diagnose_simulator(arguments)
-    from probewise.diagnosis import (
-        NEXT_PLAN,
-        SensorAndShape,
-        audit_plan_of_diagnosis,
-        diagnose,
-        join,
-        weigh_thoroughly,
-    )
+    from probewise.diagnosis import NEXT_PLAN, SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
     from probewise.report import diagnosis as report
 
     drawings = Drawings(checked_output_directory(arguments.out))

@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING
 
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import (
-    MOST_BATCH,
-    add,
-    add_out,
-    add_quiet,
-    count_up_to,
-    finish,
-    parse_count,
-    parse_seed,
-)
+from probewise.cli._common import MOST_BATCH, add, add_out, add_quiet, count_up_to, finish, parse_count, parse_seed
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
 from probewise.errors import ParameterError
 

@@ -16,16 +16,7 @@ from probewise.experiment import left_out_after_step
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
-from probewise.report.html import (
-    Section,
-    definition_list,
-    element,
-    figure,
-    page,
-    paragraph,
-    slideshow,
-    table,
-)
+from probewise.report.html import Section, definition_list, element, figure, page, paragraph, slideshow, table
 from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.canvas import png
@@ -329,8 +320,7 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
         ),
     )
     explanations = Section(
-        "What it could be",
-        (figure(drawn["explanations.png"], "Probability of each explanation; they sum to one."),),
+        "What it could be", (figure(drawn["explanations.png"], "Probability of each explanation; they sum to one."),)
     )
     gain = diagnosis.improvement
     repair = [

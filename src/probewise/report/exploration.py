@@ -107,12 +107,7 @@ def robot_views_by_model_png(
 
 
 def live_page_html(
-    step: Step,
-    picture: bytes,
-    *,
-    earlier: Sequence[Step] = (),
-    trust: float = 1.0,
-    draw: Draw = draw_or_raise,
+    step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust: float = 1.0, draw: Draw = draw_or_raise
 ) -> str:
     """Return the HTML of a running exploration's page after `step`; it reloads every second until the run ends.
 

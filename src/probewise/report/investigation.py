@@ -41,12 +41,7 @@ def summary_sentence(found: Investigation) -> str:
 
 
 def page_html(
-    found: Investigation,
-    drawn: Mapping[str, bytes],
-    *,
-    source: str,
-    seed: int,
-    concealed: Sequence[str] | None = None,
+    found: Investigation, drawn: Mapping[str, bytes], *, source: str, seed: int, concealed: Sequence[str] | None = None
 ) -> str:
     """Return the HTML of an investigation's page; `drawn` has the last diagnosis's figures, and by_round.png.
 

@@ -334,10 +334,7 @@ def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, 
 
 
 def _draw_pair(
-    ax: Axes,
-    result: Posterior,
-    columns: tuple[int, int],
-    spans: tuple[tuple[float, float], tuple[float, float]],
+    ax: Axes, result: Posterior, columns: tuple[int, int], spans: tuple[tuple[float, float], tuple[float, float]]
 ) -> None:
     x, y = (result.theta[:, i] for i in columns)
     density, x_edges, y_edges = np.histogram2d(x, y, bins=48, range=spans, weights=result.weight)

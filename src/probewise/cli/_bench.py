@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from tqdm import tqdm
 
+from probewise import emulator, recordings
 from probewise._signals import raise_if_stopped
 from probewise.arm import (
     Geometry,
@@ -32,31 +33,7 @@ from probewise.arm import (
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli._arm import SCENE, ArmName
 from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_warning, write_to_terminal
-from probewise.emulator import (
-    EmulatedBench,
-    SensorPose,
-    Tabletop,
-    VirtualClock,
-    VirtualLine,
-    parse_scene,
-    read_geometry,
-    set_up_bench,
-    shipped_geometry_path,
-)
 from probewise.errors import ParameterError
-from probewise.recordings import (
-    Disc,
-    HalfPlane,
-    Image,
-    Instrumentation,
-    Pattern,
-    Plan,
-    Polygon,
-    Quadrant,
-    Ramp,
-    Stripes,
-    Uniform,
-)
 
 if TYPE_CHECKING:
     from probewise.world import Surface, World
@@ -119,16 +96,16 @@ def open_arm_and_bench(
 
 def open_emulated_arm_and_bench(
     geometry: Geometry, geometry_file: Path | None, world: World, surface: Surface, *, seed: int, start_s: float = 0.0
-) -> tuple[LegoArm, EmulatedBench]:
+) -> tuple[LegoArm, emulator.EmulatedBench]:
     """Open the LEGO arm on an emulated brick over a simulated table; return the arm and the bench.
 
     The clock runs as fast as possible. The emulator reads its own true geometry: `geometry_file`, or the shipped one.
     When the arm's `with` block ends, it warns if the sensor hit the table.
     """
-    clock = VirtualClock()
-    numbers = read_geometry(geometry_file or shipped_geometry_path())
-    bench = set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
-    brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
+    clock = emulator.VirtualClock()
+    numbers = emulator.read_geometry(geometry_file or emulator.shipped_geometry_path())
+    bench = emulator.set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
+    brick = Brick(Link(emulator.VirtualLine(bench.radio, clock), clock=clock), clock=clock)
 
     class TableContactReporter(LegoArm):
         def __exit__(
@@ -145,7 +122,7 @@ def open_emulated_arm_and_bench(
     return TableContactReporter(BrickMachine(brick, geometry), geometry, clock=clock, start_s=start_s), bench
 
 
-def world_and_instrumentation(sensor: Path | None) -> tuple[World, Instrumentation | None]:
+def world_and_instrumentation(sensor: Path | None) -> tuple[World, recordings.Instrumentation | None]:
     """Return the world and instrumentation of a sensor.json; for None the shipped recordings' world, and None."""
     if sensor is None:
         from probewise.world.shipped import true_world
@@ -211,8 +188,8 @@ class SimulatedBench:
 
     def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
         self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
-        self._table = Tabletop(parse_scene(scene))
-        self._stand: Callable[[], SensorPose] | None = None
+        self._table = emulator.Tabletop(emulator.parse_scene(scene))
+        self._stand: Callable[[], emulator.SensorPose] | None = None
 
     def open_simulated_arm(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
         """Return the simulated arm over the table; its sensor takes any orientation."""
@@ -258,7 +235,7 @@ class SimulatedBench:
         return " ".join(words)
 
     def carry_out_request(
-        self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: RequestToPerson
+        self, patterns: Mapping[str, recordings.Pattern], origin_mm: tuple[float, float], request: RequestToPerson
     ) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if request.pattern is not None:
@@ -267,7 +244,7 @@ class SimulatedBench:
             self._table.turned_rad = request.turned_rad
 
 
-def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
+def shifted_pattern(pattern: recordings.Pattern, by_mm: tuple[float, float]) -> Surface:
     """Return a pattern shifted by `by_mm`; raise ParameterError for a ramp, which cannot be shifted."""
 
     def moved(place_mm: tuple[float, float]) -> tuple[float, float]:
@@ -277,21 +254,21 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
         return by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad)
 
     match pattern:
-        case Uniform():
+        case recordings.Uniform():
             return pattern
-        case HalfPlane():
+        case recordings.HalfPlane():
             return dataclasses.replace(pattern, offset_mm=pattern.offset_mm + along_mm(pattern.normal_rad))
-        case Quadrant():
+        case recordings.Quadrant():
             return dataclasses.replace(pattern, corner_mm=moved(pattern.corner_mm))
-        case Disc():
+        case recordings.Disc():
             return dataclasses.replace(pattern, center_mm=moved(pattern.center_mm))
-        case Polygon():
+        case recordings.Polygon():
             return dataclasses.replace(pattern, vertices_mm=tuple(map(moved, pattern.vertices_mm)))
-        case Stripes():
+        case recordings.Stripes():
             return dataclasses.replace(pattern, phase_mm=pattern.phase_mm + along_mm(pattern.normal_rad))
-        case Image():
+        case recordings.Image():
             return dataclasses.replace(pattern, origin_mm=moved(pattern.origin_mm))
-        case Ramp():
+        case recordings.Ramp():
             if by_mm != (0.0, 0.0):
                 raise ParameterError("--origin-mm", by_mm, "0,0 with a ramp, which is given in field coordinates")
             return pattern
@@ -301,8 +278,8 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
 
 
 def plan_for_own_instrument(
-    plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
-) -> Plan:
+    plan: recordings.Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
+) -> recordings.Plan:
     """Return the plan for a user's instrument: a given unit, range ("LOW,HIGH") or step replaces the plan's own.
 
     A new unit drops the plan's range, step and sensor. Measured covariates are left out.
@@ -324,7 +301,7 @@ def _parse_declared(option: str, text: str, n: int, allowed: str) -> tuple[float
     return numbers
 
 
-def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
+def plan_for_lego_arm(plan: recordings.Plan, geometry: Geometry) -> recordings.Plan:
     """Return the plan for the LEGO arm: in LEGO units, 1 to 100, at its reading height; no measured covariates."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
@@ -338,7 +315,7 @@ def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
     return without_measured_covariates(plan, instrumentation)
 
 
-def without_measured_covariates(plan: Plan, instrumentation: Instrumentation) -> Plan:
+def without_measured_covariates(plan: recordings.Plan, instrumentation: recordings.Instrumentation) -> recordings.Plan:
     """Return the plan by an instrumentation, with the covariates that can be commanded: controls, LED and height."""
     plan = dataclasses.replace(plan, instrumentation=instrumentation)
     can = {*plan.instrumentation.controls, "led", "height_mm"}

@@ -34,5 +34,5 @@ plots.spatial_sensitivity(calibration.sensor.field, ax=ax)
 # %%
 # Standardised residuals: 95 % should lie between the dashed lines.
 prediction = predict(calibration.sensor, recording.plan, recording.readings)
-fig, ax = plt.subplots(figsize=(8, 3))
+fig, ax = plt.subplots(figsize=(8, 3), layout="constrained")
 plots.standardised_residuals(recording, prediction.mean, prediction.sd, ax=ax)

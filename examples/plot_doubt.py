@@ -60,7 +60,7 @@ for ax, (trust, (experiment, found)) in zip(axes, runs.items(), strict=True):
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
     exploration.draw_robot_view(found.last, experiment, places, levels=(10.0, 60.0), ax=ax)
     ax.add_patch(plt.Circle(hidden.center_mm, hidden.radius_mm, fill=False, linestyle=":", linewidth=2, color="white"))
-    ax.set_title(f"trust {trust:g} (dotted: the true circle)", loc="right")
+    ax.set_title(f"{'trusting' if trust == 1 else 'doubting'} robot (dotted: the true circle)", loc="right")
 
 # %%
 # What the second robot believes about its sensor, reading by reading.

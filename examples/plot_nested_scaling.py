@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from matplotlib.ticker import MaxNLocator, NullFormatter
 
 near = (Path("docs"), Path("../docs"), Path(sys.argv[0]).resolve().parent.parent / "docs")
 file = next(path for docs in near if (path := docs / "results" / "nested_scaling.json").exists())
@@ -24,10 +25,18 @@ for name, study in studies.items():
 def draw(name, label, quantities):
     """Plot quantities of one study against its size, logarithmic axes, a panel each."""
     points = studies[name]["points"]
-    _, axes = plt.subplots(1, len(quantities), figsize=(3.4 * len(quantities), 3), layout="constrained")
+    size = (3.6 * len(quantities), 3)
+    _, axes = plt.subplots(1, len(quantities), figsize=size, layout="constrained")
     for ax, (key, title) in zip(axes, quantities.items(), strict=True):
-        ax.loglog([p["size"] for p in points], [p[key] for p in points], "o-")
-        ax.set(xlabel=label, ylabel=title)
+        values = [p[key] for p in points]
+        ax.loglog([p["size"] for p in points], values, "o-")
+        ax.set_xlabel(label)
+        ax.set_title(title, fontsize="medium", loc="left")
+        for axis, shown in ((ax.xaxis, [p["size"] for p in points]), (ax.yaxis, values)):
+            axis.set_minor_formatter(NullFormatter())
+            if max(shown) < 50 * min(shown):  # hardly a decade: powers of ten would be few
+                axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+                axis.set_major_formatter(lambda value, _: f"{value:g}")
         ax.grid(True, which="both", alpha=0.3)
 
 

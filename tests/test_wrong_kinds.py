@@ -24,28 +24,12 @@ from probewise.diagnosis import (
 )
 from probewise.effects import VOCABULARY, Effect
 from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
-from probewise.experiment import (
-    Experiment,
-    Exploration,
-    as_shape,
-    experiment_for,
-    explore,
-    result_json,
-    samples_csv,
-)
+from probewise.experiment import Experiment, Exploration, as_shape, experiment_for, explore, result_json, samples_csv
 from probewise.inference import GaussianKnown, Naive, Rounded, SensorProblem, StudentT
 from probewise.investigation import Budget, investigate
 from probewise.nested import NestedResult, RemainingEvidence, SliceMove, diversify, run
 from probewise.priors import Joint, LogUniform, Normal, Product, Uniform
-from probewise.recordings import (
-    HalfPlane,
-    Plan,
-    Recording,
-    read_plan,
-    read_recording,
-    write_plan,
-    write_recording,
-)
+from probewise.recordings import HalfPlane, Plan, Recording, read_plan, read_recording, write_plan, write_recording
 from probewise.report.plots import corner_plot, readings_by_orientation, spatial_sensitivity
 from probewise.scene import AnyOf, Circle, Field, HypothesisScene, KnownScene, Rectangle, RegularPolygon
 from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture, NaiveSensor

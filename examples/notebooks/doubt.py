@@ -56,7 +56,7 @@ for name, found in (("trusts its sensor", trusting), ("doubts its sensor", doubt
 # circle.
 axes = plots.grid_of_axes(1, 2, size_in=(13.0, 4.2))
 outline_mm = outlines(circle.region(truth[None]))[0]
-for ax, name, found in zip(axes[0], ("trust 1", "trust 0.9"), (trusting, doubting), strict=True):
+for ax, name, found in zip(axes[0], ("trusting", "doubting"), (trusting, doubting), strict=True):
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
     title = f"{name}, after {len(places)} readings"
     exploration.draw_robot_view(

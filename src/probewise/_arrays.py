@@ -37,12 +37,8 @@ def own_arithmetic(function: Callable[P, T]) -> Callable[P, T]:
 def floats(values: ArrayLike, name: str = "values") -> FloatArray:
     """Convert numbers (an array, a list, a column of a table) to an array of floats; a float64 array is not copied.
 
-    None becomes NaN, and so do the masked values of a masked array. `name` is that of the argument in messages.
-
-    Raises
-    ------
-    ParameterError
-        If there is a text, a date, a complex number, a set, a ragged list, or a whole number beyond floats.
+    None and masked values become NaN. Raises ParameterError, with the argument's `name`, for a text, a date, a complex
+    number, a set, a ragged list, or a whole number beyond floats.
     """
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(np.object_), np.nan)

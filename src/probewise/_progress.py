@@ -26,16 +26,10 @@ _WITHOUT = "{desc} [{elapsed}]{postfix}"
 
 @contextlib.contextmanager
 def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Iterator[Progress]:
-    """Yield a progress function (a `Progress`) whose display appears once the work has taken two seconds.
+    """Yield a progress function (a `Progress`), silent if `quiet`; its display appears after two seconds of work.
 
-    Parameters
-    ----------
-    quiet
-        Show nothing.
-    beat
-        Update the elapsed time between reports; False while the program prompts at the same terminal.
-    lines
-        Write lines of text where standard error is neither a terminal nor a notebook; False: nothing there.
+    `beat` updates the elapsed time between reports; False while the program prompts at the same terminal. Without
+    `lines` nothing is written where standard error is neither a terminal nor a notebook.
     """
     looked_at = sys.stderr.isatty() or "ipykernel" in sys.modules
     if quiet or not (looked_at or lines):
@@ -66,10 +60,7 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
 def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
     """Yield the caller's progress function, that of a bar in a terminal or notebook (True), or a silent one (False).
 
-    Raises
-    ------
-    ParameterError
-        If `progress` is none of these.
+    Raises ParameterError if `progress` is none of these.
     """
     if isinstance(progress, bool):
         with progress_shown(quiet=not progress, lines=False) as shown:

@@ -19,13 +19,7 @@ import numpy as np
 
 from probewise._arrays import own_arithmetic
 from probewise._display import ShowsItself
-from probewise._kinds import (
-    checked_number,
-    checked_whole,
-    require_accepts_positional,
-    require_kind,
-    require_rng,
-)
+from probewise._kinds import checked_number, checked_whole, require_accepts_positional, require_kind, require_rng
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
@@ -80,8 +74,8 @@ def investigate(
 ) -> Generator[Round, None, None]:
     """Yield rounds of an investigation until an explanation is settled, no reading would help, or the budget is spent.
 
-    A round, a recording and its diagnosis, is carried out only when it is asked for. An explanation is settled if it
-    has probability 0.95 and the verdict is not `cannot_tell`. There are at most `rounds` rounds.
+    A round, a recording and its diagnosis, is carried out only when it is asked for; the last has a `stop_reason`. An
+    explanation is settled if it has probability 0.95 and the verdict is not `cannot_tell`.
 
     Parameters
     ----------
@@ -100,14 +94,7 @@ def investigate(
     hands
         Whether a person can turn or exchange sheets; if not, plans only scan the sheet in place.
     rng
-        Random generator; each round has its own child, so that a resumed investigation is reproducible.
-    progress
-        Called at every step.
-
-    Yields
-    ------
-    Round
-        One per round; the last has a `stop_reason`.
+        Each round has its own child of it, so that a resumed investigation is reproducible.
 
     Raises
     ------
@@ -130,11 +117,7 @@ def investigate(
 
 
 def _rounds_until_stop(
-    record: Record,
-    plan: Plan,
-    diagnosed: Callable[..., Diagnosis],
-    budget: Budget,
-    rngs: list[np.random.Generator],
+    record: Record, plan: Plan, diagnosed: Callable[..., Diagnosis], budget: Budget, rngs: list[np.random.Generator]
 ) -> Generator[Round, None, None]:
     """Yield the rounds; `diagnosed` diagnoses all recordings so far, `rngs` has one generator per round."""
     recordings: list[Recording] = []
@@ -204,22 +187,10 @@ def _minutes_of_plan(plan: Plan, after_s: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round: its readings, and the diagnosis of all readings so far.
+    """One round: its recording, the plan in words (`reason_for_readings`), and the diagnosis of all readings so far.
 
-    Attributes
-    ----------
-    number
-        Number of the round, from 1.
-    recording
-        Recording of this round.
-    reason_for_readings
-        The plan of this round in words.
-    diagnosis
-        Diagnosis of this and all earlier readings.
-    stop_reason
-        Reason why the investigation ends here; None: it continues.
-    settled
-        Whether it ends because one hypothesis has probability 0.95 or more.
+    Rounds count from 1. `stop_reason` says why the investigation ends here (None: it continues), `settled` whether
+    because one hypothesis has probability 0.95 or more.
     """
 
     number: int
@@ -285,22 +256,10 @@ _KEPT_AGAIN_S = 0.5  # an arm takes longer per reading, so that none of its read
 
 
 class RoundsFolder:
-    """The folder of one investigation, in which the plan and the readings of its rounds are kept.
+    """The folder of one investigation: plan and readings of each round; made with the first round.
 
-    Parameters
-    ----------
-    path
-        The folder; created with the first round if missing.
-    settings
-        Settings that determine the investigation, as JSON takes them.
-    resume
-        Whether to resume the investigation in the folder.
-
-    Raises
-    ------
-    FileError
-        If the folder holds an investigation and `resume` is False, or holds none, or one with other settings, and
-        `resume` is True.
+    `settings`, as JSON takes them, determine the investigation. Raises FileError if the folder holds an investigation
+    and `resume` is False, or holds none, or one with other settings, and `resume` is True.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
@@ -389,10 +348,7 @@ class SimulatedRecorder:
 def parse_concealed(text: str) -> tuple[Concealed, ...]:
     """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing" for none.
 
-    Raises
-    ------
-    ParameterError
-        If an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
+    Raises ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
     """
     return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
 

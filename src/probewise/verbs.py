@@ -1,5 +1,7 @@
 """The main commands of the command line as Python functions, with the same names and defaults.
 
+Everywhere `rng` is the source of randomness: `np.random.default_rng(seed)` gives the result of the command with
+`--seed`; and `progress` whether to show a bar in a terminal or notebook, or your own function (`probewise.progress`).
 Each function's See Also names the version with every option. Heavy imports happen inside the functions, so that
 `import probewise` and `probewise --help` are quick.
 """
@@ -30,23 +32,7 @@ if TYPE_CHECKING:
     Table: TypeAlias = RunTable | Mapping[str, Any]
     AnySimulator: TypeAlias = Simulator | str | Path
 
-__all__ = [
-    "CALIBRATION",
-    "MAX_READINGS",
-    "METHOD",
-    "MODEL",
-    "N_LIVE",
-    "ORDERS",
-    "SHAPE",
-    "SHAPES",
-    "UTILITY",
-    "audit",
-    "calibrate",
-    "diagnose",
-    "explore",
-    "fit",
-    "predict",
-]
+__all__ = ["audit", "calibrate", "diagnose", "explore", "fit", "predict"]
 
 # Defaults of the command line and of the functions below.
 ORDERS = (1, 2, 3, 4)
@@ -93,10 +79,6 @@ def calibrate(
     nested_stop
         Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or
         "remaining" (ln Z can rise by 0.05 at most).
-    rng
-        Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise calibrate --seed`.
-    progress
-        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 
     Returns
     -------
@@ -161,6 +143,10 @@ def predict(
 ) -> Prediction | SystemPrediction:
     """Predict the readings of a plan, each with its sd; score those of a recording.
 
+    The result has the predictive mean and sd of a reading for each row, (n_points,), in the unit of the readings, and
+    the natural log density of each recorded reading, per unit of the reading; NaN where there is none or it is outside
+    the declared range.
+
     Parameters
     ----------
     model
@@ -170,15 +156,7 @@ def predict(
         Pose, time and pattern of every reading; or a recording, whose readings are then scored. Of a simulator a table
         of its columns: a dict of arrays, or a DataFrame.
     rng
-        Source of randomness, for a simulator, whose runs outside the recording are drawn.
-    progress
-        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
-
-    Returns
-    -------
-    Prediction or SystemPrediction
-        Predictive mean and sd of a reading for each row, (n_points,), in the unit of the readings; natural log density
-        of each recorded reading, per unit of the reading, NaN where there is none or it is outside the declared range.
+        Only for a simulator, whose runs outside the recording are drawn.
 
     Raises
     ------
@@ -241,7 +219,8 @@ def explore(
     """Let the robot find a shape, choosing each measurement itself.
 
     Without an `arm` it is simulated: `probewise.world` hides a shape on a field and computes the readings pixel by
-    pixel, with the SSF of `sensor` as the truth.
+    pixel, with the SSF of `sensor` as the truth. What `model`, `method`, `utility`, `learn_sensor`, `batch`,
+    `orientations_rad`, `heights_mm`, `repeats`, `trust` and `cards` mean is at `probewise.experiment.experiment_for`.
 
     Parameters
     ----------
@@ -260,43 +239,16 @@ def explore(
         geometry was fitted to marks, the arm's own error is part of the sds, and of the stopping rule.
     field
         Field of this width and height, `probewise.scene.Field(width_mm, height_mm)`; by default the paper's.
-    model
-        The robot's sensor model: "ssf" or "naive".
-    method
-        "particles": samples carried from reading to reading. "paper": nested sampling anew after each reading, 50
-        diversified samples, the entropy of their predictions, a Student-t or naive likelihood, a complete sensor model.
     nested_stop
-        Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or
-        "remaining" (ln Z can rise by 0.05 at most).
+        Stopping rule of nested sampling with the method "paper": see `calibrate`.
     levels
         Recording with readings over black and over white, for the levels and sds of the paper's naive model; the
         simulated arm reads both before it starts.
-    utility
-        The acquisition function: one of `inquiry.UTILITY_NAMES`, or your own utility; by default "finishing", with the
-        method "paper" its own, "entropy".
-    learn_sensor
-        Infer the size and position of the footprint and both levels along with the shape.
-    batch
-        Number of readings chosen at a time.
-    orientations_rad, heights_mm, repeats
-        Candidate orientations, heights and repeats, for an arm that can vary them; one number leaves no choice. See
-        `probewise.experiment.experiment_for`.
-    trust
-        Prior probability that the sensor model is complete; below 1 the run also infers which effect it leaves out.
-        By default 0.9; 1 with the naive model, `learn_sensor`, another utility, several shapes, or the method "paper".
-    cards
-        Rectangles of known position and albedo on the field,
-        `probewise.scene.Card(x_mm, y_mm, width_mm, height_mm, albedo)`: readings over them separate a tilt or a scale
-        error from another shape.
     max_readings
         Stop after so many readings at the latest.
     journal
         File with one JSON line per measurement; its folder is created if missing. If the file exists, the run
         continues from it, given an `rng` of the same seed, the same sensor and the same truth.
-    rng
-        Source of randomness; `np.random.default_rng(seed)` gives the run of `probewise explore --seed`.
-    progress
-        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 
     Returns
     -------
@@ -340,30 +292,24 @@ def explore(
     """
     from dataclasses import replace
 
-    from probewise import experiment
-    from probewise._kinds import (
-        checked_number,
-        checked_one_or_several_numbers,
-        checked_path,
-        checked_whole,
-        require_flag,
-        require_kind,
-        require_rng,
-    )
+    from probewise import _kinds, experiment
     from probewise._progress import progress_or_bar
     from probewise.arm import LegoArm, as_instrument
     from probewise.calibration.sensor_file import require_fitted_sensor
     from probewise.errors import ParameterError
     from probewise.scene import Field
 
-    require_rng(rng)
+    _kinds.require_rng(rng)
     field = Field() if field is None else field
-    require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
+    _kinds.require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     require_fitted_sensor(sensor, "in the order explore(sensor, ...)")
-    require_flag("learn_sensor", learn_sensor)
+    _kinds.require_flag("learn_sensor", learn_sensor)
     lies = experiment.as_shape(shape, field)
     streams, hidden = experiment.RandomStreams.spawned_from(rng), None
-    naive = _naive_levels(sensor, levels, method=method, model=model, has_arm=arm is not None, rng=streams.levels)
+    naive = method == "paper" and model == "naive"
+    if (naive and arm is not None and levels is None) or (levels is not None and not naive):
+        allowed = "a recording with readings over black and over white" if naive else "None"
+        raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
     asked = experiment.experiment_for(
         sensor,
         lies,
@@ -371,24 +317,26 @@ def explore(
         method=method,
         model=model,
         nested_stop=nested_stop,
-        naive=naive,
+        naive=naive_levels(sensor, levels, rng=streams.levels) if naive else None,
         utility=utility,
         learn_sensor=learn_sensor,
-        batch=checked_whole("batch", batch),
-        orientations_rad=checked_one_or_several_numbers("orientations_rad", orientations_rad),
-        heights_mm=checked_one_or_several_numbers("heights_mm", heights_mm),
-        repeats=tuple(checked_whole("repeats", n) for n in checked_one_or_several_numbers("repeats", repeats)),
-        trust=None if trust is None else checked_number("trust", trust, "a number greater than 0, up to 1"),
+        batch=_kinds.checked_whole("batch", batch),
+        orientations_rad=_kinds.checked_one_or_several_numbers("orientations_rad", orientations_rad),
+        heights_mm=_kinds.checked_one_or_several_numbers("heights_mm", heights_mm),
+        repeats=tuple(
+            _kinds.checked_whole("repeats", n) for n in _kinds.checked_one_or_several_numbers("repeats", repeats)
+        ),
+        trust=None if trust is None else _kinds.checked_number("trust", trust, "a number greater than 0, up to 1"),
         cards=tuple(cards),
     )
-    if isinstance(arm, LegoArm) and arm.geometry.accuracy is not None:
-        asked = replace(asked, fitted_arm=experiment.FittedArm.from_geometry_and_sensor(arm.geometry, sensor))
-    path = None if journal is None else checked_path("journal", journal)
+    geometry = arm.geometry if isinstance(arm, LegoArm) else None
+    if geometry is not None and geometry.accuracy is not None:
+        asked = replace(asked, fitted_arm=experiment.FittedArm.from_geometry_and_sensor(geometry, sensor))
+    path = None if journal is None else _kinds.checked_path("journal", journal)
     before = experiment.read_journal(path) if path is not None and path.exists() else None
-    geometry = experiment.geometry_entry(arm.geometry if isinstance(arm, LegoArm) else None)
     about: dict[str, Any] = {
         **experiment.sensor_entry(sensor),
-        **geometry,
+        **experiment.geometry_entry(geometry),
         "arm": "simulated" if arm is None else type(arm).__name__,
     }
     taken = () if before is None else before.readings
@@ -396,21 +344,14 @@ def explore(
         hidden = experiment.HiddenShape.given_or_drawn(truth, asked.shape, field, rng=streams.truth)
         about["hidden"] = hidden.journal_entry
         world, scale = experiment.world_like(sensor), experiment.scale_of(sensor.instrumentation)
-        arm = experiment.arm_over(
-            world,
-            experiment.with_cards(hidden.surface, asked.cards),
-            field,
-            seed=streams.noise,
-            taken=taken,
-            scale=scale,
-        )
+        surface = experiment.with_cards(hidden.surface, asked.cards)
+        arm = experiment.arm_over(world, surface, field, seed=streams.noise, taken=taken, scale=scale)
     elif truth is not None:
         raise ParameterError("truth", truth, "none with an arm of your own: what lies there is for it to find")
     instrument = as_instrument(arm, start_s=taken[-1].time_s if taken else 0.0, name="arm")
+    steps: list[Step] = []
     with instrument, progress_or_bar(progress) as told:
         told(*("going through the journal", 0, len(taken)) if taken else ("taking the first readings",))
-
-        steps: list[Step] = []
         for step in experiment.explore(
             instrument,
             asked,
@@ -428,33 +369,14 @@ def explore(
         return experiment.Exploration(asked, tuple(steps), hidden)
 
 
-def _naive_levels(
-    sensor: FittedSensor,
-    levels: Recording | None,
-    *,
-    method: MethodName,
-    model: Model,
-    has_arm: bool,
-    rng: np.random.Generator,
-) -> Naive | None:
-    """Return the levels of the paper's naive model, from a recording or the simulated sensor; None if not used.
-
-    Raises ParameterError if `levels` is missing with an arm of one's own, or given without that model.
-    """
+def naive_levels(sensor: FittedSensor, levels: Recording | None, *, rng: np.random.Generator) -> Naive:
+    """Return levels and sds of the paper's naive model, from a recording, or read by the simulated sensor (None)."""
     from probewise import experiment
-    from probewise.errors import ParameterError
 
-    wanted = method == "paper" and model == "naive"
-    if (wanted and has_arm and levels is None) or (levels is not None and not wanted):
-        allowed = "a recording with readings over black and over white" if wanted else "None"
-        raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
     if levels is not None:
         return experiment.naive_levels_from_recording(levels, sensor)
-    if not wanted:
-        return None
-    return experiment.naive_levels_from_world(
-        experiment.world_like(sensor), experiment.scale_of(sensor.instrumentation), rng=rng
-    )
+    world, scale = experiment.world_like(sensor), experiment.scale_of(sensor.instrumentation)
+    return experiment.naive_levels_from_world(world, scale, rng=rng)
 
 
 def audit(
@@ -466,6 +388,9 @@ def audit(
 ) -> PlanAudit:
     """Audit a plan before any data: which effects are undetectable or aliased, and which readings would cure that.
 
+    The result has the detectability and aliases of each effect; its `cure_plan` holds the readings to add (None with
+    `simulator`).
+
     Parameters
     ----------
     plan
@@ -474,13 +399,6 @@ def audit(
         A simulator of your own, or its FILE.py, in place of the light sensor.
     sensor
         The calibrated sensor, by which detectability is computed; by default a typical one.
-    progress
-        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
-
-    Returns
-    -------
-    PlanAudit
-        Detectability and aliases of each effect; its `cure_plan` holds the readings to add (None with `simulator`).
 
     Raises
     ------
@@ -519,23 +437,9 @@ def fit(
 ) -> SystemFit:
     """Fit a simulator of your own to a table of readings: mode, posterior and evidence, without a diagnosis.
 
-    Parameters
-    ----------
-    tables
-        The readings with the simulator's columns: a dict of arrays, or a DataFrame; several are fitted together.
-    simulator
-        The simulator, `systems.Simulator`, or its FILE.py.
-    thorough
-        Compute the evidence by nested sampling as well.
-    rng
-        Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise fit --seed`.
-    progress
-        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
-
-    Raises
-    ------
-    ParameterError, FileError, ShapeError, NotConvergedError
-        As of `diagnosis.fit_simulator`.
+    `tables` hold the readings with the simulator's columns, each a dict of arrays or a DataFrame; several are fitted
+    together. `simulator` is a `systems.Simulator`, or its FILE.py. With `thorough` the evidence is computed by nested
+    sampling as well. Raises the errors of `diagnosis.fit_simulator`.
     """
     from probewise import diagnosis
     from probewise._progress import progress_or_bar
@@ -556,28 +460,21 @@ def diagnose(
 ) -> Diagnosis:
     """Find which physics a sensor model, or a simulator of your own, leaves out.
 
+    The result has verdict, probabilities, location of the mismatch, the repaired model and the advised next readings.
+
     Parameters
     ----------
     recordings
-        One recording, or several of one apparatus, diagnosed together; with `simulator` tables of its columns, each a
-        dict of arrays or a DataFrame.
+        One recording, or several of one apparatus, diagnosed together; with `simulator` tables of its columns, as for
+        `fit`.
     simulator
-        A simulator, `systems.Simulator`, or its FILE.py, in place of the light sensor.
+        A simulator, or its FILE.py, in place of the light sensor.
     sensor
         An earlier calibration, whose posterior becomes the prior.
     thorough
         Recompute the evidence of the leading hypotheses by nested sampling. It replaces Laplace's approximation if the
         two differ by more than a nat plus the standard error, and no run gave a warning. The progress bar estimates the
         minutes; they grow with the numbers of readings and of leading hypotheses.
-    rng
-        Source of randomness; `np.random.default_rng(seed)` gives the result of `probewise diagnose --seed`.
-    progress
-        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
-
-    Returns
-    -------
-    Diagnosis
-        Verdict, probabilities, location of the mismatch, the repaired model and the advised next readings.
 
     Raises
     ------

@@ -76,15 +76,9 @@ def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, 
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (
-            ("investigate", "--plan", "paper", "--origin-mm", "1,2"),
-            "--origin-mm is '1,2'; allowed: none with",
-        ),
+        (("investigate", "--plan", "paper", "--origin-mm", "1,2"), "--origin-mm is '1,2'; allowed: none with"),
         (("investigate", "--plan", "paper", "--geometry", "arm.toml"), "--geometry is 'arm.toml'; allowed: none with"),
-        (
-            ("investigate", "--plan", "paper", "--truth", "backlash:nan"),
-            "'backlash:nan'; allowed: backlash:",
-        ),
+        (("investigate", "--plan", "paper", "--truth", "backlash:nan"), "'backlash:nan'; allowed: backlash:"),
         (("study", "--model", "naive", "--learn-sensor"), "learn_sensor is True; allowed: False with"),
         (("study", "--model", "naive", "--width", "1.3"), "width is 1.3; allowed: 1.0 with"),
         (("study", "--concealed", "--beside-paper"), "--beside-paper is 'given'; allowed: none with --concealed"),

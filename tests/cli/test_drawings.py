@@ -56,7 +56,7 @@ class InThisProcess(Executor):
 @pytest.fixture
 def short_demo(monkeypatch):
     """A demo of few readings."""
-    monkeypatch.setattr("probewise.cli._workers.worker_pool", lambda n: InThisProcess())
+    monkeypatch.setattr("probewise.cli._executor.worker_pool", lambda n: InThisProcess())
     for name, n in (("N_LIVE", 80), ("N_LIVE_ROBOT", 40), ("MAX_READINGS", 3), ("MAX_READINGS_DOUBT", 2)):
         monkeypatch.setattr(demo, name, n)
 
@@ -66,8 +66,7 @@ QUICK = ("audit data.csv", "explore", "study --circles")
 
 @pytest.mark.usefixtures("short_demo")
 @pytest.mark.parametrize(
-    "command",
-    [pytest.param(words, marks=[] if words.startswith(QUICK) else pytest.mark.slow) for words in COMMANDS],
+    "command", [pytest.param(words, marks=[] if words.startswith(QUICK) else pytest.mark.slow) for words in COMMANDS]
 )
 def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_1(
     command, recording_file, sensor_file, tmp_path, monkeypatch, capsys

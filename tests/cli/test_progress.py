@@ -83,10 +83,7 @@ def test_what_has_not_changed_is_not_told_again(clock, capsys):
         for _ in range(150):
             clock[0] += 1.0
             lines.refresh()
-    assert capsys.readouterr().err.splitlines() == [
-        "exploring, thinking about 23 (2 s)",
-        "exploring, moving (150 s)",
-    ]
+    assert capsys.readouterr().err.splitlines() == ["exploring, thinking about 23 (2 s)", "exploring, moving (150 s)"]
 
 
 def test_a_step_that_takes_long_is_heard_of_while_it_lasts(hurried, capsys):

@@ -98,8 +98,7 @@ def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("option", "quick"),
-    [((), True), (("--method", "full"), False), (("--method", "quick"), True)],
+    ("option", "quick"), [((), True), (("--method", "full"), False), (("--method", "quick"), True)]
 )
 def test_a_calibration_is_quick_unless_asked_otherwise(option, quick, recording_file, tmp_path, monkeypatch):
     asked = []

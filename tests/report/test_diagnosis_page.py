@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from mixtures import fixed_mixture
 
-from probewise.diagnosis import (
-    EffectFound,
-    ParameterFound,
-    Place,
-    audit_plan_of_diagnosis,
-    diagnose,
-)
+from probewise.diagnosis import EffectFound, ParameterFound, Place, audit_plan_of_diagnosis, diagnose
 from probewise.diagnosis.advice import NextMeasurement
 from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.light_sensor import LightSensorApparatus

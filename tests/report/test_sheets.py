@@ -221,10 +221,7 @@ def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is
     # The same place and height of the sensor by the arm's own forward kinematics.
     x_mm, y_mm, height_mm = arm.position_mm(np.array([[joint.home_rad for joint in arm.joints]]))[0]
     assert face == pytest.approx([np.hypot(x_mm - arm.axis_mm[0], y_mm - arm.axis_mm[1]), height_mm])
-    assert set(crosses_in(pdf, above, 1 + len(tiles_of(side, "a4")))) == {
-        arm.axis_mm,
-        (round(x_mm, 2), round(y_mm, 2)),
-    }
+    assert set(crosses_in(pdf, above, 1 + len(tiles_of(side, "a4")))) == {arm.axis_mm, (round(x_mm, 2), round(y_mm, 2))}
     assert side.low_mm[1] == 0.0  # the cut stands on the table
 
 

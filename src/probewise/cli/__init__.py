@@ -8,8 +8,8 @@ measure how good the robot and the diagnosis are; `sheets` draws patterns to pri
 `emulate-nxt` emulates it.
 
 Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer, a figure or page that
-could not be drawn (the results are complete);
-2: unusable input, reported in one line, nothing written; 128 + N: stopped by signal N (130: Ctrl-C).
+could not be drawn (the results are complete); 2: unusable input, reported in one line, nothing written, or a standard
+output that takes no more; 128 + N: stopped by signal N (130: Ctrl-C).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from types import ModuleType
 
 from probewise._signals import Stopped, stoppable
 from probewise._writing import NotDrawnError
-from probewise.cli._common import OneLineParser, error_in_one_line, print_complaint, print_warning
+from probewise.cli._common import OneLineParser, OutputError, error_in_one_line, print_complaint, print_warning
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
@@ -71,13 +71,7 @@ def _module_of(verb: str) -> ModuleType:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb of the command line and return the exit status.
-
-    Parameters
-    ----------
-    argv
-        Arguments without the program's name; None takes those of the process.
-    """
+    """Run one verb of the command line, by default on the process's arguments, and return the exit status."""
     words = sys.argv[1:] if argv is None else list(argv)
     _replace_closed_streams()
     try:
@@ -96,6 +90,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             _write_complaint(verb, f"stopped; {str(stop) or 'nothing was written'}")
             _discard_unwritable_output()
             return stop.status
+        except OutputError as error:
+            out = getattr(arguments, "out", None)
+            kept = "" if out is None or not out.exists() else f"; what was written is kept: {out}"
+            _write_complaint(verb, f"{error}{kept}")
+            _discard_unwritable_output()
+            return 2
         except (NotConvergedError, LinkError, NotDrawnError) as error:
             _write_complaint(verb, str(error))
             return 1

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import add_path, parse_numbers
+from probewise.cli._common import add, parse_numbers, parse_path
 from probewise.errors import ParameterError, did_you_mean
+from probewise.progress import Progress, silent
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry
+    from probewise.recordings import Plan
 
 ARMS = (
     "simulated; emulator, the LEGO arm in software, or emulator:TRUE.toml, built differently from --geometry; "
@@ -28,9 +30,15 @@ SHIPPED = ("paper", "two_way")
 """Names of the plans that ship."""
 
 
+def add_arm(parser: argparse.ArgumentParser) -> None:
+    """Add --arm, the simulated one by default."""
+    add(parser, "--arm ARM", f"where the readings come from: {ARMS} (default simulated)", default="simulated")
+
+
 def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that ships") -> None:
     """Add --geometry; `default` says in its help which geometry it has otherwise."""
-    add_path(parser, "--geometry", "ARM.toml", f"the arm as built: lengths, gears, ports, limits (default: {default})")
+    about = f"the arm as built: lengths, gears, ports, limits (default: {default})"
+    add(parser, "--geometry ARM.toml", about, type=parse_path)
 
 
 def read_or_shipped_geometry(arguments: argparse.Namespace) -> Geometry:
@@ -38,6 +46,15 @@ def read_or_shipped_geometry(arguments: argparse.Namespace) -> Geometry:
     from probewise.arm import read_geometry, shipped_geometry_path
 
     return read_geometry(arguments.geometry or shipped_geometry_path())
+
+
+def read_or_shipped_plan(text: str, *, progress: Progress = silent) -> Plan:
+    """Read the plan of a file, or take the one of that name that ships, unless a file has the name."""
+    from probewise.recordings import paper_plan, read_plan, two_way_plan
+
+    if text in SHIPPED and not Path(text).exists():
+        return paper_plan() if text == "paper" else two_way_plan()
+    return read_plan(text, progress=progress)
 
 
 @dataclass(frozen=True)

@@ -61,12 +61,7 @@ def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s:
 
 
 def open_instrument(
-    arguments: argparse.Namespace,
-    geometry: Geometry,
-    *,
-    start_s: float = 0.0,
-    n_taken: int = 0,
-    scene: str = SCENE,
+    arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0, n_taken: int = 0, scene: str = SCENE
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
     """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from tqdm import tqdm
 
+from probewise import emulator, recordings
 from probewise._signals import raise_if_stopped
 from probewise.arm import (
     Geometry,
@@ -31,41 +32,8 @@ from probewise.arm import (
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli._arm import SCENE, ArmName
-from probewise.cli._common import (
-    DEFAULT_SEED,
-    CommandError,
-    parse_numbers,
-    print_warning,
-    write_to_terminal,
-)
-from probewise.emulator import (
-    EmulatedBench,
-    SensorPose,
-    Tabletop,
-    VirtualClock,
-    VirtualLine,
-    parse_scene,
-    read_geometry,
-    set_up_bench,
-    shipped_geometry_path,
-)
+from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_warning, write_to_terminal
 from probewise.errors import ParameterError
-from probewise.recordings import (
-    Disc,
-    HalfPlane,
-    Image,
-    Instrumentation,
-    Pattern,
-    Plan,
-    Polygon,
-    Quadrant,
-    Ramp,
-    Stripes,
-    Uniform,
-    paper_plan,
-    read_plan,
-    two_way_plan,
-)
 
 if TYPE_CHECKING:
     from probewise.world import Surface, World
@@ -108,21 +76,9 @@ def open_arm_and_bench(
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
     """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
 
-    Parameters
-    ----------
-    chosen
-        The arm, from `parse_arm`.
-    geometry, geometry_file
-        Geometry of the LEGO arm, and its file if given; with a file, the simulated arm has its reach.
-    sensor, scene, seed
-        For a simulated or emulated arm: the file of its sensor, the initial target, the seed of the noise.
-    start_s, n_taken
-        Time at the start, and number of readings of an earlier session.
-
-    Raises
-    ------
-    ParameterError
-        If the brick cannot read in the sensor's unit.
+    With a `geometry_file`, the simulated arm has the geometry's reach. A simulated or emulated arm has the sensor of
+    the file `sensor`, the initial target `scene`, and noise of this `seed`, after the `n_taken` readings of an earlier
+    session. Raises ParameterError if the brick cannot read in the sensor's unit.
     """
     if chosen.is_real:
         return open_real_arm(chosen, geometry, start_s=start_s), None
@@ -139,23 +95,17 @@ def open_arm_and_bench(
 
 
 def open_emulated_arm_and_bench(
-    geometry: Geometry,
-    geometry_file: Path | None,
-    world: World,
-    surface: Surface,
-    *,
-    seed: int,
-    start_s: float = 0.0,
-) -> tuple[LegoArm, EmulatedBench]:
+    geometry: Geometry, geometry_file: Path | None, world: World, surface: Surface, *, seed: int, start_s: float = 0.0
+) -> tuple[LegoArm, emulator.EmulatedBench]:
     """Open the LEGO arm on an emulated brick over a simulated table; return the arm and the bench.
 
     The clock runs as fast as possible. The emulator reads its own true geometry: `geometry_file`, or the shipped one.
     When the arm's `with` block ends, it warns if the sensor hit the table.
     """
-    clock = VirtualClock()
-    numbers = read_geometry(geometry_file or shipped_geometry_path())
-    bench = set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
-    brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
+    clock = emulator.VirtualClock()
+    numbers = emulator.read_geometry(geometry_file or emulator.shipped_geometry_path())
+    bench = emulator.set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
+    brick = Brick(Link(emulator.VirtualLine(bench.radio, clock), clock=clock), clock=clock)
 
     class TableContactReporter(LegoArm):
         def __exit__(
@@ -172,7 +122,7 @@ def open_emulated_arm_and_bench(
     return TableContactReporter(BrickMachine(brick, geometry), geometry, clock=clock, start_s=start_s), bench
 
 
-def world_and_instrumentation(sensor: Path | None) -> tuple[World, Instrumentation | None]:
+def world_and_instrumentation(sensor: Path | None) -> tuple[World, recordings.Instrumentation | None]:
     """Return the world and instrumentation of a sensor.json; for None the shipped recordings' world, and None."""
     if sensor is None:
         from probewise.world.shipped import true_world
@@ -232,24 +182,14 @@ class MarkQuestion(str):
 class SimulatedBench:
     """A table under a simulated or an emulated arm, on which the program itself lays the patterns.
 
-    Parameters
-    ----------
-    world
-        World of the sensor.
-    scene
-        Initial target, in the format of `emulate-nxt`.
-    scale
-        Rounding and range of the simulated arm's readings.
-    seed
-        Seed of the noise.
-    n_taken
-        Number of readings of an earlier session, after which the noise continues.
+    `scene` is the initial target, in the format of `emulate-nxt`; `scale` rounding and range of the simulated arm's
+    readings; `seed` that of the noise, which continues after the `n_taken` readings of an earlier session.
     """
 
     def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
         self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
-        self._table = Tabletop(parse_scene(scene))
-        self._stand: Callable[[], SensorPose] | None = None
+        self._table = emulator.Tabletop(emulator.parse_scene(scene))
+        self._stand: Callable[[], emulator.SensorPose] | None = None
 
     def open_simulated_arm(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
         """Return the simulated arm over the table; its sensor takes any orientation."""
@@ -276,10 +216,7 @@ class SimulatedBench:
     def answer_at_mark(self, question: MarkQuestion) -> str:
         """Answer like a person who watches the emulated arm's sensor over a mark: "ok", or moves such as "x 5 down 2".
 
-        Raises
-        ------
-        ParameterError
-            If the arm is not an emulated one.
+        Raises ParameterError if the arm is not an emulated one.
         """
         if self._stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")
@@ -298,7 +235,7 @@ class SimulatedBench:
         return " ".join(words)
 
     def carry_out_request(
-        self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: RequestToPerson
+        self, patterns: Mapping[str, recordings.Pattern], origin_mm: tuple[float, float], request: RequestToPerson
     ) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if request.pattern is not None:
@@ -307,7 +244,7 @@ class SimulatedBench:
             self._table.turned_rad = request.turned_rad
 
 
-def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
+def shifted_pattern(pattern: recordings.Pattern, by_mm: tuple[float, float]) -> Surface:
     """Return a pattern shifted by `by_mm`; raise ParameterError for a ramp, which cannot be shifted."""
 
     def moved(place_mm: tuple[float, float]) -> tuple[float, float]:
@@ -317,21 +254,21 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
         return by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad)
 
     match pattern:
-        case Uniform():
+        case recordings.Uniform():
             return pattern
-        case HalfPlane():
+        case recordings.HalfPlane():
             return dataclasses.replace(pattern, offset_mm=pattern.offset_mm + along_mm(pattern.normal_rad))
-        case Quadrant():
+        case recordings.Quadrant():
             return dataclasses.replace(pattern, corner_mm=moved(pattern.corner_mm))
-        case Disc():
+        case recordings.Disc():
             return dataclasses.replace(pattern, center_mm=moved(pattern.center_mm))
-        case Polygon():
+        case recordings.Polygon():
             return dataclasses.replace(pattern, vertices_mm=tuple(map(moved, pattern.vertices_mm)))
-        case Stripes():
+        case recordings.Stripes():
             return dataclasses.replace(pattern, phase_mm=pattern.phase_mm + along_mm(pattern.normal_rad))
-        case Image():
+        case recordings.Image():
             return dataclasses.replace(pattern, origin_mm=moved(pattern.origin_mm))
-        case Ramp():
+        case recordings.Ramp():
             if by_mm != (0.0, 0.0):
                 raise ParameterError("--origin-mm", by_mm, "0,0 with a ramp, which is given in field coordinates")
             return pattern
@@ -340,14 +277,9 @@ def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
 # Adapting a plan to an arm: unit, range and step of its readings, and the columns that can be commanded
 
 
-def read_or_shipped_plan(text: str) -> Plan:
-    """Return the shipped plan "paper" or "two_way", or read a plan from the file of that name."""
-    return paper_plan() if text == "paper" else two_way_plan() if text == "two_way" else read_plan(text)
-
-
 def plan_for_own_instrument(
-    plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
-) -> Plan:
+    plan: recordings.Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
+) -> recordings.Plan:
     """Return the plan for a user's instrument: a given unit, range ("LOW,HIGH") or step replaces the plan's own.
 
     A new unit drops the plan's range, step and sensor. Measured covariates are left out.
@@ -369,7 +301,7 @@ def _parse_declared(option: str, text: str, n: int, allowed: str) -> tuple[float
     return numbers
 
 
-def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
+def plan_for_lego_arm(plan: recordings.Plan, geometry: Geometry) -> recordings.Plan:
     """Return the plan for the LEGO arm: in LEGO units, 1 to 100, at its reading height; no measured covariates."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
@@ -383,7 +315,7 @@ def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
     return without_measured_covariates(plan, instrumentation)
 
 
-def without_measured_covariates(plan: Plan, instrumentation: Instrumentation) -> Plan:
+def without_measured_covariates(plan: recordings.Plan, instrumentation: recordings.Instrumentation) -> recordings.Plan:
     """Return the plan by an instrumentation, with the covariates that can be commanded: controls, LED and height."""
     plan = dataclasses.replace(plan, instrumentation=instrumentation)
     can = {*plan.instrumentation.controls, "led", "height_mm"}

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
-from probewise.errors import FileError, ProbewiseError, did_you_mean, printable, shortened, shown
+from probewise.errors import FileError, ParameterError, ProbewiseError, did_you_mean, printable, shortened, shown
 
 if TYPE_CHECKING:
     from probewise._writing import Drawings
@@ -30,6 +30,10 @@ MOST_BATCH = 100  # readings chosen at a time, each given those before it
 
 class CommandError(ProbewiseError, ValueError):
     """A command that cannot be carried out as given: an option is missing or does not apply, or nobody answers."""
+
+
+class OutputError(ProbewiseError, OSError):
+    """Report a text that standard output does not take, such as a full disk."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -61,6 +65,49 @@ class OneLineParser(argparse.ArgumentParser):
             )
 
 
+def add(to: argparse._ActionsContainer, usage: str, about: str, **more: Any) -> None:
+    """Add an argument or option by its usage, "NAME METAVAR", and its help; `more` goes to `add_argument`.
+
+    An option without metavar and `more` is a flag.
+    """
+    name, _, metavar = usage.partition(" ")
+    if metavar:
+        more["metavar"] = metavar
+    elif name.startswith("--") and not more:
+        more["action"] = "store_true"
+    to.add_argument(name, help=about, **more)
+
+
+def add_out(parser: argparse.ArgumentParser) -> None:
+    """Add --out DIR."""
+    about = "directory for the results; made if missing, files of the same names are replaced"
+    add(parser, "--out DIR", about, type=parse_path, required=True)
+
+
+def add_seed_and_quiet(parser: argparse.ArgumentParser) -> None:
+    about = f"seed of all randomness, printed with the result (default {DEFAULT_SEED})"
+    add(parser, "--seed N", about, type=parse_seed, default=DEFAULT_SEED)
+    add_quiet(parser)
+
+
+def add_quiet(parser: argparse.ArgumentParser) -> None:
+    add(parser, "--quiet", "no progress and no summary; errors still show")
+
+
+def add_nested_stop(parser: argparse.ArgumentParser) -> None:
+    about = (
+        "when nested sampling ends with --method paper: at a change of log evidence below 1e-8 (default), or "
+        "where the log evidence can rise by 0.05 at most"
+    )
+    add(parser, "--nested-stop", about, choices=("change", "remaining"))
+
+
+def refuse_nested_stop(arguments: argparse.Namespace) -> None:
+    """Raise ParameterError if --nested-stop is given without --method paper."""
+    if arguments.nested_stop is not None and arguments.method != "paper":
+        raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
+
+
 def parse_path(text: str) -> Path:
     """Parse a path, for argparse; the empty string, such as an unset shell variable, and NUL are refused."""
     if not text or "\0" in text:
@@ -69,57 +116,20 @@ def parse_path(text: str) -> Path:
     return Path(text)
 
 
-def add_seed_and_quiet(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--seed",
-        type=parse_seed,
-        default=DEFAULT_SEED,
-        metavar="N",
-        help=f"seed of all randomness, printed with the result (default {DEFAULT_SEED})",
-    )
-    add_quiet(parser)
-
-
-def add_quiet(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quiet", action="store_true", help="no progress and no summary; errors still show")
-
-
-def add_count_option(
-    parser: argparse._ActionsContainer, name: str, about: str, *, default: int | None = None, most: int = MOST
-) -> None:
-    """Add an option that takes a whole number from 1 to `most`."""
-    parser.add_argument(name, type=partial(parse_positive_int, most=most), default=default, metavar="N", help=about)
-
-
-def add_path(
-    parser: argparse._ActionsContainer,
-    name: str,
-    metavar: str,
-    about: str,
-    *,
-    required: bool = False,
-    parse: Callable[[str], Path] = parse_path,
-) -> None:
-    """Add an argument or option that takes the name of a file or directory; an option may be `required`."""
-    action = parser.add_argument(name, type=parse, metavar=metavar, help=about)
-    action.required |= required
-
-
-def add_out_directory(parser: argparse.ArgumentParser) -> None:
-    """Add --out DIR."""
-    about = "directory for the results; made if missing, files of the same names are replaced"
-    add_path(parser, "--out", "DIR", about, required=True)
-
-
 def parse_recording(text: str) -> Path:
     """Parse the path of a recording, or the name of one that ships, unless a file has that name."""
     path = parse_path(text)
     return SHIPPED_RECORDINGS.get(text, path) if not path.exists() else path
 
 
-def parse_positive_int(text: str, *, most: int = MOST) -> int:
+def parse_count(text: str, *, most: int = MOST) -> int:
     """Parse an integer from 1 to `most`, for argparse."""
     return _parse_whole_number(text, 1, most, f"from 1 to {most:,}")
+
+
+def count_up_to(most: int) -> Callable[[str], int]:
+    """Return a parser of integers from 1 to `most`, for argparse."""
+    return partial(parse_count, most=most)
 
 
 def parse_seed(text: str) -> int:
@@ -166,8 +176,15 @@ def write_to_terminal(stream: TextIO, text: str) -> None:
 
 def print_result(text: str, *, quiet: bool = False) -> None:
     """Write a line of the result to standard output, unless `quiet`."""
-    if not quiet:
+    if quiet:
+        return
+    try:
         write_to_terminal(sys.stdout, text + "\n")
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        line = shown(text.partition("\n")[0])
+        raise OutputError(f"standard output takes no more ({error.strerror}); it was to print {line}") from error
 
 
 def print_complaint(text: str) -> None:

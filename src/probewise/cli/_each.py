@@ -35,10 +35,8 @@ Verb = Callable[[argparse.Namespace], int]
 def diagnose_each(arguments: argparse.Namespace, diagnose: Verb) -> int:
     """Diagnose each recording into a folder of its own; write table.csv and a page of all; return the exit status.
 
-    `diagnose` runs the verb on the arguments of one recording.
-
-    A recording that cannot be diagnosed is a row of the table. Folders that are complete, of the same files and
-    options, are not diagnosed again.
+    `diagnose` runs the verb on the arguments of one recording. One that cannot be diagnosed is a row of the table;
+    folders that are complete, of the same files and options, are not diagnosed again.
     """
     out = checked_output_directory(arguments.out)
     folders = {name: out / name for name in _device_names(arguments.recordings)}

@@ -1,49 +1,44 @@
-"""Executors of a campaign (many tasks whose results are kept in a file): this process, workers, or a cluster."""
+"""Executors of many tasks whose results are kept: this process, worker processes, which end with it, or a cluster."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import logging
+import os
+import signal
+import threading
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from functools import partial
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from probewise._signals import reporting_what_is_kept
-from probewise.cli._common import message_to_resume, parse_positive_int
-from probewise.errors import LinkError
+from probewise.cli._common import add, count_up_to, message_to_resume
+from probewise.errors import DoubtfulResultWarning, LinkError
 from probewise.progress import Progress
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
+
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def add_executor(parser: argparse.ArgumentParser) -> None:
     """Add --workers and --scheduler."""
     where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "--workers",
-        type=partial(parse_positive_int, most=1024),
-        default=1,
-        metavar="N",
-        help="processes here (default 1)",
-    )
-    where.add_argument(
-        "--scheduler", metavar="HOST:PORT", help="a dask scheduler whose workers do it (extra `cluster`)"
-    )
+    add(where, "--workers N", "processes here (default 1)", type=count_up_to(1024), default=1)
+    add(where, "--scheduler HOST:PORT", "a dask scheduler whose workers do it (extra `cluster`)")
 
 
-@contextlib.contextmanager
-def open_executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
-    """Yield the executor that --workers or --scheduler asks for; None for this process."""
+def open_executor(arguments: argparse.Namespace) -> AbstractContextManager[Executor | None]:
+    """Open the executor that --workers or --scheduler asks for; None for this process."""
     if arguments.scheduler is not None:
-        with _cluster_executor(arguments.scheduler) as executor:
-            yield executor
-    elif arguments.workers > 1:
-        from probewise.cli._workers import worker_pool
-
-        with worker_pool(arguments.workers) as pool:
-            yield pool
-    else:
-        yield None
+        return _cluster_executor(arguments.scheduler)
+    return worker_pool(arguments.workers) if arguments.workers > 1 else contextlib.nullcontext()
 
 
 @contextlib.contextmanager
@@ -93,3 +88,44 @@ def _cluster_executor(address: str) -> Iterator[Executor]:
         raise LinkError(f"no scheduler answers at {address}; start one with `dask scheduler`") from error
     with client:
         yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]
+
+
+@contextlib.contextmanager
+def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool of `n` processes with one thread of linear algebra each; if the block raises, end the processes.
+
+    Processes are spawned, not forked, for the same behaviour on every system.
+    """
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    for name in THREAD_VARIABLES:
+        os.environ.setdefault(name, "1")
+    _start_tracker_without_hangups()
+    pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"), initializer=_initialise_worker)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in multiprocessing.active_children():
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+def _start_tracker_without_hangups() -> None:
+    """Start the process that tracks shared resources so that it outlives a closed terminal, and complains of nothing.
+
+    It ignores Ctrl-C and `kill` by itself.
+    """
+    from multiprocessing import resource_tracker
+
+    if hasattr(signal, "SIGHUP") and threading.current_thread() is threading.main_thread():
+        before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        resource_tracker.ensure_running()
+        signal.signal(signal.SIGHUP, before)
+
+
+def _initialise_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # end at once on Ctrl-C; the command reports what was kept
+    warnings.simplefilter("ignore", DoubtfulResultWarning)  # the results hold the warnings, and the report shows them

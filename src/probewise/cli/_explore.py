@@ -12,61 +12,34 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from probewise import experiment as experiments
 from probewise._progress import progress_shown
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.calibration import FittedSensor, read_sensor, write_sensor
+from probewise.cli import _bench
 from probewise.cli._arm import ArmName, parse_arm, read_or_shipped_geometry
-from probewise.cli._bench import (
-    InstrumentWithCallbacks,
-    open_emulated_arm_and_bench,
-    open_real_arm,
-    warn_and_confirm_lowering,
-    warn_if_place_sd_large,
-)
 from probewise.cli._common import (
     DEFAULT_SEED,
     finish,
     message_to_resume,
     parse_numbers,
     print_result,
+    refuse_nested_stop,
     tables_and_descriptions,
 )
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean
-from probewise.experiment import (
-    CLEAN,
-    Exploration,
-    FittedArm,
-    HiddenShape,
-    RandomStreams,
-    arm_over,
-    as_shape,
-    experiment_for,
-    geometry_entry,
-    left_out_after_step,
-    naive_levels_from_recording,
-    naive_levels_from_world,
-    read_journal,
-    repaired_sensor,
-    result_json,
-    samples_csv,
-    scale_of,
-    sensor_entry,
-    shadow_run,
-    with_cards,
-    world_like,
-)
-from probewise.experiment import explore as explore_step_by_step
+from probewise.experiment import Exploration, HiddenShape, read_journal
 from probewise.recordings import read_recording, shipped, write_bytes_atomically
 from probewise.report import exploration as report
 from probewise.report.pictures import animated_gif
 from probewise.scene import SHAPES, Card, Field
-from probewise.verbs import calibrate
+from probewise.verbs import calibrate, naive_levels
 
 if TYPE_CHECKING:
     from probewise._arrays import FloatArray
@@ -75,7 +48,7 @@ if TYPE_CHECKING:
     from probewise.inference import Naive
     from probewise.progress import Progress
 
-_ANIMATION = "run.gif"
+_SHIPPED = "shipped_sensor.json"
 
 
 @dataclass(frozen=True)
@@ -90,12 +63,11 @@ class Inputs:
     geometry: Geometry | None
     sensor: FittedSensor
     field: Field
-    cards: tuple[Card, ...]
     experiment: Experiment
     model: Model
     other: Experiment | None
     other_model: Model
-    streams: RandomStreams
+    streams: experiments.RandomStreams
 
 
 def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
@@ -111,8 +83,8 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
     sensor = _shipped_sensor(arguments, chosen) if arguments.sensor is None else read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
-    streams = RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
-    shape = as_shape(arguments.shape, field)
+    streams = experiments.RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
+    shape = experiments.as_shape(arguments.shape, field)
     _refuse_settings_that_the_arm_lacks(arguments, geometry)
     cards = parse_cards(arguments.reference, field)
     if cards and (arguments.both_models or arguments.model == "naive" or arguments.method == "paper"):
@@ -120,7 +92,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
         raise ParameterError("--reference", arguments.reference[0], allowed)
     levels = _naive_levels(arguments, chosen, sensor, rng=streams.levels)
     pose = partial(
-        experiment_for,
+        experiments.experiment_for,
         sensor,
         shape,
         field,
@@ -140,21 +112,24 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
         trust=arguments.trust,
     )
     if chosen.may_differ_from_geometry and geometry is not None and geometry.accuracy is not None:
-        fitted_arm = FittedArm.from_geometry_and_sensor(geometry, sensor)
+        fitted_arm = experiments.FittedArm.from_geometry_and_sensor(geometry, sensor)
         experiment = dataclasses.replace(experiment, fitted_arm=fitted_arm)
     other: Experiment | None = None
     other_model: Model = "naive" if arguments.model == "ssf" else "ssf"
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)
-    return Inputs(
-        chosen, geometry, sensor, field, cards, experiment, arguments.model, other, other_model, streams=streams
-    )
+    return Inputs(chosen, geometry, sensor, field, experiment, arguments.model, other, other_model, streams)
 
 
 def _shipped_sensor(arguments: argparse.Namespace, chosen: ArmName) -> FittedSensor:
-    """Calibrate the sensor of the recording that ships, and say so; ParameterError for a real arm."""
+    """Calibrate the sensor of the recording that ships, and say so; a resumed run reads the one that it began with.
+
+    Raises ParameterError for a real arm.
+    """
     if chosen.is_real:
         raise ParameterError("--sensor", "none", "the sensor model of this arm, as `probewise calibrate` writes it")
+    if arguments.resume and (arguments.out / _SHIPPED).exists():
+        return read_sensor(arguments.out / _SHIPPED)
     print_result("no --sensor: that of the recording that ships is calibrated", quiet=arguments.quiet)
     rng = np.random.default_rng(DEFAULT_SEED)
     return calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False).sensor
@@ -181,20 +156,16 @@ def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
 
     Raises ParameterError if the one given contradicts the geometry, or is no such text.
     """
-    if geometry is None:
-        return parse_field("1048,520" if text is None else text)
-    of_arm = Field(*geometry.field_mm)
-    if text is not None and parse_field(text) != of_arm:
-        raise ParameterError("--field", text, f"{of_arm.width_mm:g},{of_arm.height_mm:g}, the geometry's; or none")
-    return of_arm
-
-
-def parse_field(text: str) -> Field:
-    """Parse "WIDTH,HEIGHT" in mm; raise ParameterError for anything else."""
+    of_arm = None if geometry is None else Field(*geometry.field_mm)
+    if text is None:
+        return of_arm or Field()
     numbers = parse_numbers(text)
     if len(numbers) != 2:
         raise ParameterError("--field", text, "WIDTH,HEIGHT in mm, such as 1048,520")
-    return Field(*numbers)
+    field = Field(*numbers)
+    if of_arm not in (None, field):
+        raise ParameterError("--field", text, f"{of_arm.width_mm:g},{of_arm.height_mm:g}, the geometry's; or none")
+    return field
 
 
 def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
@@ -242,26 +213,21 @@ def _naive_levels(
 ) -> Naive | None:
     """Return the paper's naive model's readings over black and white, with sds; None if it is not used.
 
-    They are from a recording or the simulated sensor. Raises ParameterError if an option does not apply, or a real arm
-    has no recording.
+    Raises ParameterError if an option does not apply, or a real arm has no recording.
     """
-    if arguments.nested_stop is not None and arguments.method != "paper":
-        raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
+    refuse_nested_stop(arguments)
     wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)
-    if arguments.levels is not None:
-        if not wanted:
-            raise ParameterError("--levels", str(arguments.levels), "only with --method paper and --model naive")
-        return naive_levels_from_recording(read_recording(arguments.levels), sensor)
+    if arguments.levels is not None and not wanted:
+        raise ParameterError("--levels", str(arguments.levels), "only with --method paper and --model naive")
     if not wanted:
         return None
-    if chosen.is_real:
+    if arguments.levels is None and chosen.is_real:
         allowed = "a recording of readings over a black and a white sheet, for the naive model of the paper"
         raise ParameterError("--levels", "none", allowed)
-    return naive_levels_from_world(world_like(sensor), scale_of(sensor.instrumentation), rng=rng)
+    return naive_levels(sensor, None if arguments.levels is None else read_recording(arguments.levels), rng=rng)
 
 
-@dataclass(frozen=True)
-class ArmAndTruth:
+class ArmAndTruth(NamedTuple):
     """An arm over a field, with the true shape if it is simulated.
 
     `outline_mm` is the true outline, (n_points, 2), `known` the true parameters by the hypotheses' names, and `about`
@@ -271,7 +237,7 @@ class ArmAndTruth:
     arm: Instrument
     outline_mm: FloatArray | None = None
     known: Mapping[str, float] | None = None
-    about: Mapping[str, Any] = field(default_factory=dict)
+    about: Mapping[str, Any] = {}
 
 
 def _open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> ArmAndTruth:
@@ -283,17 +249,20 @@ def _open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tu
     if chosen.is_real:
         if arguments.truth is not None:
             raise ParameterError("--truth", arguments.truth, "none with a real arm, whose target is unknown")
-        return ArmAndTruth(open_real_arm(chosen, geometry, start_s=start_s))
+        return ArmAndTruth(_bench.open_real_arm(chosen, geometry, start_s=start_s))
     hidden = parse_truth(arguments.truth, arguments.shape, inputs.field, rng=inputs.streams.truth)
-    world, surface = world_like(inputs.sensor), with_cards(hidden.surface, inputs.cards)
+    world, noise = experiments.world_like(inputs.sensor), inputs.streams.noise
+    surface = experiments.with_cards(hidden.surface, inputs.experiment.cards)
     arm: Instrument
     if chosen.is_lego and geometry is not None:
-        seed = inputs.streams.noise + len(taken)  # a resumed run draws no noise a second time
+        seed = noise + len(taken)  # a resumed run draws no noise a second time
         built = chosen.true_geometry_file(arguments.geometry)
-        arm, _ = open_emulated_arm_and_bench(geometry, built, world, surface, seed=seed, start_s=start_s)
+        arm, _ = _bench.open_emulated_arm_and_bench(geometry, built, world, surface, seed=seed, start_s=start_s)
     else:
-        scale, noise = scale_of(inputs.sensor.instrumentation), inputs.streams.noise
-        arm = arm_over(world, surface, inputs.field, seed=noise, taken=taken, workspace=geometry, scale=scale)
+        scale = experiments.scale_of(inputs.sensor.instrumentation)
+        arm = experiments.arm_over(
+            world, surface, inputs.field, seed=noise, taken=taken, workspace=geometry, scale=scale
+        )
     known = hidden.parameters_by_hypothesis_name(inputs.experiment.names)
     return ArmAndTruth(arm, hidden.outline_mm, known, {"hidden": hidden.journal_entry})
 
@@ -328,20 +297,18 @@ class Pictures:
         self.frames.append(self.drawings.draw(f"frames/{name}", partial(self._draw_frame, step, shadow)))
         if step.number == 1 and not step.replayed:
             remove_earlier_results(self.out, self.files)
-        folder = self.out / "frames"
+        folder, live = self.out / "frames", self.out / "live.html"
         folder.mkdir(exist_ok=True)
         if self.frames[-1]:
             write_bytes_atomically(folder / name, self.frames[-1])
         if self.live and (page := self.drawings.draw("live.html", partial(self._live_page, step))):
-            write_bytes_atomically(self.out / "live.html", page)
+            write_bytes_atomically(live, page)
             if len(self.frames) == 1:
-                webbrowser.open((self.out / "live.html").absolute().as_uri())
+                webbrowser.open(live.absolute().as_uri())
 
     def _live_page(self, step: Step) -> bytes:
-        trust = self.inputs.experiment.trust
-        page = report.live_page_html(
-            step, self.frames[-1], earlier=self.steps[:-1], trust=trust, draw=self.drawings.draw
-        )
+        trust, earlier = self.inputs.experiment.trust, self.steps[:-1]
+        page = report.live_page_html(step, self.frames[-1], earlier=earlier, trust=trust, draw=self.drawings.draw)
         return page.encode("utf-8", "backslashreplace")
 
     def _draw_frame(self, step: Step, shadow: Step | None) -> bytes:
@@ -365,27 +332,25 @@ class Pictures:
         """
 
         def write_files(stage: StagedFiles) -> None:
-            stage.write("result.json", result_json(result))
-            stage.write("samples.csv", samples_csv(result))
-            learnt = repaired_sensor(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
-            stage.write("sensor.json", learnt.to_json())
+            stage.write("result.json", experiments.result_json(result))
+            stage.write("samples.csv", experiments.samples_csv(result))
+            rng = np.random.default_rng(seed)
+            stage.write("sensor.json", experiments.repaired_sensor(self.inputs.sensor, result.last, rng=rng).to_json())
 
-        beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
+        page = partial(
+            report.page_html,
+            result,
+            self.frames,
+            seed=seed,
+            model=self.inputs.model,
+            truth=known,
+            beside={self.inputs.other_model: self.shadows} if self.shadows else None,
+            unit=self.inputs.sensor.instrumentation.unit,
+            draw=self.drawings.draw,
+        )
+        animation = {"run.gif": lambda: animated_gif([frame for frame in self.frames if frame])}
         return self.drawings.write_results(
-            write_files,
-            {_ANIMATION: lambda: animated_gif([frame for frame in self.frames if frame])},
-            lambda _: report.page_html(
-                result,
-                self.frames,
-                seed=seed,
-                model=self.inputs.model,
-                truth=known,
-                beside=beside,
-                unit=self.inputs.sensor.instrumentation.unit,
-                draw=self.drawings.draw,
-            ),
-            inputs=self.files,
-            progress=progress,
+            write_files, animation, lambda _: page(), inputs=self.files, progress=progress
         )
 
 
@@ -409,12 +374,12 @@ def explore(arguments: argparse.Namespace) -> int:
     site = _open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
     print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     if arguments.sensor is None:
-        arguments.sensor = out / "shipped_sensor.json"
+        arguments.sensor = out / _SHIPPED
         out.mkdir(parents=True, exist_ok=True)
         write_sensor(inputs.sensor, arguments.sensor)
-    warn_and_confirm_lowering(inputs.arm, site.arm, inputs.geometry)
+    _bench.warn_and_confirm_lowering(inputs.arm, site.arm, inputs.geometry)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
-        warn_if_place_sd_large(inputs.geometry, inputs.experiment.stop_sd_mm)
+        _bench.warn_if_place_sd_large(inputs.geometry, inputs.experiment.stop_sd_mm)
     read = [arguments.sensor, *([] if arguments.levels is None else tables_and_descriptions([arguments.levels]))]
     pictures = Pictures(out, inputs, arguments.live, site.outline_mm, read)
     steps, n_before = pictures.steps, 0 if before is None else len(before.entries)
@@ -429,27 +394,28 @@ def explore(arguments: argparse.Namespace) -> int:
         believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
         progress("exploring", note=f"reading {len(steps) + 1} of at most {arguments.max_readings}, {doing}{believed}")
 
+    about = {
+        **experiments.sensor_entry(inputs.sensor, _path_relative_to_folder(out, arguments.sensor)),
+        **experiments.geometry_entry(inputs.geometry),
+        **site.about,
+        "arm": arguments.arm.partition(":")[0],
+    }
     with (
         reporting_what_is_kept(kept_message),
         progress_shown(quiet=arguments.quiet) as progress,
-        InstrumentWithCallbacks(
+        _bench.InstrumentWithCallbacks(
             site.arm,
             lambda pose: report_activity(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
             lambda reading: report_activity(f"thinking about {reading.value:g}"),
         ) as reporting,
         closing(
-            explore_step_by_step(
+            experiments.explore(
                 reporting,
                 inputs.experiment,
                 rng=inputs.streams.run,
                 max_readings=arguments.max_readings,
                 journal=before or journal,
-                about={
-                    **sensor_entry(inputs.sensor, _path_relative_to_folder(out, arguments.sensor)),
-                    **geometry_entry(inputs.geometry),
-                    **site.about,
-                    "arm": arguments.arm.partition(":")[0],
-                },
+                about=about,
             )
         ) as run,
     ):
@@ -459,7 +425,7 @@ def explore(arguments: argparse.Namespace) -> int:
             report_activity("choosing its place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in run)
         if inputs.other is not None:
-            pairs = shadow_run(run, inputs.other, site.arm, rng=inputs.streams.shadow)
+            pairs = experiments.shadow_run(run, inputs.other, site.arm, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.draw_and_write(step, shadow)
             if step.replayed:
@@ -480,10 +446,10 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journ
         effects = ", ".join(map(spoken_name, inputs.sensor.effects))
         yield f"note: the simulated arm has the sensor's SSF, levels and noise, but not its effects: {effects}"
     trust = inputs.experiment.trust
-    missing = left_out_after_step(result.last, trust)
+    missing = experiments.left_out_after_step(result.last, trust)
     if trust < 1:
         yield missing.sentence
-    if missing.leading != CLEAN:
+    if missing.leading != experiments.CLEAN:
         yield f"what the readings say of the sensor: probewise diagnose {journal} --out DIAGNOSIS"
     if site.known is not None:
         yield f"error        {report.errors_text(result, site.known)}"
@@ -498,9 +464,9 @@ def _path_relative_to_folder(folder: Path, path: Path) -> str:
 
 
 def _journal_to_resume(journal: Path, *, resume: bool) -> Journal | None:
-    if resume and not journal.exists():
-        raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
     if not journal.exists():
+        if resume:
+            raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
         return None
     if not resume:
         raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")

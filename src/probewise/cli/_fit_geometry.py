@@ -106,20 +106,9 @@ def bring_to_mark(
 ) -> TouchedMark | None:
     """Bring the sensor over a mark and down to the block on it, as a person directs; return the mark as touched.
 
-    None if the mark is skipped. Every move turns the base first and then lowers, as in a reading.
-
-    Parameters
-    ----------
-    arm
-        The arm, entered.
-    mark_mm, block_mm
-        Place of the mark on the field, and height of the block.
-    ask
-        Function that asks the person and returns "ok", "seen", "skip", or a move such as "x 5".
-    tell
-        Function that tells the person what can be answered, and why a move was refused.
-    named
-        Name of the mark.
+    None if the mark is skipped. Every move turns the base first and then lowers, as in a reading. `mark_mm` is the
+    place on the field, `block_mm` the height of the block; `ask` returns the person's answer, "ok", "seen", "skip" or a
+    move such as "x 5"; `tell` says what can be answered, and why a move was refused.
     """
     at = (*mark_mm, arm.geometry.travel_height_mm)
     arm.go_down(*at)

@@ -24,10 +24,7 @@ def is_journal(path: Path) -> bool:
 
 
 def refuse_journal(path: Path) -> None:
-    """Refuse a journal where a plan or a recording is needed, since the shape below its sensor is unknown.
-
-    Raises FileError if the path is a journal.
-    """
+    """Raise FileError for a journal where a plan or recording is needed: the shape below its sensor is unknown."""
     if is_journal(path):
         raise FileError(
             path,
@@ -37,7 +34,7 @@ def refuse_journal(path: Path) -> None:
 
 
 def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
-    """Return a journal's readings as a recording by the given sensor, and the shape that the run looked for.
+    """Return a journal's readings as a recording by the sensor, and the shape that the run looked for.
 
     Raises FileError if it is not a journal, has no reading, or has a shape unknown to `explore`.
     """
@@ -51,9 +48,7 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recor
 
 
 def find_journal_sensor_file(path: Path) -> Path:
-    """Return the path of the sensor.json of a journal's run: its original path, or beside the journal.
-
-    Where results have taken the file's place, it is one of the sensor_kept*.json there.
+    """Return the sensor.json of a journal's run: where it was, beside the journal, or what results renamed it to.
 
     Raises FileError if the journal names none, or that file is missing or has changed.
     """

@@ -31,7 +31,7 @@ from probewise.arm import (
 )
 from probewise.arm.carry_out import BY_HAND_S, duration_s, reachable_places_of
 from probewise.arm.geometry import wrapped_to_pi
-from probewise.cli._arm import SHIPPED, parse_arm, parse_place
+from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
 from probewise.cli._arm_tasks import (
     confirm_lowering,
     nxt_port,
@@ -43,7 +43,6 @@ from probewise.cli._bench import (
     plan_for_lego_arm,
     plan_for_own_instrument,
     prompter_for_answer,
-    read_or_shipped_plan,
     shifted_pattern,
     without_measured_covariates,
 )
@@ -212,18 +211,9 @@ def _pattern_names_by_row(plan: Plan) -> list[str]:
 class PersonAtBench:
     """A function that prompts a person to carry out a request of `carry_out`, and then checks the sheet that was laid.
 
-    Parameters
-    ----------
-    arm
-        The arm, entered.
-    plan, origin_mm
-        The plan, and the place of its origin.
-    sheet_check
-        The check of readings against the patterns.
-    check_sheets
-        Whether a sheet is checked before it is scanned; a user's own instrument takes only the plan's readings.
-    emulated
-        Whether the bench is an emulator, so that requests are carried out by typing in its terminal.
+    `origin_mm` is the place of the plan's origin. With `check_sheets` a sheet is checked before it is scanned; a user's
+    own instrument takes only the plan's readings. If `emulated`, requests are carried out by typing in the emulator's
+    terminal.
     """
 
     def __init__(
@@ -289,12 +279,7 @@ def _is_pty(port: str) -> bool:
 class SheetCheck:
     """A check of each sheet against its pattern, by the readings over its uniform white and black.
 
-    Parameters
-    ----------
-    plan
-        The plan, with its patterns and the range of readings.
-    white_is_bright
-        Whether white is known to read higher than black, as with the LEGO light sensor.
+    `white_is_bright`: whether white is known to read higher than black, as with the LEGO light sensor.
     """
 
     def __init__(self, plan: Plan, *, white_is_bright: bool) -> None:

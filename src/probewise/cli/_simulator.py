@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import add_path
+from probewise.cli._common import add, parse_path
 from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
@@ -16,13 +16,11 @@ if TYPE_CHECKING:
 
 def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead of the light sensor") -> None:
     """Add --simulator FILE.py; the help says what it replaces."""
-    add_path(
-        parser,
-        "--simulator",
-        "FILE.py",
+    about = (
         f"a simulator of your own{replaces}; the file says which columns of the table it reads (it is a program: run "
-        "only those that you trust)",
+        "only those that you trust)"
     )
+    add(parser, "--simulator FILE.py", about, type=parse_path)
 
 
 def refuse_sensor(sensor: Path | None) -> None:
@@ -34,8 +32,7 @@ def refuse_sensor(sensor: Path | None) -> None:
 def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
     """Read tables of one system; return them joined, and notes on their columns.
 
-    Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,
-    ParameterError if two tables are the same.
+    Raises FileError for one that cannot be read or used, or lacks a column, ParameterError if two are the same.
     """
     from probewise.systems import as_recording, concatenate_tables, read_table_for
 

@@ -8,13 +8,15 @@ from probewise.cli._arm import ARMS, SHIPPED, add_geometry, read_or_shipped_geom
 from probewise.cli._common import (
     DEFAULT_SEED,
     OneLineParser,
-    add_count_option,
-    add_path,
+    add,
     add_quiet,
+    parse_count,
+    parse_path,
     parse_seed,
     positive_number_parser,
 )
 
+_BRICK = "the brick, such as nxt:/dev/rfcomm0 or nxt:COM5"
 _ALL_ARMS = f"where the readings come from: {ARMS}"
 _LEGO_ARMS = (
     "the LEGO arm: nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or emulator:TRUE.toml, in software, built "
@@ -26,124 +28,70 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise arm` and its tasks."""
     tasks = parser.add_subparsers(dest="task", metavar="TASK", required=True, parser_class=OneLineParser)
 
-    check = _add_task(tasks, "check", "Check a geometry file, and a brick; report and draw the arm's reach.")
-    _add_arm(check)
-    add_path(check, "--out", "REACH.png", "file of the drawing (default: none)")
-    add_path(check, "--drawing", "ARM.png", "file of a drawing with the arm's lengths")
+    def task(name: str, summary: str, *, arms: str = _BRICK, moves: bool = True) -> OneLineParser:
+        """Add a task's parser, with --geometry and --quiet; if it `moves`, also --arm (help: `arms`) and --dry-run."""
+        own = tasks.add_parser(name, help=summary, description=summary)
+        if moves:
+            add(own, "--arm nxt:PORT" if arms is _BRICK else "--arm ARM", arms)
+            add(own, "--dry-run", "only print the moves, from home")
+        add_geometry(own)
+        add_quiet(own)
+        return own
 
-    jog = _add_task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
-    jog.add_argument(
-        "where", nargs="+", metavar="WHERE", help="base, shoulder or elbow and degrees; or a place X,Y in mm"
-    )
-    jog.add_argument("--down", action="store_true", help="at a place: lower the sensor to the height of reading")
+    check = task("check", "Check a geometry file, and a brick; report and draw the arm's reach.", moves=False)
+    add(check, "--arm nxt:PORT", _BRICK)
+    add(check, "--out REACH.png", "file of the drawing (default: none)", type=parse_path)
+    add(check, "--drawing ARM.png", "file of a drawing with the arm's lengths", type=parse_path)
 
-    jog.add_argument("--steps", action="store_true", help="with --down: in steps, each confirmed with Enter")
+    jog = task("jog", "Turn a joint by some degrees, or bring the sensor over a place.")
+    add(jog, "where WHERE", "base, shoulder or elbow and degrees; or a place X,Y in mm", nargs="+")
+    add(jog, "--down", "at a place: lower the sensor to the height of reading")
+    add(jog, "--steps", "with --down: in steps, each confirmed with Enter")
 
-    fit = _add_task(
-        tasks,
-        "fit-geometry",
-        "Fit home angles, links and base to marks that the sensor is brought to; writes the geometry.",
-        moves=True,
-        arms=_LEGO_ARMS,
-    )
-    add_path(fit, "--out", "ARM.toml", "where the fitted geometry goes", required=True)
-    add_path(
-        fit,
-        "--marks",
-        "MARKS.csv",
-        "where marks are kept (default: beside --out); without --arm they are read from there and only fitted",
-    )
-    for name, default, about in (
-        ("--block-mm", 32.0, "height of the block on a mark (default 32: three LEGO bricks and a smooth tile)"),
-        ("--touch-mm", 1.0, "accuracy of a mark, sd of place and height (default 1)"),
+    summary = "Fit home angles, links and base to marks that the sensor is brought to; writes the geometry."
+    fit = task("fit-geometry", summary, arms=_LEGO_ARMS)
+    add(fit, "--out ARM.toml", "where the fitted geometry goes", type=parse_path, required=True)
+    about = "where marks are kept (default: beside --out); without --arm they are read from there and only fitted"
+    add(fit, "--marks MARKS.csv", about, type=parse_path)
+    for usage, default, about in (
+        ("--block-mm MM", 32.0, "height of the block on a mark (default 32: three LEGO bricks and a smooth tile)"),
+        ("--touch-mm MM", 1.0, "accuracy of a mark, sd of place and height (default 1)"),
     ):
-        fit.add_argument(name, type=positive_number_parser("mm"), default=default, metavar="MM", help=about)
-    fit.add_argument("--resume", action="store_true", help="continue after the marks in MARKS.csv")
+        add(fit, usage, about, type=positive_number_parser("mm"), default=default)
+    add(fit, "--resume", "continue after the marks in MARKS.csv")
 
-    home = _add_task(
-        tasks,
-        "home",
-        "Bring all joints home, where their counters are 0; joints with a stop find it first.",
-        moves=True,
-    )
-    home.add_argument(
-        "--here", action="store_true", help="let a person bring the arm home by hand, and set the counters to 0 there"
-    )
+    home = task("home", "Bring all joints home, where their counters are 0; joints with a stop find it first.")
+    add(home, "--here", "let a person bring the arm home by hand, and set the counters to 0 there")
 
-    heights = _add_task(
-        tasks,
-        "heights",
-        "Check from the light over white whether the sensor hangs as high as its counters say.",
-        moves=True,
-        arms=_LEGO_ARMS,
-    )
-    heights.add_argument(
-        "places", nargs="*", metavar="X,Y", help="places in mm, two or more (default: the field's middle and the marks)"
-    )
-    add_count_option(heights, "--readings", "number of readings at each height (default 16)", default=16)
+    summary = "Check from the light over white whether the sensor hangs as high as its counters say."
+    heights = task("heights", summary, arms=_LEGO_ARMS)
+    add(heights, "places X,Y", "places in mm, two or more (default: the field's middle and the marks)", nargs="*")
+    add(heights, "--readings N", "number of readings at each height (default 16)", type=parse_count, default=16)
 
-    _add_task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
+    task("read", "Read the sensor where it stands, in LEGO units, and the battery.")
 
-    scan = _add_task(
-        tasks, "scan", "Read along a line; readings go to standard output as CSV.", moves=True, arms=_ALL_ARMS
-    )
-    scan.add_argument("start", metavar="X,Y", help="first place of the line, mm")
-    scan.add_argument("end", metavar="X,Y", help="last place of the line, mm")
-    add_count_option(scan, "--readings", "number of readings (default 21)", default=21)
+    scan = task("scan", "Read along a line; readings go to standard output as CSV.", arms=_ALL_ARMS)
+    add(scan, "start X,Y", "first place of the line, mm")
+    add(scan, "end X,Y", "last place of the line, mm")
+    add(scan, "--readings N", "number of readings (default 21)", type=parse_count, default=21)
 
-    record = _add_task(
-        tasks,
-        "record",
-        "Carry out a plan and write the recording; asks a person to lay sheets and turn the sensor.",
-        moves=True,
-        arms=_ALL_ARMS,
-    )
-    record.add_argument(
-        "plan",
-        metavar="PLAN.csv",
-        help=f"plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship",
-    )
-    add_path(record, "--out", "REC.csv", "where the recording goes", required=True)
-    record.add_argument(
-        "--origin-mm",
-        metavar="X,Y",
-        help="where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0)",
-    )
+    summary = "Carry out a plan and write the recording; asks a person to lay sheets and turn the sensor."
+    record = task("record", summary, arms=_ALL_ARMS)
+    add(record, "plan PLAN.csv", f"plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship")
+    add(record, "--out REC.csv", "where the recording goes", type=parse_path, required=True)
+    about = "where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0)"
+    add(record, "--origin-mm X,Y", about)
     own = record.add_argument_group("with FILE.py", "properties of the readings, if not in the plan's JSON")
-    own.add_argument("--unit", metavar="UNIT", help="unit of a reading, such as V or counts")
-    own.add_argument("--range", metavar="LOW,HIGH", help="smallest and largest possible reading, such as 0,1023")
-    own.add_argument("--step", metavar="STEP", help="rounding step of the readings, such as 1")
-    for task, scene in ((scan, True), (record, False)):
-        simulated = task.add_argument_group("with simulated and emulator")
-        add_path(simulated, "--sensor", "S.json", "its sensor (default: that of the shipped recordings)")
-        simulated.add_argument("--seed", type=parse_seed, metavar="N", help=f"seed of noise (default {DEFAULT_SEED})")
-        if scene:
-            simulated.add_argument("--scene", metavar="X,Y,R", help="target on the field, as for emulate-nxt")
-    record.add_argument("--resume", action="store_true", help="continue after the readings in REC.csv")
-
-
-def _add_task(
-    tasks: argparse._SubParsersAction[OneLineParser],
-    name: str,
-    summary: str,
-    *,
-    moves: bool = False,
-    arms: str | None = None,
-) -> OneLineParser:
-    """Add the parser of a task, with --geometry and --quiet; if it `moves`, also --arm (help: `arms`) and --dry-run."""
-    parser = tasks.add_parser(name, help=summary, description=summary)
-    if moves:
-        _add_arm(parser, arms)
-        parser.add_argument("--dry-run", action="store_true", help="only print the moves, from home")
-    add_geometry(parser)
-    add_quiet(parser)
-    return parser
-
-
-def _add_arm(parser: argparse.ArgumentParser, arms: str | None = None) -> None:
-    """Add --arm; `arms` is its help, by default that of a real brick."""
-    metavar, usual = "nxt:PORT" if arms is None else "ARM", "the brick, such as nxt:/dev/rfcomm0 or nxt:COM5"
-    parser.add_argument("--arm", metavar=metavar, help=arms or usual)
+    add(own, "--unit UNIT", "unit of a reading, such as V or counts")
+    add(own, "--range LOW,HIGH", "smallest and largest possible reading, such as 0,1023")
+    add(own, "--step STEP", "rounding step of the readings, such as 1")
+    for each in (scan, record):
+        simulated = each.add_argument_group("with simulated and emulator")
+        add(simulated, "--sensor S.json", "its sensor (default: that of the shipped recordings)", type=parse_path)
+        add(simulated, "--seed N", f"seed of noise (default {DEFAULT_SEED})", type=parse_seed)
+        if each is scan:
+            add(simulated, "--scene X,Y,R", "target on the field, as for emulate-nxt")
+    add(record, "--resume", "continue after the readings in REC.csv")
 
 
 def run(arguments: argparse.Namespace) -> int:

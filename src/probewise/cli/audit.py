@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._arm import SHIPPED
-from probewise.cli._common import add_path, add_quiet, finish, inputs_and_filled_in_plan, print_result
+from probewise.cli._arm import SHIPPED, read_or_shipped_plan
+from probewise.cli._common import add, add_quiet, finish, inputs_and_filled_in_plan, parse_path, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._simulator import add_simulator, refuse_sensor
 
@@ -19,16 +19,14 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise audit`."""
     about = f"plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship; with --simulator any table"
-    add_path(parser, "plan", "PLAN.csv", about)
-    add_path(parser, "--sensor", "S.json", "the calibrated sensor (default: a typical one)")
+    add(parser, "plan PLAN.csv", about, type=parse_path)
+    add(parser, "--sensor S.json", "the calibrated sensor (default: a typical one)", type=parse_path)
     add_simulator(parser)
-    add_path(
-        parser,
-        "--out",
-        "DIR",
+    about = (
         "directory for audit.json, audit.png, report.html and (without --simulator) cure_plan.csv; by default only the "
-        "text is printed",
+        "text is printed"
     )
+    add(parser, "--out DIR", about, type=parse_path)
     add_quiet(parser)
 
 
@@ -37,9 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise import diagnosis
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
-    from probewise.cli._bench import read_or_shipped_plan
     from probewise.diagnosis import CURE_PLAN, audit_json
-    from probewise.recordings import read_plan, write_plan
+    from probewise.recordings import write_plan
     from probewise.report import audit as report
     from probewise.systems import read_simulator, read_table_for
 
@@ -53,9 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
             progress("building the effects")
             audit = diagnosis.audit_system(simulator, table)
         else:
-            named = str(arguments.plan)
-            is_shipped = named in SHIPPED and not arguments.plan.exists()
-            plan = read_or_shipped_plan(named) if is_shipped else read_plan(arguments.plan, progress=progress)
+            plan = read_or_shipped_plan(str(arguments.plan), progress=progress)
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
             audit = diagnosis.audit_plan(plan, sensor=sensor, progress=progress)
 

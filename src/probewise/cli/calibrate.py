@@ -7,13 +7,14 @@ from collections.abc import Sequence
 
 from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import (
-    add_count_option,
-    add_out_directory,
-    add_path,
+    add,
+    add_nested_stop,
+    add_out,
     add_seed_and_quiet,
     finish,
-    parse_positive_int,
+    parse_count,
     parse_recording,
+    refuse_nested_stop,
     tables_and_descriptions,
 )
 from probewise.cli._journal import refuse_journal
@@ -24,37 +25,23 @@ from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise calibrate`."""
     about = "recording, its JSON beside it; or paper or concealed, which ship"
-    add_path(parser, "recording", "REC.csv", about, parse=parse_recording)
-    add_out_directory(parser)
-    parser.add_argument(
-        "--orders",
-        type=parse_positive_int,
-        nargs="+",
-        default=list(ORDERS),
-        metavar="N",
-        help=f"numbers of Gaussians to compare (default {' '.join(map(str, ORDERS))})",
-    )
-    add_count_option(
+    add(parser, "recording REC.csv", about, type=parse_recording)
+    add_out(parser)
+    about = f"numbers of Gaussians to compare (default {' '.join(map(str, ORDERS))})"
+    add(parser, "--orders N", about, type=parse_count, nargs="+", default=list(ORDERS))
+    about = f"live points where a number of Gaussians is searched in full (default {N_LIVE})"
+    add(parser, "--live N", about, type=parse_count, default=N_LIVE)
+    add(
         parser,
-        "--live",
-        f"live points where a number of Gaussians is searched in full (default {N_LIVE})",
-        default=N_LIVE,
-    )
-    parser.add_argument(
         "--method",
-        choices=("quick", "full", "paper"),
-        default=CALIBRATION,
-        help="quick (default): samples from the peaks of the likelihood, until the evidence has clearly fallen, one "
+        "quick (default): samples from the peaks of the likelihood, until the evidence has clearly fallen, one "
         "search of the prior that vouches; full: the whole prior of every number of Gaussians is searched by nested "
         "sampling, and each evidence refined by importance sampling; paper: uniform priors, evidence by nested "
         "sampling alone",
+        choices=("quick", "full", "paper"),
+        default=CALIBRATION,
     )
-    parser.add_argument(
-        "--nested-stop",
-        choices=("change", "remaining"),
-        help="when nested sampling ends with --method paper: at a change of log evidence below 1e-8 (default), or "
-        "where the log evidence can rise by 0.05 at most",
-    )
+    add_nested_stop(parser)
     add_seed_and_quiet(parser)
 
 
@@ -68,8 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.recordings import read_recording
     from probewise.report import calibration as report
 
-    if arguments.nested_stop is not None and arguments.method != "paper":
-        raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
+    refuse_nested_stop(arguments)
     refuse_journal(arguments.recording)
     drawings = Drawings(checked_output_directory(arguments.out))
     orders = tuple(sorted(set(arguments.orders)))

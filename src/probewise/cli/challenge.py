@@ -8,38 +8,25 @@ from functools import partial
 
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import (
-    CommandError,
-    add_count_option,
-    add_out_directory,
-    add_seed_and_quiet,
-    finish,
-)
+from probewise.cli._common import CommandError, add, add_out, add_seed_and_quiet, finish, parse_count
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise challenge`."""
-    add_out_directory(parser)
-    add_count_option(
-        parser,
-        "--cases",
+    add_out(parser)
+    about = (
         "number of recordings, always the first of the seed; 60 give one case of each kind, 6000 the whole table "
-        "(default 60)",
-        default=60,
+        "(default 60)"
     )
-    parser.add_argument(
-        "--systems",
-        action="store_true",
-        help="recordings of twelve kinds of system, each with its simulator's file, instead of a light sensor's",
-    )
-    add_count_option(
-        parser,
-        "--rounds",
+    add(parser, "--cases N", about, type=parse_count, default=60)
+    about = "recordings of twelve kinds of system, each with its simulator's file, instead of a light sensor's"
+    add(parser, "--systems", about)
+    about = (
         "take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: no further "
-        "readings)",
-        default=1,
+        "readings)"
     )
+    add(parser, "--rounds N", about, type=parse_count, default=1)
     add_executor(parser)
     add_seed_and_quiet(parser)
 
@@ -65,13 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     kept = partial(message_to_resume_campaign, cases, "case", arguments)
     with executor_and_progress(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
-            arguments.cases,
-            seed=arguments.seed,
-            work=work,
-            of=of,
-            path=cases,
-            executor=executor,
-            progress=progress,
+            arguments.cases, seed=arguments.seed, work=work, of=of, path=cases, executor=executor, progress=progress
         )
     rows = scored(results)
     options = ["--systems"] if arguments.systems else []

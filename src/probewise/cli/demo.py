@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
-from probewise.cli._common import add_out_directory, add_seed_and_quiet, print_result
+from probewise.cli._common import add, add_out, add_seed_and_quiet, print_result
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -32,10 +32,8 @@ MAX_READINGS_DOUBT = 20  # bounds the time of the demo
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise demo`."""
-    add_out_directory(parser)
-    parser.add_argument(
-        "--full", action="store_true", help="compare one to four Gaussians with 300 live points, as in the paper"
-    )
+    add_out(parser)
+    add(parser, "--full", "compare one to four Gaussians with 300 live points, as in the paper")
     add_seed_and_quiet(parser)
 
 
@@ -66,7 +64,7 @@ def _run_demo(
     from probewise.arm import read_geometry, shipped_geometry_path
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
-    from probewise.cli._workers import worker_pool
+    from probewise.cli._executor import worker_pool
     from probewise.inquiry import ReadingEntropy
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, cast
 from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.cli._common import (
     CommandError,
-    add_out_directory,
-    add_path,
+    add,
+    add_out,
     add_seed_and_quiet,
     finish,
     inputs_and_filled_in_plan,
+    parse_path,
     parse_recording,
 )
 from probewise.cli._executor import add_executor
@@ -38,36 +39,29 @@ _OF_ONE_RUN_OF_SIMULATOR = ("witness_*.svg", "gain.svg", "next.csv")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise diagnose`."""
-    parser.add_argument(
-        "recordings",
-        type=parse_recording,
-        nargs="+",
-        metavar="REC.csv",
-        help="recording, its JSON beside it, or paper or concealed, which ship, or the journal.jsonl of an explore "
-        "run; with --simulator any table; several are diagnosed together",
+    about = (
+        "recording, its JSON beside it, or paper or concealed, which ship, or the journal.jsonl of an explore "
+        "run; with --simulator any table; several are diagnosed together"
     )
-    add_path(
-        parser,
-        "--sensor",
-        "S.json",
-        "an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)",
-    )
+    add(parser, "recordings REC.csv", about, type=parse_recording, nargs="+")
+    about = "an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)"
+    add(parser, "--sensor S.json", about, type=parse_path)
     add_simulator(parser)
-    parser.add_argument(
+    add(
+        parser,
         "--thorough",
-        action="store_true",
-        help="compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
+        "compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
         "approximation where they differ by more than one nat plus its standard error and no run gives a warning "
         "(first says how long it may take)",
     )
-    parser.add_argument(
+    add(
+        parser,
         "--each",
-        action="store_true",
-        help="diagnose each recording by itself, into a folder of its name; table.csv and report.html sort them by "
+        "diagnose each recording by itself, into a folder of its name; table.csv and report.html sort them by "
         "what ails them; the same command resumes",
     )
     add_executor(parser)
-    add_out_directory(parser)
+    add_out(parser)
     add_seed_and_quiet(parser)
 
 
@@ -83,14 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
     if arguments.simulator is not None:
         return _diagnose_simulator(arguments)
-    from probewise.diagnosis import (
-        NEXT_PLAN,
-        SensorAndShape,
-        audit_plan_of_diagnosis,
-        diagnose,
-        join,
-        weigh_thoroughly,
-    )
+    from probewise.diagnosis import NEXT_PLAN, SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
     from probewise.report import diagnosis as report
 
     drawings = Drawings(checked_output_directory(arguments.out))

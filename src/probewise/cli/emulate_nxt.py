@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file
 from probewise.cli._arm import SCENE, add_geometry
-from probewise.cli._common import add_path, add_seed_and_quiet, print_result
+from probewise.cli._common import add, add_seed_and_quiet, parse_path, print_result
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -24,39 +24,31 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise emulate-nxt`."""
-    parser.add_argument(
-        "--scene",
-        default=SCENE,
-        metavar="X,Y,R",
-        help=f"the circle on the field, in mm (default {SCENE}), or ellipse:X,Y,A,B,ANGLE, "
-        "polygon:X,Y,X,Y,..., edge:ANGLE,OFFSET, corner:X,Y,DX,DY, uniform:ALBEDO",
-    )
-    add_path(
+    add(
         parser,
-        "--sensor",
-        "S.json",
-        "the light sensor, as calibrate writes it (default: that of the shipped recordings)",
+        "--scene X,Y,R",
+        f"the circle on the field, in mm (default {SCENE}), or ellipse:X,Y,A,B,ANGLE, "
+        "polygon:X,Y,X,Y,..., edge:ANGLE,OFFSET, corner:X,Y,DX,DY, uniform:ALBEDO",
+        default=SCENE,
     )
+    about = "the light sensor, as calibrate writes it (default: that of the shipped recordings)"
+    add(parser, "--sensor S.json", about, type=parse_path)
     add_geometry(parser)
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="NAME[=RATE]",
-        help="a fault and its probability per telegram, 0 to 1: fragment, merge, double, corrupt, half, error, "
+    add(
+        parser,
+        "--fault NAME[=RATE]",
+        "a fault and its probability per telegram, 0 to 1: fragment, merge, double, corrupt, half, error, "
         "silence, deaf, unasked, disconnect; drop, per byte; late=RATE,SECONDS; sag=MV, by which the battery falls per "
         "minute; may be given several times",
+        action="append",
+        default=[],
     )
-    parser.add_argument("--name", default="NXT", help="the brick's name, up to 14 characters (default NXT)")
-    parser.add_argument(
-        "--sleep",
-        type=int,
-        default=10,
-        metavar="MIN",
-        help="minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)",
-    )
-    add_path(parser, "--link", "PATH", "a symbolic link to keep on the device, also after a disconnection")
-    add_path(parser, "--log", "FILE", "write every telegram and fault to a file")
+    add(parser, "--name", "the brick's name, up to 14 characters (default NXT)", default="NXT")
+    about = "minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)"
+    add(parser, "--sleep MIN", about, type=int, default=10)
+    about = "a symbolic link to keep on the device, also after a disconnection"
+    add(parser, "--link PATH", about, type=parse_path)
+    add(parser, "--log FILE", "write every telegram and fault to a file", type=parse_path)
     add_seed_and_quiet(parser)
 
 

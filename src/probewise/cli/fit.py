@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import CommandError, add_out_directory, add_seed_and_quiet, finish, parse_path
+from probewise.cli._common import CommandError, add, add_out, add_seed_and_quiet, finish, parse_path
 from probewise.cli._simulator import add_simulator, read_joined_table
 
 if TYPE_CHECKING:
@@ -15,12 +15,10 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise fit`."""
-    parser.add_argument(
-        "tables", type=parse_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
-    )
+    add(parser, "tables DATA.csv", "table of readings; several are fitted together", type=parse_path, nargs="+")
     add_simulator(parser, replaces="")
-    parser.add_argument("--thorough", action="store_true", help="compute the evidence by nested sampling as well")
-    add_out_directory(parser)
+    add(parser, "--thorough", "compute the evidence by nested sampling as well")
+    add_out(parser)
     add_seed_and_quiet(parser)
 
 

@@ -12,16 +12,26 @@ from typing import TYPE_CHECKING
 
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._arm import ARMS, SHIPPED, ArmName, add_geometry, parse_arm, parse_place, read_or_shipped_geometry
+from probewise.cli._arm import (
+    SHIPPED,
+    ArmName,
+    add_arm,
+    add_geometry,
+    parse_arm,
+    parse_place,
+    read_or_shipped_geometry,
+    read_or_shipped_plan,
+)
 from probewise.cli._common import (
     CommandError,
-    add_count_option,
-    add_out_directory,
-    add_path,
+    add,
+    add_out,
     add_seed_and_quiet,
     finish,
     inputs_and_filled_in_plan,
     message_to_resume,
+    parse_count,
+    parse_path,
     positive_number_parser,
     print_result,
 )
@@ -39,50 +49,29 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise investigate`."""
-    parser.add_argument(
-        "--arm",
-        default="simulated",
-        metavar="ARM",
-        help=f"where the readings come from: {ARMS} (default simulated)",
+    add_arm(parser)
+    about = f"the first plan: a plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship"
+    add(parser, "--plan PLAN.csv", about, required=True)
+    about = (
+        "where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0; none with simulated)"
     )
-    parser.add_argument(
-        "--plan",
-        required=True,
-        metavar="PLAN.csv",
-        help=f"the first plan: a plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship",
-    )
-    parser.add_argument(
-        "--origin-mm",
-        metavar="X,Y",
-        help="where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0; none with "
-        "simulated)",
-    )
+    add(parser, "--origin-mm X,Y", about)
     add_geometry(parser)
-    add_out_directory(parser)
-    add_path(parser, "--sensor", "S.json", "an earlier calibration, whose posterior becomes the prior")
-    parser.add_argument(
-        "--truth",
-        metavar="NAME:V,V",
-        help="effect concealed in the simulated world, such as backlash:0.5 or nothing; several joined by + (default: "
-        "one effect drawn from the seed, named at the end)",
+    add_out(parser)
+    add(parser, "--sensor S.json", "an earlier calibration, whose posterior becomes the prior", type=parse_path)
+    about = (
+        "effect concealed in the simulated world, such as backlash:0.5 or nothing; several joined by + (default: "
+        "one effect drawn from the seed, named at the end)"
     )
-    add_count_option(
-        parser, "--readings", "largest number of readings beyond the first plan (default 400)", default=400
-    )
-    parser.add_argument(
-        "--minutes",
-        type=positive_number_parser("minutes"),
-        default=math.inf,
-        metavar="M",
-        help="largest number of minutes beyond the first plan (default: no limit)",
-    )
-    add_count_option(parser, "--rounds", "largest number of rounds, including the first (default 6)", default=6)
-    parser.add_argument(
-        "--no-hands",
-        action="store_true",
-        help="no person turns or exchanges sheets: take only readings over the sheet in place",
-    )
-    parser.add_argument("--resume", action="store_true", help="resume from the rounds in DIR")
+    add(parser, "--truth NAME:V,V", about)
+    about = "largest number of readings beyond the first plan (default 400)"
+    add(parser, "--readings N", about, type=parse_count, default=400)
+    about = "largest number of minutes beyond the first plan (default: no limit)"
+    add(parser, "--minutes M", about, type=positive_number_parser("minutes"), default=math.inf)
+    about = "largest number of rounds, including the first (default 6)"
+    add(parser, "--rounds N", about, type=parse_count, default=6)
+    add(parser, "--no-hands", "no person turns or exchanges sheets: take only readings over the sheet in place")
+    add(parser, "--resume", "resume from the rounds in DIR")
     add_seed_and_quiet(parser)
 
 
@@ -181,7 +170,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
     """Read the first plan and adapt it to the chosen arm; raise ParameterError if --no-hands cannot carry it out."""
-    from probewise.cli._bench import plan_for_lego_arm, plan_for_own_instrument, read_or_shipped_plan
+    from probewise.cli._bench import plan_for_lego_arm, plan_for_own_instrument
 
     plan = read_or_shipped_plan(arguments.plan)
     if chosen.kind == "simulated":

@@ -5,23 +5,25 @@ from __future__ import annotations
 import argparse
 
 from probewise._writing import checked_output_file
-from probewise.cli._common import add_path, add_seed_and_quiet, parse_recording, print_result, tables_and_descriptions
+from probewise.cli._common import (
+    add,
+    add_seed_and_quiet,
+    parse_path,
+    parse_recording,
+    print_result,
+    tables_and_descriptions,
+)
 from probewise.cli._journal import refuse_journal
 from probewise.cli._simulator import add_simulator
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise predict`."""
-    add_path(
-        parser,
-        "sensor",
-        "S.json",
-        "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json, calibrated.json or "
-        "fitted.json",
-    )
+    about = "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json, calibrated.json or "
+    add(parser, "sensor S.json", f"{about}fitted.json", type=parse_path)
     about = "plan or recording, its JSON beside it; or paper or concealed, which ship; with --simulator any table"
-    add_path(parser, "plan", "PLAN.csv", about, parse=parse_recording)
-    add_path(parser, "--out", "P.csv", "where the prediction goes", required=True)
+    add(parser, "plan PLAN.csv", about, type=parse_recording)
+    add(parser, "--out P.csv", "where the prediction goes", type=parse_path, required=True)
     add_simulator(parser)
     add_seed_and_quiet(parser)
 

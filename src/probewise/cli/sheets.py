@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise._writing import checked_output_file
-from probewise.cli._arm import add_geometry, read_or_shipped_geometry
-from probewise.cli._common import CommandError, add_path, add_quiet, print_result
+from probewise.cli._arm import add_geometry, read_or_shipped_geometry, read_or_shipped_plan
+from probewise.cli._common import CommandError, add, add_quiet, parse_path, print_result
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -19,20 +19,17 @@ FIELD, TARGET, MARKS, JIG = "field", "target", "marks", "jig"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise sheets`."""
-    parser.add_argument(
-        "what",
-        metavar="WHAT",
-        help="paper or two_way, the plans that ship; PLAN.csv, its JSON beside it, or such a JSON alone; field, the "
+    add(
+        parser,
+        "what WHAT",
+        "paper or two_way, the plans that ship; PLAN.csv, its JSON beside it, or such a JSON alone; field, the "
         "black field; target, a white shape to cut out; marks, the crosses of `arm fit-geometry`; jig, the "
         "arm's links and base at their home angles, for `arm home --here`",
     )
-    add_path(parser, "--out", "SHEETS.pdf", "where the pages go", required=True)
-    parser.add_argument("--paper", type=str.lower, default="a4", metavar="PAPER", help="a4 (default) or letter")
-    parser.add_argument(
-        "--target",
-        metavar="[SHAPE:]V,V,...",
-        help="of field and target: a white shape as --truth of explore takes it, a circle as X,Y,R in mm of the field",
-    )
+    add(parser, "--out SHEETS.pdf", "where the pages go", type=parse_path, required=True)
+    add(parser, "--paper PAPER", "a4 (default) or letter", type=str.lower, default="a4")
+    about = "of field and target: a white shape as --truth of explore takes it, a circle as X,Y,R in mm of the field"
+    add(parser, "--target [SHAPE:]V,V,...", about)
     add_geometry(parser)
     add_quiet(parser)
 
@@ -60,7 +57,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
-    from probewise.cli._bench import read_or_shipped_plan
     from probewise.recordings.description import read_description
     from probewise.report.sheets import arm_home_jig_sheets, field_sheet, marks_sheet, pattern_sheets, target_sheet
 

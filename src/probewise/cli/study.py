@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING
 
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import (
-    MOST_BATCH,
-    add_count_option,
-    add_out_directory,
-    add_quiet,
-    finish,
-    parse_seed,
-)
+from probewise.cli._common import MOST_BATCH, add, add_out, add_quiet, count_up_to, finish, parse_count, parse_seed
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
 from probewise.errors import ParameterError
 
@@ -32,45 +25,37 @@ _SIZES = ("small", "plain", "gross")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise study`."""
-    add_out_directory(parser)
-    add_count_option(
-        parser, "--circles", "circles per row, always the first ones (default 200)", default=200, most=MOST_CIRCLES
-    )
-    add_count_option(parser, "--quoted", "circles of the first row (default as --circles)", most=MOST_CIRCLES)
-    parser.add_argument(
+    circles = count_up_to(MOST_CIRCLES)
+    add_out(parser)
+    add(parser, "--circles N", "circles per row, always the first ones (default 200)", type=circles, default=200)
+    add(parser, "--quoted N", "circles of the first row (default as --circles)", type=circles)
+    add(
+        parser,
         "--concealed",
-        action="store_true",
-        help="conceal an effect from the robot in every row, at three sizes, and search for the same circles with and "
+        "conceal an effect from the robot in every row, at three sizes, and search for the same circles with and "
         "without doubt about the sensor (writes report.html and concealed.csv; replaces all other rows)",
     )
-    parser.add_argument(
-        "--seed", type=parse_seed, metavar="S", help="with --concealed: circles, noise and robot of another seed"
-    )
-    parser.add_argument("--size", choices=_SIZES, help="with --concealed: only this one of the three sizes")
-    add_count_option(
-        parser, "--clean", "with --concealed: circles of the row without a concealed effect", most=MOST_CIRCLES
-    )
-    parser.add_argument(
+    add(parser, "--seed S", "with --concealed: circles, noise and robot of another seed", type=parse_seed)
+    add(parser, "--size", "with --concealed: only this one of the three sizes", choices=_SIZES)
+    add(parser, "--clean N", "with --concealed: circles of the row without a concealed effect", type=circles)
+    add(
+        parser,
         "--beside-paper",
-        action="store_true",
-        help="for each sensor model, our method and the paper's (explore --method paper) on the same circles; of the "
+        "for each sensor model, our method and the paper's (explore --method paper) on the same circles; of the "
         "options of one row, only --population and --nested-stop apply",
     )
     one = parser.add_argument_group("one row instead of the table's", "defaults are those of the reference row")
-    one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, entirely in the field) or anywhere")
-    one.add_argument("--model", metavar="NAME", help="the robot's sensor model: ssf or naive")
-    one.add_argument("--utility", metavar="NAME", help="acquisition function: finishing, information, entropy, ...")
-    one.add_argument("--noise", type=float, metavar="SD", help="sd of the noise, LEGO units (reference: 1)")
-    one.add_argument("--width", type=float, metavar="F", help="assumed width of the SSF over the true one")
-    add_count_option(one, "--batch", "number of readings chosen at a time", most=MOST_BATCH)
-    one.add_argument("--learn-sensor", action="store_true", default=None, help="learn the sensor along with the shape")
-    one.add_argument("--method", metavar="NAME", help="how the robot infers and chooses: particles or paper")
-    one.add_argument(
-        "--nested-stop", metavar="NAME", help="when the paper's nested sampling ends: change (of ln Z) or remaining"
-    )
-    add_count_option(
-        parser, "--max-readings", "a run that is not done after N readings counts as a miss (default 100)", default=100
-    )
+    add(one, "--population NAME", "inside (50 to 150 mm, entirely in the field) or anywhere")
+    add(one, "--model NAME", "the robot's sensor model: ssf or naive")
+    add(one, "--utility NAME", "acquisition function: finishing, information, entropy, ...")
+    add(one, "--noise SD", "sd of the noise, LEGO units (reference: 1)", type=float)
+    add(one, "--width F", "assumed width of the SSF over the true one", type=float)
+    add(one, "--batch N", "number of readings chosen at a time", type=count_up_to(MOST_BATCH))
+    add(one, "--learn-sensor", "learn the sensor along with the shape", action="store_true", default=None)
+    add(one, "--method NAME", "how the robot infers and chooses: particles or paper")
+    add(one, "--nested-stop NAME", "when the paper's nested sampling ends: change (of ln Z) or remaining")
+    about = "a run that is not done after N readings counts as a miss (default 100)"
+    add(parser, "--max-readings N", about, type=parse_count, default=100)
     add_executor(parser)
     add_quiet(parser)
 

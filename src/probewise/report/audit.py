@@ -147,8 +147,8 @@ def _extra_readings_elements(audit: PlanAudit) -> tuple[Markup, ...]:
 def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:
     """Build the table of all effects, invisible ones first: detectability, detectable share, aliases, size at lambda 8.
 
-    `of` names the model whose own parameters absorb part of an effect. Where an effect's `rows` were computed, a column
-    more gives the number of rows like these that detect the effect at a change of the readings by one noise sd (rms).
+    `of` names the model whose own parameters absorb part of an effect. A column more gives the number of rows that
+    detect it, where it was computed.
     """
     counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")

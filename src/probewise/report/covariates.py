@@ -161,12 +161,11 @@ class ResidualNoise:
 
 
 def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
-    """Choose the covariate of the first figure: the first candidate with a mean residual of 2.3 sds or more.
-
-    If there is none, the candidate with the largest mean in sds; without candidates, the predicted reading.
+    """Choose the covariate of the first figure: the first candidate with a mean of 2.3 sds or more, else the largest.
 
     Candidates in order: time, X or a column, folded at a named effect's period; covariates with significant residuals,
-    those on which an unknown effect most probably depends first; last, the repair's change of the predicted readings.
+    those on which an unknown effect most probably depends first; the repair's change of the predicted readings. Without
+    any, the predicted reading.
     """
     alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
     candidates = _views_at_period(diagnosis)
@@ -186,8 +185,8 @@ def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> Cov
 def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
     """List the places with significant residuals, each with True if a mean residual reaches 2.3 sds.
 
-    First those whose covariate the unknown effect most probably depends on; then those with True; then the others. Of
-    places that are the same interval, one is kept.
+    First those on whose covariate the unknown effect most probably depends, then those with True. Of places that are
+    the same interval, one is kept.
     """
     seen = {
         place.figure_name: any(

@@ -16,16 +16,7 @@ from probewise.experiment import left_out_after_step
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
-from probewise.report.html import (
-    Section,
-    definition_list,
-    element,
-    figure,
-    page,
-    paragraph,
-    slideshow,
-    table,
-)
+from probewise.report import html
 from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.canvas import png
@@ -110,16 +101,8 @@ def figure_drawers(
 ) -> dict[str, Callable[[], bytes]]:
     """List all figures of the demo but the diagnosis's by file name, as functions that draw PNGs.
 
-    Parameters
-    ----------
-    calibration, recording, prediction
-        The sensor model, the recording it was fitted to, and its prediction of that recording.
-    searches
-        The naive and the SSF robot's search from an empty field.
-    started_alike
-        Both robots' searches from the same first reading, with places chosen by the paper's rule.
-    geometry
-        Of the arm.
+    `searches` are the naive and the SSF robot's from an empty field, `started_alike` from the same first reading, with
+    places chosen by the paper's rule.
     """
     hidden = started_alike[0].truth_mm
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
@@ -189,34 +172,21 @@ def page_html(
     seed: int,
     seconds: float,
 ) -> str:
-    """Return the HTML of the demo's page.
+    """Return the HTML of the demo's page, of what `figure_drawers` takes and more.
 
-    Parameters
-    ----------
-    calibration, recording, prediction, searches, started_alike
-        See `figure_drawers`.
-    frames
-        PNG of each step of each search.
-    diagnosis
-        Of the second recording.
-    doubt
-        The search of the robot that trusts its sensor model, and of the one that doubts it.
-    drawn
-        From `figure_drawers`, `diagnosis_figure_drawers` and `doubt_figure_drawers`.
-    concealed
-        Name of the effect that the simulated world concealed in the second recording.
-    seed, seconds
-        Seed and duration of this run.
+    `frames` has a PNG of each step of each search; `doubt` the search of the robot that trusts its sensor model, and of
+    the one that doubts it; `drawn` all figures by name; `concealed` names the effect that the simulated world concealed
+    in the second recording, whose `diagnosis` this is.
     """
     sections = [
         _sensor_section(calibration, recording, prediction, drawn, seed),
         _search_section(searches, started_alike, frames, drawn),
         _diagnosis_section(diagnosis, drawn, concealed),
         doubt_section(doubt, drawn),
-        Section(
+        html.Section(
             "This run",
             (
-                definition_list(
+                html.definition_list(
                     (
                         ("seed", str(seed)),
                         ("time", f"{number_text(seconds, 0)} s"),
@@ -237,22 +207,22 @@ def page_html(
         "brighter places promise more information. Squares: readings by their brightness. Green: the next place. "
         "Dashed white: the hidden circle."
     )
-    return page(
+    return html.page(
         "Modeling a sensor to improve its efficacy",
         answer=summary_sentence(started_alike),
-        key_figure=figure(drawn["equal_readings.png"], caption),
+        key_figure=html.figure(drawn["equal_readings.png"], caption),
         sections=sections,
     )
 
 
 def _sensor_section(
     calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], seed: int
-) -> Section:
+) -> html.Section:
     shown = calibration_report.sections(calibration.sensor, recording, prediction, drawn, seed=seed)
-    apparatus = Section(
+    apparatus = html.Section(
         "The arm and its sensor",
         (
-            figure(
+            html.figure(
                 drawn["arm.png"],
                 "The arm as its geometry file describes it (paper, figure 1): one motor turns the base, two move the "
                 "links, and parallel rods keep the sensor level. A LED lights the surface; a ridge keeps its light "
@@ -260,15 +230,15 @@ def _sensor_section(
             ),
         ),
     )
-    taken = Section(
+    taken = html.Section(
         "How the recording was taken",
         (
-            figure(
+            html.figure(
                 drawn["orientations.png"],
                 "The sensor in its four orientations, seen from above through its package, and the symbols of their "
                 "readings below (paper, figure 3). It crosses the edge between black and white in steps of 1 mm.",
             ),
-            figure(
+            html.figure(
                 drawn["quadrants.png"],
                 "Four patterns that tell the SSF from its mirror images (paper, figure 4): one reading each at the "
                 "cross, with the sensor at 0°. The number in the white part is the reading.",
@@ -276,7 +246,7 @@ def _sensor_section(
         ),
     )
     said = calibration_report.summary_sentence(calibration.sensor)
-    return Section("The sensor", (paragraph(_SENSOR), paragraph(said)), (apparatus, taken, *shown[:-1]))
+    return html.Section("The sensor", (html.paragraph(_SENSOR), html.paragraph(said)), (apparatus, taken, *shown[:-1]))
 
 
 def _search_section(
@@ -284,17 +254,17 @@ def _search_section(
     started_alike: Sequence[RobotSearch],
     frames: Sequence[Sequence[bytes]],
     drawn: Mapping[str, bytes],
-) -> Section:
+) -> html.Section:
     naive, ssf = searches
-    introduction = paragraph(
+    introduction = html.paragraph(
         "A white circle lies somewhere on the black field. The naive robot believes that its sensor sees a point, "
         "black or white. The other predicts each reading with the calibrated SSF. Both choose their own readings and "
         "stop when centre and radius are known to 4 mm each."
     )
-    panels = Section(
+    panels = html.Section(
         "As in the paper: the first three readings",
         (
-            figure(
+            html.figure(
                 drawn["first_three.png"],
                 "Both robots start with the same reading on white, then follow the paper's rule: read where the "
                 "entropy is highest (paper, figures 2 and 8). With the naive model (left) the circles cut the field "
@@ -316,21 +286,21 @@ def _search_section(
         )
         for n in range(1, n_slides + 1)
     ]
-    whole = Section(
+    whole = html.Section(
         "A whole search, step by step",
         (
-            paragraph(
+            html.paragraph(
                 f"From an empty field, finding the circle at all takes luck, whatever the model: the naive robot met "
                 f"it at reading {naive.readings_until_first_white} of {len(naive.run.steps)}, the SSF robot at "
                 f"reading {ssf.readings_until_first_white} of {len(ssf.run.steps)}. These robots choose by "
                 f"the default rule: the expected information of a reading or, near the end, the probability that it "
                 f"ends the run. The colour bar names the one shown."
             ),
-            slideshow(
+            html.slideshow(
                 list(zip(join_side_by_side(*frames), texts, strict=True)),
                 "Each step of both searches; the length below the picture is the widest posterior sd.",
             ),
-            figure(
+            html.figure(
                 drawn["progress.png"],
                 "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the "
                 "circle.",
@@ -338,24 +308,24 @@ def _search_section(
             search_comparison_table(searches, "From an empty field; columns as in the table above."),
         ),
     )
-    return Section("The search", (introduction,), (panels, whole))
+    return html.Section("The search", (introduction,), (panels, whole))
 
 
-def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> Section:
+def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> html.Section:
     said = (
-        paragraph(diagnosis_report.summary_sentence(diagnosis)),
-        paragraph(
+        html.paragraph(diagnosis_report.summary_sentence(diagnosis)),
+        html.paragraph(
             f"The simulated world that made this recording concealed: {concealed.replace('_', ' ')}. The diagnosis did "
             "not know that."
         ),
     )
-    explanations = Section(
+    explanations = html.Section(
         "What it could be",
-        (figure(drawn["explanations.png"], "Probability of each explanation; they sum to one."),),
+        (html.figure(drawn["explanations.png"], "Probability of each explanation; they sum to one."),),
     )
     gain = diagnosis.improvement
     repair = [
-        figure(
+        html.figure(
             drawn["scans.png"],
             "Residuals (recorded minus predicted) along the scans that the repair changes most: each reading, and "
             "running means. Orange: the calibrated model. Blue: the repaired model.",
@@ -373,10 +343,12 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
             "nats per reading. (A nat is a unit of log probability: "
             "one nat more makes a reading e = 2.7 times as probable.)"
         )
-        repair = [figure(drawn["before_after.png"], caption), paragraph(held), *repair]
-    link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
-    more = paragraph("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
-    return Section("A mismatch, found and repaired", said, (explanations, Section("The repair", (*repair, more))))
+        repair = [html.figure(drawn["before_after.png"], caption), html.paragraph(held), *repair]
+    link = html.element("a", "the full report of the diagnosis", href="diagnosis/report.html")
+    more = html.paragraph("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
+    return html.Section(
+        "A mismatch, found and repaired", said, (explanations, html.Section("The repair", (*repair, more)))
+    )
 
 
 def doubt_sentence(searches: Sequence[RobotSearch]) -> str:
@@ -389,18 +361,18 @@ def doubt_sentence(searches: Sequence[RobotSearch]) -> str:
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
 
 
-def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
+def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> html.Section:
     """Build the demo's section from both searches, the trusting robot's first, and from `doubt_figure_drawers`."""
     doubting = searches[-1].run
     missing = left_out_after_step(doubting.last, doubting.experiment.trust)
-    introduction = paragraph(
+    introduction = html.paragraph(
         f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
         f"{number_text(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. "
         f"The other expects with probability {1 - doubting.experiment.trust:.1g} that an effect is missing; "
         "it compares the plain model with each effect that could act, and chooses its readings and its end under all "
         "of them."
     )
-    rows = table(
+    rows = html.table(
         ("robot", "readings", "largest error", "widest posterior sd", "stopped because"),
         (
             (
@@ -415,18 +387,18 @@ def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -
         caption="Both robots look for the circle of the searches above, from the same first reading on it. One run "
         "each; probewise study --concealed repeats it for many circles and effects.",
     )
-    fields = figure(
+    fields = html.figure(
         drawn["doubt.png"],
         "The posterior of each robot at its end: left the trusting robot, right the doubting one. Blue: 50 circles "
         "drawn from the posterior. Dashed white: the hidden circle.",
     )
-    belief = figure(
+    belief = html.figure(
         drawn["belief.png"],
         "What the doubting robot believes about its sensor after each reading. A dashed line marks a reading that "
         "changed the most probable effect.",
     )
-    found = paragraph(f"At its end the doubting robot reports: {missing.sentence}")
-    return Section(
+    found = html.paragraph(f"At its end the doubting robot reports: {missing.sentence}")
+    return html.Section(
         "A robot that doubts its sensor",
-        (introduction, paragraph(doubt_sentence(searches)), fields, rows, belief, found),
+        (introduction, html.paragraph(doubt_sentence(searches)), fields, rows, belief, found),
     )

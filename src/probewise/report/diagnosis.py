@@ -34,6 +34,7 @@ from probewise.diagnosis.words import (
     parameter_in_words,
 )
 from probewise.effects import name_without_copy_suffix
+from probewise.report import html
 from probewise.report.audit import audit_table
 from probewise.report.covariates import (
     ResidualNoise,
@@ -44,18 +45,6 @@ from probewise.report.covariates import (
 )
 from probewise.report.diagnosis_figures import figure_drawers, first_figure_content, noun_of_held_out_part
 from probewise.report.headline import headline as summary_sentence
-from probewise.report.html import (
-    Markup,
-    Section,
-    definition_list,
-    details,
-    figure,
-    fragment,
-    note_paragraphs,
-    page,
-    paragraph,
-    table,
-)
 from probewise.report.words import (
     duration_text,
     number_text,
@@ -83,20 +72,20 @@ _NOISE_CAPTIONS = {
 }
 
 
-def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
+def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Section]:
     """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `figure_drawers`."""
     return [
-        Section("What it could be", _explanation_elements(diagnosis)),
-        Section("Where it shows", _place_elements(diagnosis, drawn)),
-        Section(
+        html.Section("What it could be", _explanation_elements(diagnosis)),
+        html.Section("Where it shows", _place_elements(diagnosis, drawn)),
+        html.Section(
             f"Before and after: as calibrated, {diagnosis.repair.after_in_words}"
             if diagnosis.repair.changes_predictions
             else "The model",
             _before_and_after_elements(diagnosis, drawn),
         ),
-        Section("Does the repaired model predict held-out readings?", _heldout_gain_elements(diagnosis, drawn)),
-        Section("Aliased effects, and what would separate them", _alias_elements(diagnosis)),
-        Section("Noise", _noise_elements(diagnosis, drawn)),
+        html.Section("Does the repaired model predict held-out readings?", _heldout_gain_elements(diagnosis, drawn)),
+        html.Section("Aliased effects, and what would separate them", _alias_elements(diagnosis)),
+        html.Section("Noise", _noise_elements(diagnosis, drawn)),
     ]
 
 
@@ -104,10 +93,10 @@ def page_html(
     diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
 ) -> str:
     """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`, `audit` that of its plan, if any."""
-    run = Section(
+    run = html.Section(
         "This run",
         (
-            definition_list(
+            html.definition_list(
                 (
                     ("recordings", source),
                     ("readings", f"{_n_readings_used(diagnosis)} used of {len(diagnosis.recording)}"),
@@ -115,14 +104,15 @@ def page_html(
                     *diagnosis.apparatus.words.facts,
                 )
             ),
-            *note_paragraphs((*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
+            *html.note_paragraphs((*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
         ),
     )
-    design = () if audit is None else (Section("What these readings could have shown", _audit_elements(audit)),)
-    first = fragment(
-        figure(drawn["first.svg"], _first_figure_caption(diagnosis)), definition_list(_questions_and_answers(diagnosis))
+    design = () if audit is None else (html.Section("What these readings could have shown", _audit_elements(audit)),)
+    first = html.fragment(
+        html.figure(drawn["first.svg"], _first_figure_caption(diagnosis)),
+        html.definition_list(_questions_and_answers(diagnosis)),
     )
-    return page(
+    return html.page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=summary_sentence(diagnosis),
         key_figure=first,
@@ -257,17 +247,17 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     return f"{said[:1].upper()}{said[1:]} Expected to separate {separated} by {nats} nats."
 
 
-def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _explanation_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
     credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.judged.credible]
     return (
         *(
-            paragraph(
+            html.paragraph(
                 _as_sentence(diagnosis, f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}")
             )
             for e in diagnosis.effects
             if e.probability > _LIKELY
         ),
-        table(
+        html.table(
             ("explanation", "probability"),
             (
                 (hypothesis_in_words(h.effects), probability_text(h.probability))
@@ -283,13 +273,13 @@ def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     )
 
 
-def _credible_set_elements(names: Sequence[str]) -> tuple[Markup, ...]:
+def _credible_set_elements(names: Sequence[str]) -> tuple[html.Markup, ...]:
     if len(names) <= _MOST_CREDIBLE:
-        return (paragraph(f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(names)}."),)
-    return (details(f"95 % credible set: {len(names)} explanations", paragraph(f"{'; '.join(names)}.")),)
+        return (html.paragraph(f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(names)}."),)
+    return (html.details(f"95 % credible set: {len(names)} explanations", html.paragraph(f"{'; '.join(names)}.")),)
 
 
-def _unknown_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _unknown_effect_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
     """Build the paragraph on the likely candidates for an unknown effect; empty if none is likely."""
     likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
     if not likely:
@@ -298,23 +288,25 @@ def _unknown_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
         for name, p in likely
     )
-    return (paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {candidates}."),)
+    return (
+        html.paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {candidates}."),
+    )
 
 
-def _unstated_effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _unstated_effect_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
     """Build a paragraph for each effect in the repaired model's samples that is not among the diagnosis's `effects`."""
     return tuple(
-        paragraph(_as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}"))
+        html.paragraph(_as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.unstated_effects
     )
 
 
-def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
     """Build the table of the explanations whose evidence was computed twice; empty if none was."""
     if not diagnosis.report.weighings:
         return ()
     return (
-        table(
+        html.table(
             ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree to a nat plus the error"),
             (
                 (
@@ -331,24 +323,24 @@ def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     )
 
 
-def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
     """Build the figures of the places with significant residuals; all but the first three are folded away."""
     if not diagnosis.where:
-        return (paragraph("No residual is larger than noise explains."),)
+        return (html.paragraph("No residual is larger than noise explains."),)
     shown = [
-        figure(drawn[place.figure_name], _place_caption(diagnosis, place, seen=seen))
+        html.figure(drawn[place.figure_name], _place_caption(diagnosis, place, seen=seen))
         for place, seen in ranked_places_with_visibility(diagnosis, ResidualNoise.of_diagnosis(diagnosis))
     ]
-    opening = paragraph(
+    opening = html.paragraph(
         "Residuals of the calibrated model against each covariate in which they are significant: the headline's "
         "first, then the most visible. Each dot is a reading; by chance alone, 95 % of the means would lie in the grey "
         f"band.{_walk_note(diagnosis)}"
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
-    return (opening, *first, *((details(f"{len(rest)} more", *rest),) if rest else ()))
+    return (opening, *first, *((html.details(f"{len(rest)} more", *rest),) if rest else ()))
 
 
-def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
     run = diagnosis.apparatus.words.run
     which, colours = f"One {run}", "orange"
     if diagnosis.repair.changes_predictions:
@@ -356,34 +348,34 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
         colours = f"orange as calibrated, blue {diagnosis.repair.after_in_words}"
     walk = ", each with the random walk of the zero that all readings show" if diagnosis.repair.after.has_walk else ""
     return (
-        figure(
+        html.figure(
             drawn["before_after.svg"],
             f"{which}: readings (black) and predictions ({colours}{walk}), and below the residuals with their running "
             "means.",
         ),
-        figure(
+        html.figure(
             drawn["residuals.svg"],
             f"All residuals against time and against predicted reading, with running means.{_walk_note(diagnosis)}",
         ),
         *(
-            figure(drawn[figure_name_of(e.name)], _as_sentence(diagnosis, f"With the 95 % band: {e.sentence}"))
+            html.figure(drawn[figure_name_of(e.name)], _as_sentence(diagnosis, f"With the 95 % band: {e.sentence}"))
             for e in diagnosis.effects
             if figure_name_of(e.name) in drawn
         ),
     )
 
 
-def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
     gain, changes = diagnosis.improvement, diagnosis.repair.changes_predictions
     if "gain.svg" in drawn:
-        shown = figure(
+        shown = html.figure(
             drawn["gain.svg"],
             f"Gain in log predictive density of each held-out {noun_of_held_out_part(diagnosis)}, both models "
             "fitted to the others: blue where the repaired model predicts better, orange where worse. Grey: mean "
             "over all, with standard error.",
         )
     else:
-        shown = paragraph(diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED)
+        shown = html.paragraph(diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED)
     unit = f"{diagnosis.recording.plan.instrumentation.unit_after_number}{diagnosis.recording.weighting_in_words}"
     facts = []
     if gain.heldout_by_scan:
@@ -395,10 +387,10 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
         rms += f" as calibrated, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
     facts.append(("rms of the residuals", rms))
     facts.append(("test for further missing effects", typeset_numbers(p_in_words(gain.p_value_after))))
-    return shown, definition_list(facts)
+    return shown, html.definition_list(facts)
 
 
-def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
     noise = diagnosis.report.noise
     names = [] if noise.model == "white" else noise.model.split("+")
     model = join_names([effect_in_words(name) for name in names]) if names else "white: independent, with one sd"
@@ -408,9 +400,9 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     ]
     beside = ", the random walk aside" if diagnosis.repair.after.has_walk else ""
     return (
-        paragraph(typeset_numbers(test)),
-        *((table(("parameter", "unit", "value", "95 % interval"), rows),) if rows else ()),
-        figure(
+        html.paragraph(typeset_numbers(test)),
+        *((html.table(("parameter", "unit", "value", "95 % interval"), rows),) if rows else ()),
+        html.figure(
             drawn["noise.svg"],
             f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
             f"Middle: scatter by predicted reading{beside}. Below: histogram on a logarithmic scale{beside}.",
@@ -418,16 +410,16 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     )
 
 
-def _effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _effect_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
     likely = [effect for effect in diagnosis.effects if effect.probability > _LIKELY]
     rest = [effect for effect in diagnosis.effects if effect.probability <= _LIKELY]
     shown = (_effect_table(likely),) if likely else ()
     if not rest:
         return shown
-    return (*shown, details(f"{len(rest)} less likely effects", _effect_table(rest)))
+    return (*shown, html.details(f"{len(rest)} less likely effects", _effect_table(rest)))
 
 
-def _effect_table(effects: Sequence[EffectFound]) -> Markup:
+def _effect_table(effects: Sequence[EffectFound]) -> html.Markup:
     rows = [
         (
             _effect_words_and_name(effect.name) if k == 0 else "",
@@ -439,7 +431,7 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
         for effect in effects
         for k, p in enumerate(effect.parameters)
     ]
-    return table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
+    return html.table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
 
 
 def _effect_words_and_name(name: str) -> str:
@@ -456,19 +448,19 @@ def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> t
     return typeset_numbers(written), typeset_numbers(range_text(low, high))
 
 
-def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _alias_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
     """List the aliased pairs, those with effects of the credible set first; all but the first eight are folded away."""
     credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
     ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
-        return (paragraph("None: these readings tell apart all effects of the vocabulary that they can detect."),)
+        return (html.paragraph("None: these readings tell apart all effects of the vocabulary that they can detect."),)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
-    more = (details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()
+    more = (html.details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()
     return (_alias_table(first), *more)
 
 
-def _alias_table(aliases: Sequence[Alias]) -> Markup:
-    return table(
+def _alias_table(aliases: Sequence[Alias]) -> html.Markup:
+    return html.table(
         ("aliased in these readings", "cosine", "what would separate them", "readings needed"),
         (
             (
@@ -487,7 +479,7 @@ def _readings_needed_text(n: int) -> str:
     return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
 
 
-def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
+def _audit_elements(audit: PlanAudit) -> tuple[html.Markup, ...]:
     meaning: dict[Literal["fine", "aliased", "invisible"], str] = {
         "fine": "detected, and told from every other",
         "aliased": "detected, but another effect can imitate it",
@@ -501,9 +493,9 @@ def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
         ]
         pairs.append((f"{detectability} ({words})", ", ".join(names).replace("_", " ") or "none"))
     return (
-        definition_list(pairs),
-        details("every effect, with numbers", audit_table(audit.effects)),
-        paragraph("probewise audit PLAN.csv lists the readings that would help, before any are taken."),
+        html.definition_list(pairs),
+        html.details("every effect, with numbers", audit_table(audit.effects)),
+        html.paragraph("probewise audit PLAN.csv lists the readings that would help, before any are taken."),
     )
 
 

@@ -22,7 +22,7 @@ from probewise.experiment import (
 )
 from probewise.experiment.result import stop_reason_with_checks
 from probewise.inquiry import UtilityMap
-from probewise.report.html import Draw, Markup, Section, definition_list, draw_or_raise, figure, page, paragraph, table
+from probewise.report import html
 from probewise.report.plots.canvas import grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
@@ -47,24 +47,11 @@ def draw_robot_view(
     lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the robot's view of the field after a step, as in the paper; return the axes.
+    """Draw the robot's view of the field after a step of an experiment, as in the paper; return the axes.
 
-    Parameters
-    ----------
-    step, experiment
-        Posterior after the step, and the experiment it belongs to.
-    readings
-        x_mm, y_mm and value of the readings up to this step.
-    levels
-        Readings over black and white.
-    truth_mm
-        Outline of the true shape, (n_vertices, 2), where known.
-    drawn
-        The map drawn; by default that from which the robot chose.
-    title
-        Title; by default the number of readings and of bits known.
-    lego_scale
-        Whether to add the paper's coordinates at the top.
+    `readings` are x_mm, y_mm and value up to this step, `levels` the readings over black and white; `truth_mm` is the
+    outline of the true shape, (n_vertices, 2), where known; `drawn` the map, by default that from which the robot
+    chose; `lego_scale` adds the paper's coordinates at the top.
     """
     seen = np.asarray(readings, dtype=np.float64).reshape(-1, 3)
     pose, drawn = step.next_pose, drawn or step.map
@@ -109,7 +96,7 @@ def robot_views_by_model_png(
 ) -> bytes:
     """Draw the posteriors of several sensor models from the same readings, one below the other; return a PNG.
 
-    Each of `views` is a title, a step and the experiment it belongs to; the rest is as in `draw_robot_view`.
+    Each of `views` is a title, a step and its experiment; the rest is as in `draw_robot_view`.
     """
     axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
@@ -125,38 +112,38 @@ def live_page_html(
     *,
     earlier: Sequence[Step] = (),
     trust: float = 1.0,
-    draw: Draw = draw_or_raise,
+    draw: html.Draw = html.draw_or_raise,
 ) -> str:
     """Return the HTML of a running exploration's page after `step`; it reloads every second until the run ends.
 
-    `picture` is a PNG. If `trust` in the sensor model is below 1, the probabilities of its possible faults follow,
-    after each of the `earlier` steps and this one; `draw` makes their figure.
+    If `trust` in the sensor model is below 1, the probabilities of its possible faults follow, after each of the
+    `earlier` steps and this one; `draw` makes their figure.
     """
     reason = stop_reason_with_checks((*earlier, step))
     state = "The robot works" if reason is None else f"The robot has stopped: {reason}"
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
-    found = figure(picture, f"{following}{step.summary()}.")
+    found = html.figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1
     sections = (_fault_section((*earlier, step), trust, draw),) if trust < 1 else ()
-    return page("The robot's search", answer=f"{state}.", key_figure=found, sections=sections, reload_s=every_s)
+    return html.page("The robot's search", answer=f"{state}.", key_figure=found, sections=sections, reload_s=every_s)
 
 
-def _fault_section(steps: Sequence[Step], trust: float, draw: Draw) -> Section:
+def _fault_section(steps: Sequence[Step], trust: float, draw: html.Draw) -> html.Section:
     """Build the section on effects that the sensor model may leave out: their probabilities after each reading."""
     doubted = left_out_after_step(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
     changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
     dashed = " A dashed line marks a change of the most probable one." if changed else ""
     named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN]
-    return Section(
+    return html.Section(
         "What the sensor model leaves out",
         (
-            paragraph(doubted.sentence),
-            figure(
+            html.paragraph(doubted.sentence),
+            html.figure(
                 draw("probabilities of faults", lambda: png(effect_probabilities_by_reading(beliefs))),
                 f"Probabilities of the sensor's possible faults after each reading.{dashed}",
             ),
-            table(
+            html.table(
                 ("left out", "probability"),
                 (("nothing" if n == CLEAN else spoken_name(n), probability_text(p)) for n, p in named[:_MOST_SHOWN]),
             ),
@@ -199,16 +186,13 @@ def summary_sentence(run: Exploration) -> str:
     return f"{opening} {article} {found.name}{several} with {known}."
 
 
-def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
-    """Build the table of the shape that an exploration found.
-
-    Columns: each parameter's unit, mean, sd, the arm's part of the sd if known, 95 % interval; the truth if given.
-    """
+def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> html.Markup:
+    """Build the table of the shape that an exploration found, with the arm's part of the sd and the truth, if known."""
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm_error is not None else ()
     header = ("parameter", "unit", "mean", "sd", *arm, "95 % interval", *(("truth",) if truth else ()))
-    return table(
+    return html.table(
         header,
         (
             (
@@ -225,10 +209,10 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
     )
 
 
-def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
+def steps_table(run: Exploration, unit: str = "LEGO") -> html.Markup:
     """Build an exploration's table of steps: place, reading (in `unit`), widest posterior sd, bits so far."""
     reading = f"reading ({unit_after_number(unit)})" if unit else "reading"
-    return table(
+    return html.table(
         ("number", "at (mm)", reading, "widest sd (mm)", "information so far (bits)"),
         (
             (
@@ -253,69 +237,50 @@ def page_html(
     truth: Mapping[str, float] | None = None,
     beside: Mapping[str, Sequence[Step]] | None = None,
     unit: str = "LEGO",
-    draw: Draw = draw_or_raise,
+    draw: html.Draw = html.draw_or_raise,
 ) -> str:
     """Return the HTML of an exploration's page.
 
-    `frames` are PNGs of the steps; `model` is the name of the sensor model; `truth` are the parameters of the true
-    shape by name, where known; `beside` are steps of other sensor models, updated with the same readings, by name of
-    the model; `unit` is the readings'; `draw` makes the curves.
+    `frames` are PNGs of the steps; `truth` are the parameters of the true shape by name, where known; `beside` are
+    steps of other sensor models, updated with the same readings, by the model's name; `draw` makes the curves.
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
-    off = probability_text(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
-    facts = [
-        ("sensor model", MODEL_NAMES.get(model, model)),
-        ("inference", run.experiment.inference_method.label),
-        ("stopped because", run.stop_reason),
-        ("cost", f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time"),
-        ("information", f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading"),
-        (
-            "the paper's count",
-            f"{number_text(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)",
-        ),
-        (f"probability that a length is off by over {OFF_MM:g} mm", off),
-        ("fit of the best hypothesis", _fit_in_words(run.last.p_value)),
-        ("seed", str(seed)),
-    ]
-    if truth:
-        facts.insert(2, ("error against the truth, ± posterior sd", errors_text(run, truth)))
-    shape: list[Markup] = [shape_table(run, truth)]
-    if run.last.shapes:
-        shape.append(table(("shape", "probability"), ((n, probability_text(p)) for n, p in run.last.shapes.items())))
-    shape.append(definition_list(facts))
-    if run.last.sensor:
+    last, trust = run.last, run.experiment.trust
+    shape: list[html.Markup] = [shape_table(run, truth)]
+    if last.shapes:
+        shape.append(html.table(("shape", "probability"), ((n, probability_text(p)) for n, p in last.shapes.items())))
+    shape.append(html.definition_list(_facts(run, MODEL_NAMES.get(model, model), truth, seed)))
+    if last.sensor:
         sensor = [
             (words_without_unit(name), unit_of_name(name), *value_with_error(mean, sd).partition(" ± ")[::2])
-            for name, (mean, sd) in run.last.sensor.items()
+            for name, (mean, sd) in last.sensor.items()
         ]
-        shape.append(table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."))
+        shape.append(html.table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."))
     widths = {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()}
     bits = {name: np.array([s.bits for s in steps]) for name, steps in runs.items()}
+    more = "" if trust == 1 else " Information about what the sensor model leaves out is included."
+    how_fast = (
+        html.figure(
+            draw("widths", lambda: png(posterior_widths(widths, target_mm=run.experiment.stop_sd_mm))),
+            "Widest posterior sd of a length after each reading; dashed: the target precision.",
+        ),
+        html.figure(
+            draw("information", lambda: png(information_gained(bits))),
+            f"Information about the shape: prior minus posterior differential entropy.{more}",
+        ),
+        steps_table(run, unit),
+    )
+    slides = [
+        (picture, f"Reading {s.number}: {s.reading.value:g}.") for s, picture in zip(run.steps, frames, strict=True)
+    ]
     sections = [
-        Section("The shape and what it cost", (*shape, *(paragraph(f"Doubtful: {note}.") for note in run.notes))),
-        *((_fault_section(run.steps, run.experiment.trust, draw),) if run.experiment.trust < 1 else ()),
-        Section(
-            "How fast",
-            (
-                figure(
-                    draw("widths", lambda: png(posterior_widths(widths, target_mm=run.experiment.stop_sd_mm))),
-                    "Widest posterior sd of a length after each reading; dashed: the target precision.",
-                ),
-                figure(
-                    draw("information", lambda: png(information_gained(bits))),
-                    _information_caption(run.experiment.trust),
-                ),
-                steps_table(run, unit),
-            ),
+        html.Section(
+            "The shape and what it cost", (*shape, *(html.paragraph(f"Doubtful: {note}.") for note in run.notes))
         ),
-        Section(
-            "Every step",
-            tuple(
-                figure(picture, f"Reading {s.number}: {s.reading.value:g}.")
-                for s, picture in zip(run.steps[:-1], frames[:-1], strict=True)
-            ),
-        ),
+        *((_fault_section(run.steps, trust, draw),) if trust < 1 else ()),
+        html.Section("How fast", how_fast),
+        html.Section("Every step", (html.slideshow(slides, "The robot's view after each reading."),)),
     ]
     caption = (
         "The robot's view of the field after the last reading: at lighter places, a reading carries more information."
@@ -325,19 +290,31 @@ def page_html(
             f" The {said[model]} chose the readings; the other panel shows the other model's posterior from the same "
             f"readings, and where it would read next."
         )
-    return page(
-        "The robot's search", answer=summary_sentence(run), key_figure=figure(frames[-1], caption), sections=sections
+    return html.page(
+        "The robot's search",
+        answer=summary_sentence(run),
+        key_figure=html.figure(frames[-1], caption),
+        sections=sections,
     )
 
 
-def _information_caption(trust: float) -> str:
-    """Describe the information gained; with `trust` below 1 it includes that about the effect left out."""
-    more = "" if trust == 1 else " Information about what the sensor model leaves out is included."
-    return f"Information about the shape: prior minus posterior differential entropy.{more}"
-
-
-def _fit_in_words(p_value: float | None) -> str:
-    """Write the p-value of the best hypothesis's fit, and its meaning; None: not tested."""
-    if p_value is None:
-        return "not tested: the most probable noise is not the declared one"
-    return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
+def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed: int) -> list[tuple[str, str]]:
+    """List what a run is and cost, in words, by name."""
+    p_value = run.last.p_value
+    fits = "not tested: the most probable noise is not the declared one"
+    if p_value is not None:
+        fits = f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
+    paper = f"{number_text(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"
+    off = probability_text(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
+    return [
+        ("sensor model", model),
+        ("inference", run.experiment.inference_method.label),
+        *([("error against the truth, ± posterior sd", errors_text(run, truth))] if truth else []),
+        ("stopped because", run.stop_reason),
+        ("cost", f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time"),
+        ("information", f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading"),
+        ("the paper's count", paper),
+        (f"probability that a length is off by over {OFF_MM:g} mm", off),
+        ("fit of the best hypothesis", fits),
+        ("seed", str(seed)),
+    ]

@@ -216,10 +216,7 @@ _TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
             r"(?i)\balias(es|ed)?\b",
             "two effects that change these readings in the same way, so that the readings cannot tell which it is",
         ),
-        "cosine": (
-            r"\bcosine\b",
-            "1 where two effects change the readings in the same proportions, 0 where unrelated",
-        ),
+        "cosine": (r"\bcosine\b", "1 where two effects change the readings in the same proportions, 0 where unrelated"),
         "unknown": (r"\bunknown\b", "something that no effect which this program knows explains"),
     }
 )

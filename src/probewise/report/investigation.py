@@ -41,17 +41,11 @@ def summary_sentence(found: Investigation) -> str:
 
 
 def page_html(
-    found: Investigation,
-    drawn: Mapping[str, bytes],
-    *,
-    source: str,
-    seed: int,
-    concealed: Sequence[str] | None = None,
+    found: Investigation, drawn: Mapping[str, bytes], *, source: str, seed: int, concealed: Sequence[str] | None = None
 ) -> str:
-    """Return the HTML of an investigation's page.
+    """Return the HTML of an investigation's page; `drawn` has the last diagnosis's figures, and by_round.png.
 
-    `drawn` has the figures of the last diagnosis, and that of `probabilities_png` as by_round.png; `source` is that of
-    the readings, in words; `concealed` are the effects that a simulated world concealed, None for any other arm.
+    `concealed` are the effects that a simulated world concealed, None for any other arm.
     """
     hidden = ", ".join(map(spoken_name, concealed or ())) or "nothing"
     bars, diagnosis = probabilities_figure_html(drawn["by_round.png"]), found.last.diagnosis

@@ -39,11 +39,7 @@ def _paste_side_by_side(left: bytes, right: bytes) -> bytes:
 
 
 def animated_gif(frames: Sequence[bytes], *, frame_s: float = _FRAME_S, last_s: float = _LAST_S) -> bytes:
-    """Join PNGs into an animated GIF that loops for ever; return its bytes.
-
-    There are one PNG or more (ParameterError for none); smaller ones are set at the upper left of a white sheet.
-    `frame_s` is the duration of each frame but the last, `last_s` that of the last.
-    """
+    """Join one or more PNGs into an animated GIF that loops for ever; smaller ones lie at the upper left."""
     if not frames:
         raise ParameterError("frames", 0, "one picture or more")
     pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]

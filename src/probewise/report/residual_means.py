@@ -53,21 +53,11 @@ def mean_residuals(
 ) -> ResidualMeans:
     """Average residuals in bins of a covariate, with the 95 % band of chance.
 
-    Parameters
-    ----------
-    covariate, before, after
-        Shape (n_points,): the covariate, and the residuals of both models; NaN where there is no reading.
-    sd
-        Noise sd of one reading, a number or (n_points,).
-    rho, scan
-        Correlation of the noise of successive readings in a scan; scan numbers, (n_points,).
-    names
-        Names of the values of a categorical covariate: each is a bin.
-    window
-        Interval of the covariate that has bins of its own: no bin straddles its ends.
-    absorbed
-        Posterior samples of the predictions, (n_samples, n_points): the fit absorbs their variance from the noise,
-        which narrows the band.
+    All have the shape (n_points,): the covariate, the residuals of both models, NaN where there is no reading, the
+    noise `sd` of one reading, and `scan` numbers, within which successive noise has the correlation `rho`. `names` are
+    those of a categorical covariate's values: each is a bin. No bin straddles the ends of `window`. `absorbed`,
+    (n_samples, n_points), are posterior samples of the predictions: the fit absorbs their variance from the noise,
+    which narrows the band.
     """
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     values = covariate[ok]

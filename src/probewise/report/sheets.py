@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,19 +14,8 @@ from probewise.arm import Geometry
 from probewise.arm.fitting import spread_mark_places
 from probewise.effects.reference import orientation_deg
 from probewise.errors import ParameterError
-from probewise.recordings.patterns import (
-    Disc,
-    HalfPlane,
-    Image,
-    Pattern,
-    Polygon,
-    Quadrant,
-    Ramp,
-    Stripes,
-    Uniform,
-    where_white_in_words,
-)
-from probewise.recordings.plan import Plan
+from probewise.recordings import Disc, HalfPlane, Image, Pattern, Plan, Polygon, Quadrant, Ramp, Stripes, Uniform
+from probewise.recordings.patterns import where_white_in_words
 
 PAPERS_MM: Mapping[str, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 """Width and height of the papers, upright."""
@@ -62,6 +51,7 @@ class Sheet:
     words: tuple[tuple[float, float, str], ...] = ()  # further texts, each with x and y of its left end before it
     frame: str = "the pattern's origin"  # origin of x and y, in words
     orientations_rad: tuple[float, ...] = ()  # of the sensor over the sheet
+    skips_blank_pages: bool = False  # whether pages without a line or cross are left out
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -88,14 +78,8 @@ class Tile:
 def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     """Split a sheet into pages, portrait or landscape, whichever needs fewer; `paper` is "a4" or "letter".
 
-    Returns
-    -------
-    The tiles row by row from below, each row from the left.
-
-    Raises
-    ------
-    ParameterError
-        If it needs more than 400 pages, or the paper size is unknown.
+    Return the tiles row by row from below, each row from the left. ParameterError if it needs more than 400 pages, or
+    the paper is unknown.
     """
     if paper not in PAPERS_MM:
         raise ParameterError("paper", paper, " or ".join(PAPERS_MM))
@@ -109,33 +93,30 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
         )
     x_mm = np.linspace(sheet.low_mm[0], sheet.high_mm[0], n_columns + 1).tolist()
     y_mm = np.linspace(sheet.low_mm[1], sheet.high_mm[1], n_rows + 1).tolist()
-    return tuple(
-        Tile(
-            column,
-            row,
-            (x_mm[column], y_mm[row]),
-            (x_mm[column + 1], y_mm[row + 1]),
-            page,
-            (OVERLAP_MM * (column < n_columns - 1), OVERLAP_MM * (row < n_rows - 1)),
-        )
-        for row in range(n_rows)
-        for column in range(n_columns)
-    )
+    tiles = []
+    for row, column in itertools.product(range(n_rows), range(n_columns)):
+        low, high = (x_mm[column], y_mm[row]), (x_mm[column + 1], y_mm[row + 1])
+        beyond = (OVERLAP_MM * (column < n_columns - 1), OVERLAP_MM * (row < n_rows - 1))
+        tiles.append(Tile(column, row, low, high, page, beyond))
+    return tuple(tile for tile in tiles if not sheet.skips_blank_pages or _has_drawing(sheet, tile))
+
+
+def _has_drawing(sheet: Sheet, tile: Tile) -> bool:
+    """Return whether a stroke or a cross of the sheet lies inside the page, not only along its edge."""
+    crosses = [] if sheet.crosses_mm is None else [sheet.crosses_mm]
+    strokes = [np.linspace(a, b, 500) for stroke in sheet.strokes_mm for a, b in itertools.pairwise(stroke)]
+    points = np.concatenate([*crosses, *strokes])
+    return bool(((points > tile.low_mm) & (points < tile.high_mm)).all(axis=1).any())
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
-    """Make one sheet per pattern, which reaches 40 mm or more beyond the plan's readings.
+    """Make one sheet per pattern that the plan uses, which reaches 40 mm or more beyond the plan's readings.
 
-    Parameters
-    ----------
-    patterns
-        By name.
-    plan
-        The plan; patterns that it does not use are left out. None: the sheets show each pattern's own extent.
+    Without a plan, the sheets show each pattern's own extent.
     """
     sheets = []
     for name, pattern in patterns.items():
-        places, turns = np.zeros((1, 2)), ()
+        places, turns = np.concatenate([np.zeros((1, 2)), _points_sheet_must_show(pattern)]), ()
         if plan is not None:
             used = [index for index, own in enumerate(plan.pattern_names) if own == name]
             rows = np.flatnonzero(np.isin(plan.pattern, used))
@@ -143,8 +124,6 @@ def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) ->
                 continue
             places = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
             turns = tuple(dict.fromkeys(np.radians(orientation_deg(plan)[rows]).tolist()))
-        else:
-            places = np.concatenate([places, _points_sheet_must_show(pattern)])
         lines = (where_white_in_words(pattern),)
         sheets.append(Sheet(name, pattern, *_sheet_corners_around(places, AROUND_MM), lines, orientations_rad=turns))
     return tuple(sheets)
@@ -152,7 +131,9 @@ def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) ->
 
 def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
     """Make the sheet of the field: black, with the target white inside its closed outline, (n, 2); None: all black."""
-    pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_vertices_without_closing(outline_mm))
+    pattern: Pattern = Uniform(0.0)
+    if outline_mm is not None:
+        pattern = Polygon(tuple((x, y) for x, y in outline_mm[:-1].tolist()))
     said = "all black" if outline_mm is None else "black, the target white at its place"
     return Sheet("field", pattern, (0.0, 0.0), field_mm, (said,), frame="the field's lower left corner")
 
@@ -178,73 +159,76 @@ def marks_sheet(geometry: Geometry) -> Sheet:
 def arm_home_jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     """Return two sheets that show an arm at its home angles: its links from the side, and its base from above."""
     base, shoulder, elbow = (joint.home_rad for joint in geometry.joints)
-    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
+    turns = (shoulder, shoulder + elbow if geometry.elbow_is_relative else elbow)
     joints = [np.array(geometry.shoulder_mm)]
-    for length, angle in zip(geometry.links_mm, (shoulder, lower), strict=True):
+    for length, angle in zip(geometry.links_mm, turns, strict=True):
         joints.append(joints[-1] + length * np.array([math.cos(angle), math.sin(angle)]))
     face = joints[-1] + [geometry.sensor_mm[0], -geometry.sensor_mm[1]]
-    crosses = np.array([*joints, face])
-    beams = [_beam_outline(a, b) for a, b in itertools.pairwise(joints)]
+    return _links_from_side_sheet(geometry, joints, face, turns), _base_from_above_sheet(geometry, base, float(face[0]))
+
+
+def _links_from_side_sheet(
+    geometry: Geometry, joints: list[FloatArray], face: FloatArray, turns: tuple[float, float]
+) -> Sheet:
+    """Make the jig's sheet of the links: places from the base's axis and above the table, `turns` of both links."""
+    crosses, links = np.array([*joints, face]), list(itertools.pairwise(joints))
+    beams = [_beam_outline(a, b) for a, b in links]
     drawn = np.concatenate([crosses, *beams, [[0.0, 0.0]]])
     low, high = _sheet_corners_around(drawn, _JIG_MM)
     if drawn[:, 1].min() >= 0:
         low = low[0], 0.0  # cut there, the sheet stands on the table
-    middles = [(a + b) / 2 for a, b in itertools.pairwise(joints)]
-    of_links = zip(("upper", "lower"), geometry.links_mm, (shoulder, lower), middles, strict=True)
-    side = Sheet(
+    words = [(3.0, 40.0, "the base's axis"), (4.0, 4.0, "the table")]
+    for name, length, angle, (a, b) in zip(("upper", "lower"), geometry.links_mm, turns, links, strict=True):
+        (x, y), degrees = ((a + b) / 2 + 8.0).tolist(), math.degrees(angle)
+        words.append((x, y, f"{name} link, {length:g} mm\n{degrees:.4g} degrees from the horizontal"))
+    axis, table = [[0.0, max(low[1], 0.0)], [0.0, high[1]]], [[low[0], 0.0], [high[0], 0.0]]
+    lines = (
+        "the links at home, from the side, outwards to the right",
+        "glue it on card, cut it at y = 0, stand it on the table beside the",
+        "links, the base's axis at x = 0; bring the joints' axles to the crosses",
+    )
+    return Sheet(
         "jig, side",
         Uniform(1.0),
         low,
         high,
-        (
-            "the links at home, from the side, outwards to the right",
-            "glue it on card, cut it at y = 0, stand it on the table beside the",
-            "links, the base's axis at x = 0; bring the joints' axles to the crosses",
-        ),
+        lines,
         crosses_mm=crosses,
         cross_names=("shoulder", "elbow", "wrist", f"sensor's face, {face[1]:.1f} mm up"),
-        strokes_mm=(
-            *beams,
-            *(np.array(pair) for pair in itertools.pairwise(joints)),
-            np.array([[0.0, max(low[1], 0.0)], [0.0, high[1]]]),
-            np.array([[low[0], 0.0], [high[0], 0.0]]),
-        ),
-        words=(
-            (3.0, 40.0, "the base's axis"),
-            (4.0, 4.0, "the table"),
-            *(
-                (x + 8.0, y + 8.0, f"{name} link, {length:g} mm\n{math.degrees(angle):.4g} degrees from the horizontal")
-                for name, length, angle, (x, y) in of_links
-            ),
-        ),
+        strokes_mm=(*beams, *map(np.array, links), np.array(axis), np.array(table)),
+        words=tuple(words),
         frame="where the base's axis meets the table; y is the height",
+        skips_blank_pages=True,
     )
-    axis, out = np.array(geometry.axis_mm), float(face[0])
-    along = np.array([math.cos(base), math.sin(base)])
-    rest = axis + out * along
+
+
+def _base_from_above_sheet(geometry: Geometry, base_rad: float, out_mm: float) -> Sheet:
+    """Make the jig's sheet of the base, whose sensor is `out_mm` from its axis."""
+    axis = np.array(geometry.axis_mm)
+    rest = axis + out_mm * np.array([math.cos(base_rad), math.sin(base_rad)])
     low, high = _sheet_corners_around(np.array([axis, rest]), _JIG_BASE_MM)
     x_low, y_low, x_high, y_high = *low, *high
     width, height = geometry.field_mm
     edges = [np.array([[max(x_low, 0.0), y], [min(x_high, width), y]]) for y in (0.0, height) if y_low < y < y_high]
     edges += [np.array([[x, max(y_low, 0.0)], [x, min(y_high, height)]]) for x in (0.0, width) if x_low < x < x_high]
-    from_above = Sheet(
+    lines = (
+        f"the base at home, from above: {math.degrees(base_rad):.4g} degrees from the x axis",
+        "lay its cross below the base's axis and its line on the field's edge",
+        "(cut out what the base covers); turn the base until the links are",
+        "above the line",
+    )
+    return Sheet(
         "jig, base",
         Uniform(1.0),
         low,
         high,
-        (
-            f"the base at home, from above: {math.degrees(base):.4g} degrees from the x axis",
-            "lay its cross below the base's axis and its line on the field's edge",
-            "(cut out what the base covers); turn the base until the links are",
-            "above the line",
-        ),
+        lines,
         crosses_mm=np.array([axis, rest]),
         cross_names=("the base's axis", "sensor"),
         strokes_mm=(np.array([axis, rest]), *edges),
         words=tuple((max(edge[0, 0], x_low) + 4.0, edge[0, 1] + 3.0, "edge of the field") for edge in edges),
         frame="the field's lower left corner",
     )
-    return side, from_above
 
 
 def _beam_outline(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
@@ -262,7 +246,8 @@ def _sheet_corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tupl
     """Return the lower left and upper right corner of a sheet that shows points, (n, 2), with a margin."""
     low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
-    return _two_floats(low), _two_floats(high)
+    (x_low, y_low), (x_high, y_high) = low.tolist(), high.tolist()
+    return (x_low, y_low), (x_high, y_high)
 
 
 def _pages_across_and_up(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
@@ -291,12 +276,3 @@ def _points_sheet_must_show(pattern: Pattern) -> FloatArray:
             return np.array([[x, y], [x + albedo.shape[1] * pixel, y + albedo.shape[0] * pixel]])
         case Ramp() | Uniform():
             return np.array([[-AROUND_MM, 0.0], [AROUND_MM, 0.0]])
-
-
-def _vertices_without_closing(outline_mm: FloatArray) -> tuple[tuple[float, float], ...]:
-    return tuple((x, y) for x, y in outline_mm[:-1].tolist())
-
-
-def _two_floats(values: FloatArray | Sequence[float]) -> tuple[float, float]:
-    x, y = values
-    return float(x), float(y)

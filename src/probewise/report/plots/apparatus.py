@@ -14,40 +14,26 @@ from matplotlib.transforms import Affine2D
 from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.errors import ReachError
-from probewise.report.plots.canvas import (
-    BLACK,
-    GREY,
-    ORANGE,
-    SMALL_PT,
-    VERMILLION,
-    AxesGrid,
-    add_colour_bar,
-    axes_or_new,
-    draw_map,
-    grid_of_axes,
-    label_axes,
-    paint_out_of_reach,
-)
+from probewise.report.plots import canvas
 from probewise.report.words import number_text
 
 _ROD_MM = 26.0  # distance between the two rods of each parallelogram, as drawn
 _LINES_DEG = 15.0  # step between contours of equal orientation
-_ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": BLACK}
-_LABEL: dict[str, Any] = {"fontsize": SMALL_PT, "textcoords": "offset points", "arrowprops": _ARROW}
+_ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": canvas.BLACK}
+_LABEL: dict[str, Any] = {"fontsize": canvas.SMALL_PT, "textcoords": "offset points", "arrowprops": _ARROW}
 
 
 def arm_and_sensor(
     geometry: Geometry, place_mm: tuple[float, float], *, outline_mm: FloatArray | None = None
-) -> AxesGrid:
+) -> canvas.AxesGrid:
     """Draw the arm as it reads at a place, from the side and from above, and its sensor from below (paper, figure 1).
 
-    `outline_mm`, (n_vertices, 2), is that of the target on the field. Return the axes, (1, 3). ReachError if the arm
-    cannot read at `place_mm`.
+    `outline_mm`, (n_vertices, 2), is the target's. Return the axes, (1, 3). ReachError if `place_mm` is out of reach.
     """
     base, shoulder, elbow = geometry.angles_rad(np.array([place_mm]), geometry.read_height_mm)[0].tolist()
     if not np.isfinite(base):
         raise ReachError("place_mm", place_mm, geometry.sentence())
-    axes = grid_of_axes(1, 3, size_in=(9.6, 3.3), width_ratios=[1.75, 1.6, 0.75])
+    axes = canvas.grid_of_axes(1, 3, size_in=(9.6, 3.3), width_ratios=[1.75, 1.6, 0.75])
     side, above, face = axes[0]
     _draw_arm_from_side(side, geometry, shoulder, elbow)
     _draw_arm_from_above(above, geometry, place_mm, outline_mm)
@@ -55,16 +41,17 @@ def arm_and_sensor(
     face.set_axis_off()
     face.set(xlim=(-0.95, 0.95), ylim=(-0.95, 0.95), aspect="equal")
     face.set_title("sensor, from below", fontsize="medium", loc="left")
-    face.annotate("photodiode", (0.0, 0.24), xytext=(0.0, 0.72), ha="center", fontsize=SMALL_PT, arrowprops=_ARROW)
-    face.annotate("LED", (0.0, -0.24), xytext=(0.0, -0.8), ha="center", fontsize=SMALL_PT, arrowprops=_ARROW)
+    face.annotate(
+        "photodiode", (0.0, 0.24), xytext=(0.0, 0.72), ha="center", fontsize=canvas.SMALL_PT, arrowprops=_ARROW
+    )
+    face.annotate("LED", (0.0, -0.24), xytext=(0.0, -0.8), ha="center", fontsize=canvas.SMALL_PT, arrowprops=_ARROW)
     return axes
 
 
 def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring; return the axes.
 
-    The sensor reads at the distance `away_mm` from the base's axis, by default in the middle of its reach; ReachError
-    if it cannot.
+    The sensor reads `away_mm` from the base's axis, by default in the middle of its reach; ReachError if it cannot.
     """
     away = (geometry.nearest_mm + geometry.farthest_mm) / 2 if away_mm is None else away_mm
     middle = (geometry.base.low_rad + geometry.base.high_rad) / 2
@@ -72,7 +59,7 @@ def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Ax
     _, shoulder, elbow = geometry.angles_rad(place, geometry.read_height_mm)[0].tolist()
     if not np.isfinite(shoulder):
         raise ReachError("away_mm", away, f"{geometry.nearest_mm:.0f} to {geometry.farthest_mm:.0f} mm")
-    ax = axes_or_new(ax, size_in=(8.2, 5.4))
+    ax = canvas.axes_or_new(ax, size_in=(8.2, 5.4))
     _draw_arm_from_side(ax, geometry, shoulder, elbow, named=False)
     _draw_lengths(ax, geometry, shoulder, elbow)
     joint, knee, *_ = _joints_from_side(geometry, shoulder, elbow)
@@ -115,9 +102,9 @@ def _draw_dimension(ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArr
     """Draw a dimension line, with arrows and text, parallel to the part from `begin` to `end` and offset by `away`."""
     a, b = begin + away, end + away
     for here, there in ((begin, a), (end, b)):
-        ax.plot(*np.array([here, there]).T, color=GREY, linewidth=0.6, zorder=1)
+        ax.plot(*np.array([here, there]).T, color=canvas.GREY, linewidth=0.6, zorder=1)
     arrow: dict[str, Any] = {"arrowstyle": "<|-|>", "linewidth": 0.8, "shrinkA": 0.0, "shrinkB": 0.0}
-    ax.annotate("", tuple(b), xytext=tuple(a), arrowprops={**arrow, "color": BLACK, "mutation_scale": 7})
+    ax.annotate("", tuple(b), xytext=tuple(a), arrowprops={**arrow, "color": canvas.BLACK, "mutation_scale": 7})
     (x, y), turn, ha = (a + b) / 2, 0.0, "center"
     if side == "above":
         turn = float(np.degrees(np.arctan2(*(b - a)[::-1])))
@@ -127,7 +114,7 @@ def _draw_dimension(ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArr
         x, ha = min(a[0], b[0]) - 6, "right"
     else:
         x, y, ha = max(a[0], b[0]) + 6, y + 2, "left"
-    ax.text(float(x), float(y), text, rotation=turn, ha=ha, va="center", fontsize=SMALL_PT)
+    ax.text(float(x), float(y), text, rotation=turn, ha=ha, va="center", fontsize=canvas.SMALL_PT)
 
 
 def draw_sensor_face(
@@ -135,15 +122,17 @@ def draw_sensor_face(
 ) -> None:
     """Draw the sensor seen from below: package, photodiode (white), LED (red) and the ridge between them.
 
-    `center` and `size` are the middle and the width of the package in the axes' units. It is turned anticlockwise in
-    the drawing; at 0 the photodiode is at the top. `zorder` is that of the lowest part.
+    `size` is the width of the package in the axes' units; it is turned anticlockwise, at 0 the photodiode is at the
+    top.
     """
     turn = Affine2D().scale(size).rotate(turned_rad).translate(*center) + ax.transData
     parts = (
-        FancyBboxPatch((-0.42, -0.42), 0.84, 0.84, boxstyle="round,pad=0,rounding_size=0.12", fc="#9a9a9a", ec=BLACK),
+        FancyBboxPatch(
+            (-0.42, -0.42), 0.84, 0.84, boxstyle="round,pad=0,rounding_size=0.12", fc="#9a9a9a", ec=canvas.BLACK
+        ),
         Rectangle((-0.36, -0.035), 0.72, 0.07, fc="#4d4d4d", ec="none"),
-        Circle((0.0, 0.21), 0.13, fc="white", ec=BLACK),
-        Circle((0.0, -0.21), 0.13, fc="#d62728", ec=BLACK),
+        Circle((0.0, 0.21), 0.13, fc="white", ec=canvas.BLACK),
+        Circle((0.0, -0.21), 0.13, fc="#d62728", ec=canvas.BLACK),
     )
     for k, part in enumerate(parts):
         part.set(transform=turn, linewidth=0.8, zorder=zorder + 0.1 * k)
@@ -161,19 +150,23 @@ def _joints_from_side(geometry: Geometry, shoulder: float, elbow: float) -> list
 
 def _draw_arm_from_side(ax: Axes, geometry: Geometry, shoulder: float, elbow: float, *, named: bool = True) -> None:
     joint, knee, wrist, eye = _joints_from_side(geometry, shoulder, elbow)
-    ax.axhline(0.0, color=BLACK, linewidth=1.2)
-    ax.add_patch(Rectangle((-45, 0), 90, joint[1] - 12, fc="#e3e3e3", ec=GREY, zorder=1))
-    ax.plot([0, 0], [-25, knee[1] + 70], color=BLACK, linewidth=1.0, linestyle=(0, (6, 3)), zorder=2)
+    ax.axhline(0.0, color=canvas.BLACK, linewidth=1.2)
+    ax.add_patch(Rectangle((-45, 0), 90, joint[1] - 12, fc="#e3e3e3", ec=canvas.GREY, zorder=1))
+    ax.plot([0, 0], [-25, knee[1] + 70], color=canvas.BLACK, linewidth=1.0, linestyle=(0, (6, 3)), zorder=2)
     rods = np.array([[0.0, 0.0], [0.0, _ROD_MM]])
     for away in rods:
         for ends in ([joint + away, knee + away], [knee + away, wrist + away]):
-            ax.plot(*np.array(ends).T, color=ORANGE, linewidth=3.0, solid_capstyle="round", zorder=3)
+            ax.plot(*np.array(ends).T, color=canvas.ORANGE, linewidth=3.0, solid_capstyle="round", zorder=3)
     for end in (joint, knee, wrist):
-        ax.plot(*np.array([end, end + rods[1]]).T, color=BLACK, linewidth=2.2, zorder=4)
-        ax.plot(*end, marker="o", markersize=6, color="white", markeredgecolor=BLACK, zorder=5)
-    ax.plot([wrist[0], eye[0]], [wrist[1], wrist[1]], color=BLACK, linewidth=2.2, zorder=4)
-    ax.add_patch(Rectangle((eye[0] - 8, eye[1]), 16, geometry.sensor_mm[1] + 6, fc="#9a9a9a", ec=BLACK, zorder=4))
-    label_axes(ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side" if named else "")
+        ax.plot(*np.array([end, end + rods[1]]).T, color=canvas.BLACK, linewidth=2.2, zorder=4)
+        ax.plot(*end, marker="o", markersize=6, color="white", markeredgecolor=canvas.BLACK, zorder=5)
+    ax.plot([wrist[0], eye[0]], [wrist[1], wrist[1]], color=canvas.BLACK, linewidth=2.2, zorder=4)
+    ax.add_patch(
+        Rectangle((eye[0] - 8, eye[1]), 16, geometry.sensor_mm[1] + 6, fc="#9a9a9a", ec=canvas.BLACK, zorder=4)
+    )
+    canvas.label_axes(
+        ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side" if named else ""
+    )
     ax.set_aspect("equal")
     if not named:
         return
@@ -190,16 +183,18 @@ def _draw_arm_from_above(
     ax: Axes, geometry: Geometry, place_mm: tuple[float, float], outline_mm: FloatArray | None
 ) -> None:
     width, height = geometry.field_mm
-    ax.add_patch(Rectangle((0, 0), width, height, fc="#222222", ec=BLACK))
+    ax.add_patch(Rectangle((0, 0), width, height, fc="#222222", ec=canvas.BLACK))
     if outline_mm is not None:
         ax.fill(*outline_mm.T, color="white")
     (x, y), (at_x, at_y) = geometry.axis_mm, place_mm
-    ax.plot([x, at_x], [y, at_y], color=ORANGE, linewidth=4.0, solid_capstyle="round")
-    ax.plot(x, y, marker="o", markersize=11, color="#e3e3e3", markeredgecolor=BLACK)
-    ax.plot(at_x, at_y, marker="s", markersize=7, color="#9a9a9a", markeredgecolor=VERMILLION, markeredgewidth=1.4)
-    ax.annotate("base", (x, y), xytext=(12, 0), textcoords="offset points", va="center", fontsize=SMALL_PT)
+    ax.plot([x, at_x], [y, at_y], color=canvas.ORANGE, linewidth=4.0, solid_capstyle="round")
+    ax.plot(x, y, marker="o", markersize=11, color="#e3e3e3", markeredgecolor=canvas.BLACK)
+    ax.plot(
+        at_x, at_y, marker="s", markersize=7, color="#9a9a9a", markeredgecolor=canvas.VERMILLION, markeredgewidth=1.4
+    )
+    ax.annotate("base", (x, y), xytext=(12, 0), textcoords="offset points", va="center", fontsize=canvas.SMALL_PT)
     ax.set(xlim=(-20, width + 20), ylim=(-20, max(height, y) + 50), aspect="equal")
-    label_axes(ax, x="x (mm)", y="y (mm)", title="from above, with the field")
+    canvas.label_axes(ax, x="x (mm)", y="y (mm)", title="from above, with the field")
 
 
 def reach_map(
@@ -212,32 +207,32 @@ def reach_map(
 ) -> Axes:
     """Draw an arm's reach over the field, coloured by the sensor's orientation.
 
-    `orientation_rad`, (n_y, n_x), lower row first, is NaN out of reach; `x_mm`, (n_x,), and `y_mm`, (n_y,), are the
-    places of columns and rows; `axis_mm` is that of the arm's axis.
+    `orientation_rad`, (n_y, n_x), lower row first, at the places `x_mm` and `y_mm`, is NaN out of reach; `axis_mm` is
+    the place of the arm's axis.
     """
-    ax = axes_or_new(ax, size_in=(8.2, 5.0))
+    ax = canvas.axes_or_new(ax, size_in=(8.2, 5.0))
     degrees = _unwrapped_about_mean_deg(np.degrees(orientation_rad))
-    image = draw_map(ax, degrees, x_mm, y_mm, cmap="cividis")
+    image = canvas.draw_map(ax, degrees, x_mm, y_mm, cmap="cividis")
     levels = _contour_levels_deg(degrees)
     if levels.size:
         style: dict[str, Any] = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
         lines = ax.contour(x_mm, y_mm, np.ma.masked_invalid(degrees), levels, **style)
-        for label in ax.clabel(lines, fmt=_angle_text, fontsize=SMALL_PT):
-            label.set_path_effects([withStroke(linewidth=2.0, foreground=BLACK)])
+        for label in ax.clabel(lines, fmt=_angle_text, fontsize=canvas.SMALL_PT):
+            label.set_path_effects([withStroke(linewidth=2.0, foreground=canvas.BLACK)])
     left, right, low, high = image.get_extent()
-    paint_out_of_reach(ax)
-    bar = add_colour_bar(ax, image, "orientation of the sensor (degrees)").yaxis
+    canvas.paint_out_of_reach(ax)
+    bar = canvas.add_colour_bar(ax, image, "orientation of the sensor (degrees)").yaxis
     bar.set_major_locator(MultipleLocator(_LINES_DEG) if levels.size else MaxNLocator())
     bar.set_major_formatter(FuncFormatter(lambda angle, _: _angle_text(angle)))
-    ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=BLACK, linewidth=0.8))
-    ax.plot(*axis_mm, marker="o", markersize=9, color=BLACK)
-    ax.annotate("arm's axis", axis_mm, textcoords="offset points", xytext=(8, 0), va="center", fontsize=SMALL_PT)
+    ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=canvas.BLACK, linewidth=0.8))
+    ax.plot(*axis_mm, marker="o", markersize=9, color=canvas.BLACK)
+    ax.annotate("arm's axis", axis_mm, textcoords="offset points", xytext=(8, 0), va="center", fontsize=canvas.SMALL_PT)
     (x, y), margin = axis_mm, 20.0
     ax.set(xlim=(min(left, x - margin), max(right, x + margin)), ylim=(min(low, y - margin), max(high, y + margin)))
     ax.set_aspect("equal")
     share = 100 * float(np.isfinite(degrees).mean())
     title = f"{share:.0f} % of the field (framed) within reach; grey is out of reach"
-    return label_axes(ax, x="x (mm)", y="y (mm)", title=title)
+    return canvas.label_axes(ax, x="x (mm)", y="y (mm)", title=title)
 
 
 def _unwrapped_about_mean_deg(degrees: FloatArray) -> FloatArray:

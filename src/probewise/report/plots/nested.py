@@ -20,25 +20,15 @@ from probewise._kinds import require_kind, require_like
 from probewise._words import unit_of_name
 from probewise.errors import ParameterError
 from probewise.nested import NestedResult, Weighted
-from probewise.report.plots.canvas import (
-    BLACK,
-    BLUE,
-    GREY,
-    PAGE_IN,
-    SMALL_PT,
-    VERMILLION,
-    AxesGrid,
-    axes_or_grid,
-    axes_or_new,
-    label_axes,
-    new_figure,
-)
+from probewise.report.plots import canvas
 from probewise.report.words import value_and_interval_texts, value_with_error, words_without_unit
 
 Posterior: TypeAlias = NestedResult | Weighted
 
 # Darker points have more weight, so that they show on white; lightness falls evenly, so that it can be read in grey.
-_WEIGHT: Colormap = LinearSegmentedColormap.from_list("probewise_weight", ["#dcdcdc", "#8fbbdb", BLUE, "#00233b"])
+_WEIGHT: Colormap = LinearSegmentedColormap.from_list(
+    "probewise_weight", ["#dcdcdc", "#8fbbdb", canvas.BLUE, "#00233b"]
+)
 _SSF_UNITS = {"u": "mm", "v": "mm", "A": "mm⁻²", "B": "mm⁻²", "C": "mm⁻²"}  # units of the paper's symbols
 _MASSES = (0.68, 0.95)
 _SHADES = ("#aecfe6", "#4d9bcb")  # colours of the larger and of the smaller mass
@@ -50,8 +40,8 @@ _FEW = 6  # parameters up to which a corner plot fits a page and has numbers
 
 
 def trace_plot(
-    result: NestedResult, *, parameters: Sequence[str] | None = None, axes: AxesGrid | None = None
-) -> AxesGrid:
+    result: NestedResult, *, parameters: Sequence[str] | None = None, axes: canvas.AxesGrid | None = None
+) -> canvas.AxesGrid:
     """Draw each parameter of the dead points against the remaining log volume, darker where the posterior mass is.
 
     On top: posterior mass per nat of log volume. To the right of each trace: the parameter's marginal posterior, on a
@@ -62,7 +52,7 @@ def trace_plot(
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
     height = 1.5 if n <= _FEW else 1.15
-    axes = axes_or_grid(
+    axes = canvas.axes_or_grid(
         axes,
         n + 1,
         2,
@@ -74,30 +64,30 @@ def trace_plot(
     shown = shown[np.argsort(mass[shown], kind="stable")]
     top, key = axes[0]
     _draw_mass(top, depth, mass, linewidth=1.2)
-    label_axes(top, x="", y="posterior\nper nat", title=_evidence_text(result))
+    canvas.label_axes(top, x="", y="posterior\nper nat", title=_evidence_text(result))
     key.axis("off")
     scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
     place = key.inset_axes((0.05, 0.42, 0.9, 0.16))
     bar = key.figure.colorbar(scale, cax=place, orientation="horizontal", ticks=[0, 1])
-    bar.set_label("posterior per nat,\nshare of its peak", fontsize=SMALL_PT)
-    bar.ax.tick_params(labelsize=SMALL_PT)
+    bar.set_label("posterior per nat,\nshare of its peak", fontsize=canvas.SMALL_PT)
+    bar.ax.tick_params(labelsize=canvas.SMALL_PT)
     for row, i in enumerate(columns, start=1):
         trace, side = axes[row]
         values = result.theta[:, i]
         colours: dict[str, Any] = {"c": mass[shown] / mass.max(), "cmap": _WEIGHT, "vmin": 0, "vmax": 1}
         trace.scatter(depth[shown], values[shown], s=5, linewidths=0, rasterized=True, **colours)
         last = row == n
-        label_axes(trace, x=_DEPTH if last else "", y=_parameter_label(result.names[i]))
+        canvas.label_axes(trace, x=_DEPTH if last else "", y=_parameter_label(result.names[i]))
         span = _axis_limits(result, i)
         centres, density = _centres_and_smoothed_density(values, result.weight, span, result.n_eff)
-        side.fill_betweenx(centres, density, color=BLUE, alpha=0.25, lw=0)
-        side.plot(density, centres, color=BLUE, linewidth=1.2)
+        side.fill_betweenx(centres, density, color=canvas.BLUE, alpha=0.25, lw=0)
+        side.plot(density, centres, color=canvas.BLUE, linewidth=1.2)
         side.set_xlim(left=0)
         side.set_ylim(span)
-        label_axes(side, x="posterior" if last else "", y="")
+        canvas.label_axes(side, x="posterior" if last else "", y="")
         side.set_xticks([])
         side.yaxis.tick_right()
-        side.tick_params(labelsize=SMALL_PT)
+        side.tick_params(labelsize=canvas.SMALL_PT)
         for ax in (trace, side):
             ax.yaxis.set_major_locator(MaxNLocator(3))
     for ax in axes[:, 0]:
@@ -109,23 +99,26 @@ def trace_plot(
 
 
 def corner_plot(
-    result: Posterior, *, parameters: Sequence[str] | None = None, axes: AxesGrid | None = None
-) -> AxesGrid:
+    result: Posterior, *, parameters: Sequence[str] | None = None, axes: canvas.AxesGrid | None = None
+) -> canvas.AxesGrid:
     """Draw the marginal posterior of each parameter, and 68 % and 95 % regions of each pair.
 
-    Intervals of single parameters are central ones; up to six parameters also have their median and 95 % interval
-    written above. Regions of pairs are those of highest density, from a histogram of the weighted samples
-    smoothed by a kernel that narrows as the effective sample size grows. Up to six parameters fit the width of a page;
-    with more, the figure grows and its text does not shrink. `parameters` are the names to draw, in this order;
-    default: all.
+    Intervals of single parameters are central ones; up to six parameters, which fit the width of a page, also have
+    their median and 95 % interval written above. Regions of pairs are those of highest density, from a histogram of the
+    weighted samples smoothed by a kernel that narrows as the effective sample size grows. `parameters` are the names to
+    draw, in this order; default: all.
 
     Return the axes, (n, n), of the n parameters drawn; None above the diagonal, where axes given are hidden.
     ParameterError for an unknown name or none.
     """
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
-    side = (min(1.9, (PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
-    cells = _corner_axes(n, side) if axes is None else axes_or_grid(axes, n, n, size_in=(PAGE_IN, PAGE_IN))
+    side = (min(1.9, (canvas.PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
+    cells = (
+        _corner_axes(n, side)
+        if axes is None
+        else canvas.axes_or_grid(axes, n, n, size_in=(canvas.PAGE_IN, canvas.PAGE_IN))
+    )
     drawn = np.full((n, n), None, dtype=np.object_)
     spans = [_axis_limits(result, i) for i in columns]
     for (row, column), ax in np.ndenumerate(cells):
@@ -140,7 +133,7 @@ def corner_plot(
             _draw_pair(ax, result, (columns[column], columns[row]), (spans[column], spans[row]))
             ax.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
         ax.set_xlim(spans[column])
-        ax.tick_params(labelsize=SMALL_PT, length=3)
+        ax.tick_params(labelsize=canvas.SMALL_PT, length=3)
         ax.tick_params(axis="x", labelrotation=45)
         ax.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
         if row == n - 1:
@@ -164,17 +157,17 @@ def corner_plot(
             loc="upper right",
             borderaxespad=0.0,
             frameon=False,
-            fontsize=SMALL_PT,
-            title_fontsize=SMALL_PT,
+            fontsize=canvas.SMALL_PT,
+            title_fontsize=canvas.SMALL_PT,
             alignment="left",
         )
     return drawn
 
 
-def _corner_axes(n: int, side_in: float) -> AxesGrid:
+def _corner_axes(n: int, side_in: float) -> canvas.AxesGrid:
     """Open square axes on and below the diagonal, and at the upper right for the legend: (n, n), None elsewhere."""
     width, height = _LEFT_IN + n * side_in + _RIGHT_IN, _BOTTOM_IN + n * side_in + _TOP_IN
-    sheet = new_figure((width, height))
+    sheet = canvas.new_figure((width, height))
     cells = np.full((n, n), None, dtype=np.object_)
     for row, column in [*((i, j) for i in range(n) for j in range(i + 1)), (0, n - 1)]:
         if cells[row, column] is None:
@@ -192,7 +185,9 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     bars at once in 99 of 100 correct runs (binomial, Šidák's correction); bars outside it are red.
     """
     require_kind("result", result, NestedResult, _A_RUN)
-    ax = label_axes(axes_or_new(ax, size_in=(6.4, 3.6)), x="rank among the live points (0: worst, 1: best)", y=_NEW)
+    ax = canvas.label_axes(
+        canvas.axes_or_new(ax, size_in=(6.4, 3.6)), x="rank among the live points (0: worst, 1: best)", y=_NEW
+    )
     n = result.insertion_rank.size
     if n == 0:
         ax.text(0.5, 0.5, "no point was inserted", transform=ax.transAxes, ha="center", va="center")
@@ -203,52 +198,56 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     tail = (1.0 - 0.99 ** (1.0 / n_bars)) / 2.0
     low, high = (float(binom.ppf(q, n, 1.0 / n_bars)) for q in (tail, 1.0 - tail))
     outside = (counts < low) | (counts > high)
-    colour = np.where(outside, VERMILLION, _SHADES[0])
+    colour = np.where(outside, canvas.VERMILLION, _SHADES[0])
     ax.bar(edges[:-1], counts, 1.0 / n_bars, align="edge", color=colour, edgecolor="white", linewidth=0.6)
-    ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0, label="99 % of correct runs")
-    ax.axhline(n / n_bars, color=BLACK, linewidth=0.9, label="uniform")
+    ax.axhspan(low, high, color=canvas.GREY, alpha=0.25, lw=0, label="99 % of correct runs")
+    ax.axhline(n / n_bars, color=canvas.BLACK, linewidth=0.9, label="uniform")
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1.3 * max(high, counts.max()))
-    ax.legend(frameon=False, fontsize=SMALL_PT, loc="upper right", ncols=2)  # leaves room for the text above every bar
+    ax.legend(
+        frameon=False, fontsize=canvas.SMALL_PT, loc="upper right", ncols=2
+    )  # leaves room for the text above every bar
     ax.set_title(f"{n} {_NEW}, p = {result.insertion_p_value:.2g}", fontsize="medium", loc="left")
     return ax
 
 
-def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
+def run_plot(result: NestedResult, *, axes: canvas.AxesGrid | None = None) -> canvas.AxesGrid:
     """Draw the course of a run: likelihood, posterior mass, live points and cumulative evidence against log volume.
 
     Return the axes, (4, 1). The likelihood's axis leaves out values far below those that carry posterior mass.
     """
     require_kind("result", result, NestedResult, _A_RUN)
-    axes = axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
+    axes = canvas.axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
     depth, mass = -result.log_volume, _mass_per_nat(result)
     likelihood, posterior, alive, evidence = axes[:, 0]
     peak = float(result.log_likelihood.max())
     below = max(20.0 * (peak - float(result.log_likelihood[int(np.argmax(mass))])), 30.0)
     floor = max(float(result.log_likelihood.min()), peak - below)
-    likelihood.plot(depth, result.log_likelihood, color=BLUE, linewidth=1.4)
+    likelihood.plot(depth, result.log_likelihood, color=canvas.BLUE, linewidth=1.4)
     likelihood.set_ylim(floor - 0.03 * (peak - floor), peak + 0.05 * (peak - floor))
-    label_axes(likelihood, x="", y="ln likelihood", title=_evidence_text(result))
+    canvas.label_axes(likelihood, x="", y="ln likelihood", title=_evidence_text(result))
     _draw_mass(posterior, depth, mass, linewidth=1.4)
-    label_axes(posterior, x="", y="posterior per nat")
-    alive.plot(depth, result.n_at_death, color=BLUE, linewidth=0.8)
+    canvas.label_axes(posterior, x="", y="posterior per nat")
+    alive.plot(depth, result.n_at_death, color=canvas.BLUE, linewidth=0.8)
     alive.set_ylim(0, 1.1 * float(result.n_at_death.max()))
-    label_axes(alive, x="", y="live points")
+    canvas.label_axes(alive, x="", y="live points")
     error = result.log_z_error
-    evidence.axhspan(result.log_z - error, result.log_z + error, color=GREY, alpha=0.35, lw=0, label="ln Z ± its error")
+    evidence.axhspan(
+        result.log_z - error, result.log_z + error, color=canvas.GREY, alpha=0.35, lw=0, label="ln Z ± its error"
+    )
     so_far = np.logaddexp.accumulate(result.log_weight) + result.log_z
-    evidence.plot(depth, so_far, color=BLUE, linewidth=1.4, label="from the points so far")
+    evidence.plot(depth, so_far, color=canvas.BLUE, linewidth=1.4, label="from the points so far")
     evidence.set_ylim(result.log_z - max(6.0, 4 * error), result.log_z + max(1.0, 2 * error))
-    evidence.legend(frameon=False, fontsize=SMALL_PT, loc="lower right")
+    evidence.legend(frameon=False, fontsize=canvas.SMALL_PT, loc="lower right")
     evidence.set_xlim(0, depth[-1])
-    label_axes(evidence, x=_DEPTH, y="ln Z")
+    canvas.label_axes(evidence, x=_DEPTH, y="ln Z")
     evidence.figure.align_ylabels(list(axes[:, 0]))
     return axes
 
 
 def _draw_mass(ax: Axes, depth: FloatArray, mass: FloatArray, *, linewidth: float) -> None:
-    ax.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
-    ax.plot(depth, mass, color=BLUE, linewidth=linewidth)
+    ax.fill_between(depth, mass, color=canvas.BLUE, alpha=0.25, lw=0)
+    ax.plot(depth, mass, color=canvas.BLUE, linewidth=linewidth)
     ax.set_ylim(bottom=0)
 
 
@@ -322,7 +321,7 @@ def _centres_and_smoothed_density(
 def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, float], *, titled: bool) -> None:
     centres, density = _centres_and_smoothed_density(result.theta[:, column], result.weight, span, result.n_eff)
     cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
-    ax.plot(centres, density, color=BLUE, linewidth=1.2)
+    ax.plot(centres, density, color=canvas.BLUE, linewidth=1.2)
     for (low, high), colour in zip(cuts, _SHADES, strict=True):
         ax.fill_between(centres, density, where=list((centres >= low) & (centres <= high)), color=colour, lw=0)
     ax.set_ylim(0, 1.1 * max(float(density.max()), 1e-300))
@@ -331,14 +330,11 @@ def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, 
     if titled:
         median = float(result.quantiles([0.5])[0, column])
         low, high = (float(end) for end in cuts[0])
-        ax.set_title("\n".join(value_and_interval_texts(median, low, high)), fontsize=SMALL_PT)
+        ax.set_title("\n".join(value_and_interval_texts(median, low, high)), fontsize=canvas.SMALL_PT)
 
 
 def _draw_pair(
-    ax: Axes,
-    result: Posterior,
-    columns: tuple[int, int],
-    spans: tuple[tuple[float, float], tuple[float, float]],
+    ax: Axes, result: Posterior, columns: tuple[int, int], spans: tuple[tuple[float, float], tuple[float, float]]
 ) -> None:
     x, y = (result.theta[:, i] for i in columns)
     density, x_edges, y_edges = np.histogram2d(x, y, bins=48, range=spans, weights=result.weight)
@@ -351,11 +347,11 @@ def _draw_pair(
     top = float(ordered[0])
     ax.set_ylim(spans[1])
     if not 0 < levels[0] < levels[1] < top:
-        ax.plot(x, y, linestyle="none", marker=".", markersize=2, color=BLUE)
+        ax.plot(x, y, linestyle="none", marker=".", markersize=2, color=canvas.BLUE)
         return
     middles = [(edges[:-1] + edges[1:]) / 2 for edges in (x_edges, y_edges)]
     ax.contourf(*middles, smooth.T, levels=[*levels, top * 1.001], colors=_SHADES)
-    ax.contour(*middles, smooth.T, levels=levels, colors=BLUE, linewidths=0.6)
+    ax.contour(*middles, smooth.T, levels=levels, colors=canvas.BLUE, linewidths=0.6)
 
 
 def _new_points_per_bar(rank: IntArray, n_ranked: IntArray, edges: FloatArray) -> FloatArray:

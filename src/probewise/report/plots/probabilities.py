@@ -12,22 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from probewise._arrays import FloatArray
 from probewise.effects import spoken_name
-from probewise.report.plots.canvas import (
-    BLUE,
-    COPPER,
-    CYCLE,
-    GREY,
-    LETTERS_PER_IN,
-    ORANGE,
-    SMALL_PT,
-    AxesGrid,
-    axes_or_grid,
-    axes_or_new,
-    figure_of,
-    label_axes,
-    legend_above,
-    legend_below,
-)
+from probewise.report.plots import canvas
 
 _SHOWN = 6  # hypotheses with a colour of their own in the bars of rounds
 _VISIBLE = 0.02  # probability from which a hypothesis has one
@@ -35,7 +20,7 @@ _LINE = 0.42  # height of a further line of a label, in distances of two bars
 _AXES_SHARE = 0.775  # of a figure's width: its axes before the layout, which widens them
 _EFFECT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")  # of the likeliest effects by reading
 _CLEAN, _REST = "#D9D9D9", "#7F7F7F"
-_DETECTABILITY = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
+_DETECTABILITY = {"fine": canvas.BLUE, "aliased": canvas.ORANGE, "invisible": canvas.GREY}
 _NOT_COMPARED = "#e8e8e8"
 _MOST_NAMES = 36  # columns of the matrix labelled with names; if there are more, they are numbered
 
@@ -53,13 +38,13 @@ def hypothesis_probabilities(
         shown.append((f"{len(order) - most} others", float(np.sum(np.asarray(probabilities)[order[most:]]))))
     shown_names = [name for name, _ in shown]
     height = 0.6 + 0.42 * (len(shown) + _LINE * n_further_lines(shown_names, width_in=6.6))
-    ax = axes_or_new(ax, size_in=(6.6, height))
-    wrapped = _wrapped_labels(shown_names, ax.get_position().width * figure_of(ax).get_figwidth())
+    ax = canvas.axes_or_new(ax, size_in=(6.6, height))
+    wrapped = _wrapped_labels(shown_names, ax.get_position().width * canvas.figure_of(ax).get_figwidth())
     # A bar lies below all lines of its label.
     lines_before = np.cumsum([len(lines) - 1 for lines in wrapped])
     at = -np.arange(len(shown), dtype=np.float64) - _LINE * lines_before
-    ax.barh(at - 0.22, [p for _, p in shown], color=[BLUE, *[GREY] * (len(shown) - 1)], height=0.34)
-    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": SMALL_PT}
+    ax.barh(at - 0.22, [p for _, p in shown], color=[canvas.BLUE, *[canvas.GREY] * (len(shown) - 1)], height=0.34)
+    beside: dict[str, Any] = {"textcoords": "offset points", "fontsize": canvas.SMALL_PT}
     for y, lines, (_, p) in zip(at, wrapped, shown, strict=True):
         ax.annotate(f"{p:.3f}", (p, y - 0.22), xytext=(4, 0), va="center", **beside)
         ax.annotate("\n".join(lines), (0.0, y + 0.06), xytext=(3, 0), **beside)
@@ -69,7 +54,7 @@ def hypothesis_probabilities(
     ax.set_xticks(np.linspace(0.0, 1.0, 6))
     # Room for at least three bars, so that a single bar is not too thick.
     ax.set_ylim(min(at[-1], -2.0) - 0.5, 0.5)
-    return label_axes(ax, x="probability", y="")
+    return canvas.label_axes(ax, x="probability", y="")
 
 
 def n_further_lines(names: Sequence[str], *, width_in: float) -> int:
@@ -79,7 +64,7 @@ def n_further_lines(names: Sequence[str], *, width_in: float) -> int:
 
 def _wrapped_labels(names: Sequence[str], width_in: float) -> list[list[str]]:
     """Return the lines of each label in axes of this width."""
-    room = max(int(LETTERS_PER_IN * width_in), 1)
+    room = max(int(canvas.LETTERS_PER_IN * width_in), 1)
     return [textwrap.wrap(name, room) or [""] for name in names]
 
 
@@ -95,23 +80,23 @@ def probabilities_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Ax
             highest[name] = max(p, highest.get(name, 0.0))
     shown = [name for name in sorted(highest, key=lambda name: -highest[name]) if highest[name] >= _VISIBLE][:_SHOWN]
     alone = ax is None
-    ax = axes_or_new(ax, size_in=(6.6, 1.1 + 0.5 * len(beliefs)))
+    ax = canvas.axes_or_new(ax, size_in=(6.6, 1.1 + 0.5 * len(beliefs)))
     at = -np.arange(len(beliefs), dtype=np.float64)
     left = np.zeros(len(beliefs))
     style: dict[str, Any] = {"height": 0.6, "edgecolor": "white", "linewidth": 0.5}
-    for name, colour in zip(shown, CYCLE, strict=False):
+    for name, colour in zip(shown, canvas.CYCLE, strict=False):
         width = np.array([believed.get(name, 0.0) for believed in beliefs.values()])
         ax.barh(at, width, left=left, color=colour, label=name, **style)
         left += width
     if (left < 1.0 - 1e-3).any():
-        ax.barh(at, 1.0 - left, left=left, color=GREY, label="all others", **style)
+        ax.barh(at, 1.0 - left, left=left, color=canvas.GREY, label="all others", **style)
     ax.set_yticks(at, list(beliefs))
     ax.set_xlim(0.0, 1.0)
-    n_lines = legend_above(ax)
+    n_lines = canvas.legend_above(ax)
     if alone:
-        sheet = figure_of(ax)
+        sheet = canvas.figure_of(ax)
         sheet.set_figheight(sheet.get_figheight() + 0.2 * n_lines)
-    return label_axes(ax, x="probability", y="")
+    return canvas.label_axes(ax, x="probability", y="")
 
 
 def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
@@ -120,7 +105,7 @@ def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, 
     The name "clean" stands for nothing. A dashed line before a bar marks a reading that changed the most probable
     effect. The five effects of the highest probability after any reading have colours; the others are one part.
     """
-    ax = axes_or_new(ax, size_in=(6.8, 4.0))
+    ax = canvas.axes_or_new(ax, size_in=(6.8, 4.0))
     names = list(dict.fromkeys(name for step in left_out for name in step if name != "clean"))
     ranked = sorted(names, key=lambda name: -max(step.get(name, 0.0) for step in left_out))
     n = len(_EFFECT_COLOURS)
@@ -139,8 +124,8 @@ def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, 
             ax.axvline(number[k] - 0.5, color="black", linestyle="--", linewidth=1.0)
     ax.set(ylim=(0, 1), xlim=(0.4, len(left_out) + 0.6))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    legend_above(ax)
-    return label_axes(ax, x="reading", y="probability")
+    canvas.legend_above(ax)
+    return canvas.label_axes(ax, x="reading", y="probability")
 
 
 def audit_matrix(
@@ -149,30 +134,20 @@ def audit_matrix(
     cosines: FloatArray,
     *,
     alias: float,
-    axes: AxesGrid | None = None,
-) -> AxesGrid:
+    axes: canvas.AxesGrid | None = None,
+) -> canvas.AxesGrid:
     """Draw the detectable share of each effect, and how well every other effect imitates it; fine effects come first.
 
     The matrix is not symmetric: the row is the effect that is present, at typical parameters; the column is the effect
-    it may be mistaken for, at its best-fitting parameters.
-
-    Parameters
-    ----------
-    names, detectability
-        Names of the effects, and whether each is "fine", "aliased" or "invisible".
-    cosines
-        Cosine of the row's change with the column's best imitation, (n_effects, n_effects), 0 where not compared; the
-        detectable share on the diagonal.
-    alias
-        Cosine from which two effects are aliased, and marked.
-    axes
-        Axes to draw on, (1, 2), with one y axis, which are returned; a new figure without.
+    it may be mistaken for, at its best-fitting parameters. `detectability` is "fine", "aliased" or "invisible";
+    `cosines`, (n_effects, n_effects), 0 where not compared, has the detectable share on the diagonal; from the cosine
+    `alias` on two effects are aliased, and marked. Return the axes, (1, 2), which share the y axis.
     """
     order = sorted(range(len(names)), key=lambda k: (list(_DETECTABILITY).index(detectability[k]), -cosines[k, k]))
     labels = [spoken_name(names[k]) for k in order]
     at = np.arange(len(order))
     opened = axes is None
-    axes = axes_or_grid(axes, 1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
+    axes = canvas.axes_or_grid(axes, 1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
     bars, matrix = axes[0]
     bars.barh(at, np.diag(cosines)[order], color=[_DETECTABILITY[detectability[k]] for k in order], height=0.7)
     bars.set_yticks(at, labels)
@@ -181,15 +156,15 @@ def audit_matrix(
     for kind, colour in _DETECTABILITY.items():
         if kind in detectability:
             bars.barh([np.nan], [0], color=colour, label=kind)
-    label_axes(bars, x="detectable share (no unit)", y="")
+    canvas.label_axes(bars, x="detectable share (no unit)", y="")
     if len(order) > _MOST_NAMES:
         bars.set_yticks(at, [f"{name}  {k + 1}" for k, name in enumerate(labels)])
         labels = [str(k + 1) if k % 5 == 4 else "" for k in range(len(labels))]
     _draw_matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
     if opened:
-        legend_below(axes)
+        canvas.legend_below(axes)
     else:
-        bars.legend(frameon=False, fontsize=SMALL_PT)
+        bars.legend(frameon=False, fontsize=canvas.SMALL_PT)
     return axes
 
 
@@ -198,11 +173,11 @@ def _draw_matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: fl
     alone = ~(np.nan_to_num(shown).any(axis=0) | np.nan_to_num(shown).any(axis=1))
     shown[alone, :] = shown[:, alone] = np.nan
     ax.set_facecolor(_NOT_COMPARED)
-    image = ax.imshow(shown, cmap=COPPER, vmin=0, vmax=1, aspect="auto")
+    image = ax.imshow(shown, cmap=canvas.COPPER, vmin=0, vmax=1, aspect="auto")
     rows, columns = np.nonzero(np.nan_to_num(shown) >= alias)
     ax.plot(columns, rows, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
-    ax.set_xticks(np.arange(len(labels)), labels, rotation=0 if labels[0] == "" else 90, fontsize=SMALL_PT)
+    ax.set_xticks(np.arange(len(labels)), labels, rotation=0 if labels[0] == "" else 90, fontsize=canvas.SMALL_PT)
     ax.tick_params(left=False)
     bar = ax.figure.colorbar(image, ax=ax, label="cosine (no unit); circles from the line on", shrink=0.7)
     bar.ax.axhline(alias, color="black", linewidth=1.2)
-    label_axes(ax, x="effect it may be mistaken for", y="", title="row: the effect present; grey: not compared")
+    canvas.label_axes(ax, x="effect it may be mistaken for", y="", title="row: the effect present; grey: not compared")

@@ -18,25 +18,8 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Plan, Quadrant, Recording
 from probewise.recordings.plan import require_recording
+from probewise.report.plots import canvas
 from probewise.report.plots.apparatus import draw_sensor_face
-from probewise.report.plots.canvas import (
-    BLACK,
-    BLUE,
-    CYCLE,
-    GREY,
-    PAGE_IN,
-    SMALL_PT,
-    VERMILLION,
-    AxesGrid,
-    axes_or_grid,
-    axes_or_new,
-    figure_of,
-    grid_of_axes,
-    hide_unused,
-    label_axes,
-    legend_above,
-    legend_below,
-)
 from probewise.report.words import decimals_to_show, number_text, number_unsigned_zero
 
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")
@@ -108,7 +91,7 @@ def _along_label(tracks: Sequence[Track], side: str = "") -> str:
 
 
 def _symbol_of_track(k: int) -> dict[str, Any]:
-    marker, colour = _MARKERS[k % len(_MARKERS)], CYCLE[k % len(CYCLE)]
+    marker, colour = _MARKERS[k % len(_MARKERS)], canvas.CYCLE[k % len(canvas.CYCLE)]
     return {"linestyle": "none", "marker": marker, "color": colour, "markerfacecolor": "none"}
 
 
@@ -119,7 +102,7 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
     (the quadrants) are drawn by `predicted_and_recorded_by_scan` only.
     """
     require_recording(recording)
-    ax = axes_or_new(ax)
+    ax = canvas.axes_or_new(ax)
     tracks, _ = tracks_and_single_rows(recording.plan)
     size = 4 if len(tracks) <= _MOST_NAMED else 2
     for k, track in enumerate(tracks):
@@ -127,9 +110,9 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
         along, readings = track.along_mm[ok], recording.readings[track.rows][ok]
         ax.plot(along, readings, markersize=size, markeredgewidth=1.0, label=track.label, **_symbol_of_track(k))
     if 0 < len(tracks) <= _MOST_NAMED:
-        legend_above(ax, title="orientation of the sensor")
+        canvas.legend_above(ax, title="orientation of the sensor")
     unit = recording.plan.instrumentation.unit_after_number
-    return label_axes(ax, x=_along_label(tracks, ", white side positive"), y=f"reading ({unit})")
+    return canvas.label_axes(ax, x=_along_label(tracks, ", white side positive"), y=f"reading ({unit})")
 
 
 def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes:
@@ -144,11 +127,11 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
         raise ParameterError("recording", recording.source or "as given", "one with a scan over a half_plane")
     turns = {track.label: (k, float(plan.orientation_rad[track.rows[0]])) for k, track in lines}
     n = len(turns)
-    ax = axes_or_new(ax, size_in=(1.55 * n, 2.9))
+    ax = canvas.axes_or_new(ax, size_in=(1.55 * n, 2.9))
     edge = plan.patterns[plan.pattern_names[int(plan.pattern[lines[0][1].rows[0]])]]
     assert isinstance(edge, HalfPlane)
     for left, shade in zip((0.0, n / 2), _shades_out_and_in(edge), strict=True):
-        ax.add_patch(Rectangle((left, 0.0), n / 2, 1.0, fc=shade, ec=BLACK))
+        ax.add_patch(Rectangle((left, 0.0), n / 2, 1.0, fc=shade, ec=canvas.BLACK))
     for place, (label, (k, turn)) in enumerate(turns.items()):
         at = place + 0.5
         draw_sensor_face(ax, center=(at, 0.5), size=0.62, turned_rad=turn)
@@ -156,7 +139,7 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
         ax.plot(at - 0.16, 2.42, markersize=7, markeredgewidth=1.4, **_symbol_of_track(k))
         ax.text(at - 0.02, 2.42, label, va="center")
     along = np.concatenate([track.along_mm for _, track in lines])
-    ax.annotate("", (n - 0.3, -0.2), xytext=(0.3, -0.2), arrowprops={"arrowstyle": "-|>", "color": BLACK})
+    ax.annotate("", (n - 0.3, -0.2), xytext=(0.3, -0.2), arrowprops={"arrowstyle": "-|>", "color": canvas.BLACK})
     span = f"{number_unsigned_zero(along.min(), 0)} to {number_unsigned_zero(along.max(), 0)} mm"
     ax.text(n / 2, -0.28, f"every scan runs across the edge, {span}", ha="center", va="top")
     ax.set(xlim=(-0.05, n + 0.05), ylim=(-0.62, 2.65), aspect="equal")
@@ -168,7 +151,7 @@ def _shades_out_and_in(pattern: HalfPlane | Quadrant) -> tuple[str, str]:
     return (_DARK, _BRIGHT) if pattern.inside >= pattern.outside else (_BRIGHT, _DARK)
 
 
-def quadrant_patterns(recording: Recording) -> AxesGrid:
+def quadrant_patterns(recording: Recording) -> canvas.AxesGrid:
     """Draw each quadrant pattern with its corner and the mean of the usable readings there (paper, figure 4).
 
     Return the axes, (n_rows, 2). ParameterError if there are no readings over quadrants.
@@ -183,7 +166,7 @@ def quadrant_patterns(recording: Recording) -> AxesGrid:
     if not quadrants:
         raise ParameterError("recording", recording.source or "as given", "one with readings over a quadrant")
     n_rows = -(-len(quadrants) // 2)
-    axes = grid_of_axes(n_rows, 2, size_in=(4.6, 2.35 * n_rows + 0.1))
+    axes = canvas.grid_of_axes(n_rows, 2, size_in=(4.6, 2.35 * n_rows + 0.1))
     for ax in axes.flat:
         ax.set_axis_off()
     unit = plan.instrumentation.unit_after_number
@@ -201,25 +184,24 @@ def _draw_quadrant(ax: Axes, pattern: Quadrant, reading: str) -> None:
     ax.add_patch(Rectangle(*whole, fc=outside, ec="none"))
     (x0, x1), (y0, y1) = sorted((x, dx * _AROUND_MM)), sorted((y, dy * _AROUND_MM))
     ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fc=inside, ec="none"))
-    ax.add_patch(Rectangle(*whole, fc="none", ec=BLACK, clip_on=False))
-    ink, ink_around = (BLACK, "white") if inside == _BRIGHT else ("white", BLACK)
+    ax.add_patch(Rectangle(*whole, fc="none", ec=canvas.BLACK, clip_on=False))
+    ink, ink_around = (canvas.BLACK, "white") if inside == _BRIGHT else ("white", canvas.BLACK)
     middle = ((x + dx * _AROUND_MM) / 2, (y + dy * _AROUND_MM) / 2)
     ax.text(*middle, reading, ha="center", va="center", color=ink, fontsize="large")
     corner = f"({number_unsigned_zero(x, 0)}, {number_unsigned_zero(y, 0)}) mm"
     ax.text(x - dx * 1.2, y - dy * 1.2, corner, ha="right" if dx > 0 else "left", va="top", color=ink_around)
-    ax.plot(0.0, 0.0, marker="+", markersize=10, markeredgewidth=1.4, color=GREY)
+    ax.plot(0.0, 0.0, marker="+", markersize=10, markeredgewidth=1.4, color=canvas.GREY)
     ax.set(xlim=(-_AROUND_MM, _AROUND_MM), ylim=(-_AROUND_MM, _AROUND_MM), aspect="equal")
 
 
 def predicted_and_recorded_by_scan(
-    recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: AxesGrid | None = None
-) -> AxesGrid:
+    recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: canvas.AxesGrid | None = None
+) -> canvas.AxesGrid:
     """Draw recorded and predicted readings with the 95 % band of new readings (paper, figure 7).
 
     Each panel shows a scan over one pattern, the last one all single readings; of more than eight panels, evenly spaced
-    ones are drawn. `mean` is the predicted reading of each row and `sd` that of one new reading, (n_points,).
-
-    Return the axes, (n_rows, 3) (two columns where there are two or four panels, one for one panel).
+    ones are drawn. `mean` is the predicted reading of each row and `sd` that of one new reading, (n_points,). Return
+    the axes, (n_rows, 3) (two columns where there are two or four panels, one for one panel).
     """
     require_recording(recording)
     tracks, alone = tracks_and_single_rows(recording.plan)
@@ -229,25 +211,25 @@ def predicted_and_recorded_by_scan(
     n_panels = max(len(shown) + bool(alone.size), 1)
     n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
     n_rows = -(-n_panels // n_columns)
-    width = 4.4 * n_columns if n_columns < 3 else PAGE_IN
+    width = 4.4 * n_columns if n_columns < 3 else canvas.PAGE_IN
     opened = axes is None
-    axes = axes_or_grid(axes, n_rows, n_columns, size_in=(width, 0.4 + 2.4 * n_rows), sharey=True)
+    axes = canvas.axes_or_grid(axes, n_rows, n_columns, size_in=(width, 0.4 + 2.4 * n_rows), sharey=True)
     for ax, track in zip(axes.flat, shown, strict=False):
         _draw_track(ax, recording, track, mean, sd)
-        label_axes(ax, x="", y="", title=track.label)
+        canvas.label_axes(ax, x="", y="", title=track.label)
     if alone.size:
         ax = axes.flat[len(shown)]
         _draw_single_readings(ax, recording, alone, mean, sd)
-        label_axes(ax, x="", y="", title="single readings")
-    hide_unused(axes, n_panels)
+        canvas.label_axes(ax, x="", y="", title="single readings")
+    canvas.hide_unused(axes, n_panels)
     for ax in axes[:, 0]:
         ax.set_ylabel(f"reading ({recording.plan.instrumentation.unit_after_number})")
     for ax in list(axes.flat)[max(n_panels - n_columns, 0) : len(shown)]:
         ax.set_xlabel(_along_label(shown))
     if opened:
-        legend_below(axes)
+        canvas.legend_below(axes)
     else:
-        axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
+        axes.flat[0].legend(frameon=False, fontsize=canvas.SMALL_PT)
     return axes
 
 
@@ -256,20 +238,26 @@ def _draw_track(ax: Axes, recording: Recording, track: Track, mean: FloatArray, 
     rows, along = track.rows[order], track.along_mm[order]
     ok, half = recording.usable[rows], _SD_95 * sd[rows]
     ax.fill_between(
-        along, mean[rows] - half, mean[rows] + half, color=GREY, alpha=0.35, lw=0, label="holds 95 % of new readings"
+        along,
+        mean[rows] - half,
+        mean[rows] + half,
+        color=canvas.GREY,
+        alpha=0.35,
+        lw=0,
+        label="holds 95 % of new readings",
     )
     if ok.any():
-        ax.plot(along[ok], recording.readings[rows][ok], ".", color=VERMILLION, markersize=3.5, label="recorded")
-    ax.plot(along, mean[rows], color=BLACK, linewidth=1.1, label="predicted")
+        ax.plot(along[ok], recording.readings[rows][ok], ".", color=canvas.VERMILLION, markersize=3.5, label="recorded")
+    ax.plot(along, mean[rows], color=canvas.BLACK, linewidth=1.1, label="predicted")
 
 
 def _draw_single_readings(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray, sd: FloatArray) -> None:
     at, ok, plan = np.arange(len(rows)), recording.usable[rows], recording.plan
-    ax.errorbar(at, mean[rows], yerr=_SD_95 * sd[rows], fmt="_", color=BLACK, capsize=4, markersize=12)
-    ax.plot(at[ok], recording.readings[rows][ok], "o", color=VERMILLION, markersize=5)
+    ax.errorbar(at, mean[rows], yerr=_SD_95 * sd[rows], fmt="_", color=canvas.BLACK, capsize=4, markersize=12)
+    ax.plot(at[ok], recording.readings[rows][ok], "o", color=canvas.VERMILLION, markersize=5)
     if len(rows) <= _MOST_NAMED:
         names = [plan.pattern_names[code].replace("_", " ") for code in plan.pattern[rows]]
-        ax.set_xticks(at, names, rotation=30, ha="right", fontsize=SMALL_PT)
+        ax.set_xticks(at, names, rotation=30, ha="right", fontsize=canvas.SMALL_PT)
     ax.margins(x=0.15)
 
 
@@ -279,72 +267,71 @@ def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArra
     Parameters are as for `predicted_and_recorded_by_scan`.
     """
     require_recording(recording)
-    ax = axes_or_new(ax, size_in=(7.2, 2.8))
+    ax = canvas.axes_or_new(ax, size_in=(7.2, 2.8))
     ok = np.flatnonzero(recording.usable)
-    ax.plot(ok + 1, (recording.readings[ok] - mean[ok]) / sd[ok], ".", color=BLUE, markersize=3)
+    ax.plot(ok + 1, (recording.readings[ok] - mean[ok]) / sd[ok], ".", color=canvas.BLUE, markersize=3)
     for level in (-_SD_95, 0.0, _SD_95):
-        ax.axhline(level, color=GREY, linewidth=0.8, linestyle="-" if level == 0 else "--")
-    return label_axes(ax, x="reading number", y="(recorded − predicted) / sd")
+        ax.axhline(level, color=canvas.GREY, linewidth=0.8, linestyle="-" if level == 0 else "--")
+    return canvas.label_axes(ax, x="reading number", y="(recorded − predicted) / sd")
 
 
 def residuals_by_scan(
     recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9, columns: int = 3
-) -> AxesGrid:
-    """Draw the residuals of two models along the `most` scans that the repair changes most, a panel each.
+) -> canvas.AxesGrid:
+    """Draw the residuals of two models along the `most` scans that the repair changes most, a panel each, on one scale.
 
-    `before` and `after` are the predictions of the calibrated and of the repaired model, (n_points,). All panels have
-    the same scales. Return the axes, (n_rows, columns); those without a scan are hidden.
+    `before` and `after` are predictions, (n_points,). Return the axes, (n_rows, columns).
     """
     require_recording(recording)
     tracks, _ = tracks_and_single_rows(recording.plan)
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in tracks]
     shown = [tracks[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
     n_rows = max(-(-len(shown) // columns), 1)
-    axes = grid_of_axes(n_rows, columns, size_in=(3.2 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
+    axes = canvas.grid_of_axes(n_rows, columns, size_in=(3.2 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
     for ax, track in zip(axes.flat, shown, strict=False):
         _draw_residuals_of_both(ax, recording, [track], before, after, markersize=2.2, alpha=0.4)
         scan = recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])]
-        label_axes(ax, x="", y="", title=scan.replace("_", " "))
-    hide_unused(axes, len(shown))
-    sheet, edge = figure_of(axes), _along_label([])
+        canvas.label_axes(ax, x="", y="", title=scan.replace("_", " "))
+    canvas.hide_unused(axes, len(shown))
+    sheet, edge = canvas.figure_of(axes), _along_label([])
     sheet.supxlabel(edge if _along_label(shown) == edge else f"{edge}, or {_ALONG_SCAN}", fontsize=10)
     sheet.supylabel(f"recorded − predicted ({recording.plan.instrumentation.unit_after_number})", fontsize=10)
-    lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in (VERMILLION, BLUE)]
-    sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize=SMALL_PT)
+    lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in (canvas.VERMILLION, canvas.BLUE)]
+    sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize=canvas.SMALL_PT)
     return axes
 
 
 def readings_before_and_after_repair(
     recording: Recording, rows: IntArray, before: FloatArray, after: FloatArray, *, name: str = ""
-) -> AxesGrid:
+) -> canvas.AxesGrid:
     """Draw readings with the curves of two models, and below them the residuals, around where the models differ.
 
-    `rows`, (n_rows,), are those of one scan, or of several over one pattern in one orientation; `before` and `after`
-    are predictions, (n_points,); `name` is the title. Return the axes, (2, 1).
-
-    ParameterError if no three of the readings lie along a line.
+    `rows` are those of one scan, or of several over one pattern in one orientation; `before` and `after` are
+    predictions, (n_points,). Return the axes, (2, 1). ParameterError if no three of the readings lie along a line.
     """
     require_recording(recording)
     tracks, _ = tracks_and_single_rows(recording.plan.take(rows))
     if not tracks:
         raise ParameterError("rows", rows.tolist(), "readings at three places or more along one line")
     tracks = [replace(track, rows=rows[track.rows]) for track in tracks]
-    axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
+    axes = canvas.grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
     above, below = axes[:, 0]
     for k, track in enumerate(tracks):
         order = np.argsort(track.along_mm, kind="stable")
         at, along = track.rows[order], track.along_mm[order]
         ok = recording.usable[at]
-        above.plot(along[ok], recording.readings[at][ok], ".", color=BLACK, markersize=4, label="" if k else "recorded")
-        for predicted, colour, model in ((before, VERMILLION, _BEFORE), (after, BLUE, _AFTER)):
+        above.plot(
+            along[ok], recording.readings[at][ok], ".", color=canvas.BLACK, markersize=4, label="" if k else "recorded"
+        )
+        for predicted, colour, model in ((before, canvas.VERMILLION, _BEFORE), (after, canvas.BLUE, _AFTER)):
             above.plot(along, predicted[at], color=colour, linewidth=1.5, label="" if k else model)
     limits = _limits_around_change(tracks, np.abs(after - before))
     _draw_residuals_of_both(below, recording, tracks, before, after, markersize=4, alpha=0.5, limits=limits)
     below.set_xlim(limits)
     unit = recording.plan.instrumentation.unit_after_number
-    above.legend(frameon=False, fontsize=SMALL_PT)
-    label_axes(above, x="", y=f"reading ({unit})", title=name)
-    label_axes(below, x=_along_label(tracks), y=f"recorded − predicted\n({unit})")
+    above.legend(frameon=False, fontsize=canvas.SMALL_PT)
+    canvas.label_axes(above, x="", y=f"reading ({unit})", title=name)
+    canvas.label_axes(below, x=_along_label(tracks), y=f"recorded − predicted\n({unit})")
     return axes
 
 
@@ -373,11 +360,11 @@ def _draw_residuals_of_both(
     rows, along = (np.concatenate(parts) for parts in zip(*((t.rows, t.along_mm) for t in tracks), strict=True))
     ok = recording.usable[rows] & (along >= limits[0]) & (along <= limits[1])
     rows, along = rows[ok], along[ok]
-    for predicted, colour in ((before, VERMILLION), (after, BLUE)):
+    for predicted, colour in ((before, canvas.VERMILLION), (after, canvas.BLUE)):
         residual = recording.readings[rows] - predicted[rows]
         ax.plot(along, residual, ".", color=colour, markersize=markersize, alpha=alpha)
         ax.plot(*_running_mean_by_position(along, residual), color=colour, linewidth=1.8)
-    ax.axhline(0.0, color=BLACK, linewidth=0.7)
+    ax.axhline(0.0, color=canvas.BLACK, linewidth=0.7)
 
 
 def _running_mean_by_position(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -12,27 +12,13 @@ from matplotlib.ticker import MaxNLocator
 from probewise._arrays import FloatArray
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
-from probewise.report.plots.canvas import (
-    BLACK,
-    BLUE,
-    GREY,
-    SKY,
-    SMALL_PT,
-    VERMILLION,
-    AxesGrid,
-    figure_of,
-    finish,
-    label_axes,
-    legend_above,
-    set_plain_tick_labels,
-    stack_of_axes,
-)
+from probewise.report.plots import canvas
 from probewise.report.residual_means import ResidualMeans
 from probewise.report.words import number_text, number_unsigned_zero
 
 BEFORE, AFTER = "as calibrated", "repaired"
 _CHANCE = "95 % by chance alone"
-_STYLES = ((VERMILLION, "o", "-"), (BLUE, "s", (0, (4, 1.5))))
+_STYLES = ((canvas.VERMILLION, "o", "-"), (canvas.BLUE, "s", (0, (4, 1.5))))
 _CROWDED = 500  # number of dots from which they are paler
 _MANY = 1500  # number of dots from which they are an image inside the SVG
 _ASIDE = 0.15  # offset of the means before and after from a categorical value's position
@@ -65,26 +51,15 @@ def mean_residuals_along(
 ) -> Axes:
     """Draw mean residuals against a covariate, the 95 % band of chance, and the interval that is significant.
 
-    Parameters
-    ----------
-    means
-        From `mean_residuals`.
-    label, unit
-        Label of the covariate with its unit; unit of the readings.
-    each
-        Covariate and residual of every reading, (n_points,) each, drawn as dots behind.
-    window
-        Ends of the significant interval, shaded unless it takes up most of the axis.
-    names
-        Names of the values 0, 1, 2 ... of a categorical covariate.
-    after
-        Name of the later of the two models.
+    `each` holds covariate and residual of every reading, (n_points,) each, drawn as dots behind; `window` is the
+    significant interval, shaded unless it takes up most of the axis; `names` are those of the values 0, 1, 2 ... of a
+    categorical covariate; `after` is the name of the later of the two models.
     """
-    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    ax = ax if ax is not None else canvas.stack_of_axes([2.7])[0]
     if each is not None:
-        _draw_dots(ax, *each, GREY, "one reading")
-    ax.axhline(0, color=BLACK, linewidth=0.7)
-    band: dict[str, Any] = {"color": GREY, "alpha": 0.3, "label": _CHANCE}
+        _draw_dots(ax, *each, canvas.GREY, "one reading")
+    ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
+    band: dict[str, Any] = {"color": canvas.GREY, "alpha": 0.3, "label": _CHANCE}
     if names:
         ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, **band)
     elif len(means.at) == 1:
@@ -93,7 +68,7 @@ def mean_residuals_along(
         ax.fill_between(means.at, -means.chance, means.chance, linewidth=0, **band)
     aside = _ASIDE if names and means.after is not None else 0.0
     mean = "mean, " if each is not None else ""
-    drawn = ((means.before, VERMILLION, "o", BEFORE, -aside), (means.after, BLUE, "s", after, aside))
+    drawn = ((means.before, canvas.VERMILLION, "o", BEFORE, -aside), (means.after, canvas.BLUE, "s", after, aside))
     for values, colour, marker, name, step in drawn:
         if values is not None:
             line = marker if names else f"{marker}-"
@@ -105,10 +80,10 @@ def mean_residuals_along(
         middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
         if 2 * half < _MOST_SHADE * (high - low):  # nothing stands out where nearly all is shaded
             ends = (middle - half, middle + half)
-            ax.axvspan(*ends, color=SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
+            ax.axvspan(*ends, color=canvas.SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
     averaged = each is None and int(means.size.max(initial=1)) > 1
     y = f"{'mean residual' if averaged else 'residual'} ({unit})"
-    return finish(ax, x=label, y=y, plain="y" if names else "xy")
+    return canvas.finish(ax, x=label, y=y, plain="y" if names else "xy")
 
 
 def scan_with_residuals(
@@ -119,17 +94,16 @@ def scan_with_residuals(
     joined: bool = True,
     label: str,
     unit: str,
-) -> AxesGrid:
-    """Draw the readings of one scan with each model's predictions, and below them the residuals.
+) -> canvas.AxesGrid:
+    """Draw the readings of one scan with each model's predictions, and below them the residuals; return the axes, (2,).
 
     `along`, `readings` and the predictions of the `models` (name and predictions, the calibrated model first) have the
-    shape (n_rows,), NaN where there is no usable reading. Without `joined`, no curve joins the rows. `label` is that of
-    the x axis with its unit, `unit` the readings'. Return the two axes, (2,).
+    shape (n_rows,), NaN where there is no usable reading. Without `joined`, no curve joins the rows.
     """
-    axes = stack_of_axes([2.5, 2.0])
+    axes = canvas.stack_of_axes([2.5, 2.0])
     above, below = axes
-    above.plot(along, readings, "o", color=BLACK, markersize=3, alpha=0.7, label="recorded", zorder=1)
-    below.axhline(0, color=BLACK, linewidth=0.7)
+    above.plot(along, readings, "o", color=canvas.BLACK, markersize=3, alpha=0.7, label="recorded", zorder=1)
+    below.axhline(0, color=canvas.BLACK, linewidth=0.7)
     for (name, predicted), (colour, marker, line) in zip(models, _STYLES, strict=False):
         style = {"color": colour, "marker": marker, "markersize": 3.2, "alpha": 0.8, "linestyle": "none"}
         curve = {"color": colour, "linewidth": 1.6, "linestyle": line}
@@ -138,39 +112,38 @@ def scan_with_residuals(
         if joined:
             below.plot(*running_mean_curve(along, readings - predicted), **curve)
     below.sharex(above)
-    finish(above, x="", y=f"reading ({unit})")
-    finish(below, x=label, y=f"residual ({unit})")
+    canvas.finish(above, x="", y=f"reading ({unit})")
+    canvas.finish(below, x=label, y=f"residual ({unit})")
     return axes
 
 
 def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     """Draw usable readings by reading number, for recordings too short for any other figure."""
     require_recording(recording)
-    ax = ax if ax is not None else stack_of_axes([2.7])[0]
+    ax = ax if ax is not None else canvas.stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)
-    ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)
-    label_axes(ax, x="reading number", y=f"reading ({recording.plan.instrumentation.unit_after_number})")
-    set_plain_tick_labels(ax)
+    ax.plot(usable + 1, recording.readings[usable], "o", color=canvas.BLUE, markersize=5)
+    canvas.label_axes(ax, x="reading number", y=f"reading ({recording.plan.instrumentation.unit_after_number})")
+    canvas.set_plain_tick_labels(ax)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return ax
 
 
 def residuals_against_covariates(
     covariates: Sequence[tuple[str, FloatArray]], models: Sequence[tuple[str, FloatArray]], *, unit: str
-) -> AxesGrid:
+) -> canvas.AxesGrid:
     """Draw all residuals against each covariate, with running means, one panel per covariate; return the axes, (n,).
 
-    `covariates` are labels with units, and values, (n_points,); `models` names and residuals, (n_points,), NaN where
-    there is no usable reading, the calibrated model first; `unit` is the readings'.
+    `covariates` are labels and values, `models` names and residuals, (n_points,), the calibrated model first.
     """
-    axes = stack_of_axes([2.2] * len(covariates))
+    axes = canvas.stack_of_axes([2.2] * len(covariates))
     for ax, (label, at) in zip(axes, covariates, strict=True):
-        ax.axhline(0, color=BLACK, linewidth=0.7)
+        ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
             _draw_dots(ax, at, residuals, colour, "")
             curve = running_mean_curve(at, residuals)
             ax.plot(*curve, color=colour, linewidth=2.0, linestyle=line, label=f"running mean, {name}")
-        finish(ax, x=label, y=f"residual ({unit})")
+        canvas.finish(ax, x=label, y=f"residual ({unit})")
     return axes
 
 
@@ -185,17 +158,17 @@ def heldout_gain_by_scan(
     ranked = sorted(scans, key=lambda pair: -pair[1])
     if len(ranked) > _MOST_SCANS:
         ranked = [*ranked[: _MOST_SCANS // 2], *ranked[-_MOST_SCANS // 2 :]]
-    ax = ax if ax is not None else stack_of_axes([1.0 + 0.28 * max(len(ranked), 3)])[0]
+    ax = ax if ax is not None else canvas.stack_of_axes([1.0 + 0.28 * max(len(ranked), 3)])[0]
     gains = np.array([gain for _, gain in ranked])
     at = -np.arange(len(ranked), dtype=np.float64)
-    ax.barh(at, gains, 0.62, color=[BLUE if gain >= 0 else VERMILLION for gain in gains])
-    ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, zorder=0)
+    ax.barh(at, gains, 0.62, color=[canvas.BLUE if gain >= 0 else canvas.VERMILLION for gain in gains])
+    ax.axvspan(mean - sd, mean + sd, color=canvas.GREY, alpha=0.3, linewidth=0, zorder=0)
     total = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number_text(sd, 3)} nats per reading"
-    ax.axvline(mean, color=GREY, linewidth=1.4, label=total)
-    ax.axvline(0, color=BLACK, linewidth=0.7)
+    ax.axvline(mean, color=canvas.GREY, linewidth=1.4, label=total)
+    ax.axvline(0, color=canvas.BLACK, linewidth=0.7)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
     ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
-    return finish(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}", plain="x")
+    return canvas.finish(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}", plain="x")
 
 
 def recorded_against_predicted(
@@ -205,14 +178,14 @@ def recorded_against_predicted(
 
     `label` and `unit` are those of the readings.
     """
-    ax = ax if ax is not None else stack_of_axes([4.2])[0]
+    ax = ax if ax is not None else canvas.stack_of_axes([4.2])[0]
     there = np.isfinite(readings)
     x, y = predicted[there], readings[there]
-    ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=BLUE, alpha=0.6, label="readings, ± 1 sd")
+    ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=canvas.BLUE, alpha=0.6, label="readings, ± 1 sd")
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
-    ax.plot(ends, ends, color=BLACK, lw=0.9, label="as predicted")
-    label_axes(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
-    legend_above(ax)
+    ax.plot(ends, ends, color=canvas.BLACK, lw=0.9, label="as predicted")
+    canvas.label_axes(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
+    canvas.legend_above(ax)
     return ax
 
 
@@ -226,10 +199,10 @@ def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) 
 
 def _label_x_by_name(ax: Axes, names: Sequence[str]) -> None:
     """Label the positions 0, 1, 2 ... of the x axis by name; slanted and thinned where names do not fit."""
-    width_in = figure_of(ax).get_figwidth()
+    width_in = canvas.figure_of(ax).get_figwidth()
     fits = sum(len(name) + 2 for name in names) < 12 * width_in
     skip = max(1, round(len(names) / (4 * width_in)))
     slant: dict[str, Any] = {} if fits else {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
     at = np.arange(len(names))
-    ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize=SMALL_PT, **slant)
+    ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize=canvas.SMALL_PT, **slant)
     ax.set_xlim(-0.6, len(names) - 0.4)

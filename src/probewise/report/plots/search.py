@@ -15,20 +15,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray
 from probewise._words import count_with_noun
-from probewise.report.plots.canvas import (
-    BLACK,
-    COPPER,
-    CYCLE,
-    SMALL_PT,
-    AxesGrid,
-    add_colour_bar,
-    axes_or_new,
-    draw_map,
-    label_axes,
-    legend_above,
-    legend_below,
-    paint_out_of_reach,
-)
+from probewise.report.plots import canvas
 
 _LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
 _NEXT_GREEN = "#00e08a"  # the palette's green, lighter, so that the next place shows on copper
@@ -65,16 +52,12 @@ def playing_field(
         Utility of a reading at each place, such as its bits, (n_y, n_x), lower row first; NaN out of the arm's reach.
     x_mm, y_mm
         Places of the columns and rows, shapes (n_x,) and (n_y,).
-    outlines_mm
-        Outline of each sampled hypothesis, shape (n_vertices, 2) each.
+    outlines_mm, truth_mm
+        Outline of each sampled hypothesis, and of the true target, drawn dashed, (n_vertices, 2) each.
     places_mm, readings
         Places of the readings, shape (n_readings, 2), and their values, (n_readings,).
     levels
         Reading of black and of white, for the brightness of the squares.
-    next_mm
-        The place chosen next.
-    truth_mm
-        Outline of the true target, drawn dashed; None if unknown.
     cards_mm
         Corners of each card whose place and albedo are known, (4, 2).
     utility_max
@@ -82,14 +65,14 @@ def playing_field(
     lego_scale
         Whether to add the paper's coordinates, LEGO distance units, at the top.
     """
-    ax = axes_or_new(ax, size_in=(8.2, 5.2))
+    ax = canvas.axes_or_new(ax, size_in=(8.2, 5.2))
     if np.isnan(utility).any():
-        paint_out_of_reach(ax)
+        canvas.paint_out_of_reach(ax)
     top = utility_max if utility_max is not None else float(np.nanmax(utility))
     if top <= _NOTHING:
         top = 1.0  # a scale of nothing would have a power of ten
-    image = draw_map(ax, utility, x_mm, y_mm, cmap=COPPER, vmin=0.0, vmax=top)
-    add_colour_bar(ax, image, utility_label)
+    image = canvas.draw_map(ax, utility, x_mm, y_mm, cmap=canvas.COPPER, vmin=0.0, vmax=top)
+    canvas.add_colour_bar(ax, image, utility_label)
     if len(outlines_mm):
         ax.add_collection(LineCollection(list(outlines_mm), colors=_OUTLINE_BLUE, linewidths=0.7, alpha=0.75))
         ax.plot([], [], color=_OUTLINE_BLUE, label=f"{len(outlines_mm)} hypotheses drawn from the posterior")
@@ -103,15 +86,15 @@ def playing_field(
         shade = np.clip((np.asarray(readings) - low) / max(high - low, 1e-9), 0, 1)
         colours: dict[str, Any] = {
             "c": np.repeat(shade[:, None], 3, axis=1),
-            "edgecolors": np.where(shade < 0.5, _DARK_EDGE, BLACK),
+            "edgecolors": np.where(shade < 0.5, _DARK_EDGE, canvas.BLACK),
         }
         ax.scatter(places_mm[:, 0], places_mm[:, 1], s=34, marker="s", linewidths=0.9, zorder=3, **colours)
-        for name, colour, rim in (("dark reading", "black", _DARK_EDGE), ("bright reading", "white", BLACK)):
+        for name, colour, rim in (("dark reading", "black", _DARK_EDGE), ("bright reading", "white", canvas.BLACK)):
             ax.plot([], [], "s", color=colour, markersize=6, markeredgecolor=rim, label=name)
     if next_mm is not None:
         style: dict[str, Any] = {
             "c": _NEXT_GREEN,
-            "edgecolors": BLACK,
+            "edgecolors": canvas.BLACK,
             "linewidths": 1.0,
             "zorder": 4,
             "label": "next place",
@@ -121,8 +104,8 @@ def playing_field(
     ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
     if lego_scale:
         lego = ax.secondary_xaxis("top", functions=(_to_lego, _from_lego))
-        lego.set_xlabel("LEGO distance units (8 mm)", fontsize=SMALL_PT)
-        lego.tick_params(labelsize=SMALL_PT)
+        lego.set_xlabel("LEGO distance units (8 mm)", fontsize=canvas.SMALL_PT)
+        lego.tick_params(labelsize=canvas.SMALL_PT)
     if title:
         ax.set_title(title, fontsize="medium", loc="left")
     return ax
@@ -136,9 +119,9 @@ def _from_lego(units: ArrayLike) -> FloatArray:
     return np.asarray(units, dtype=np.float64) * _LEGO_UNIT_MM
 
 
-def draw_field_legend(axes: Axes | AxesGrid) -> None:
+def draw_field_legend(axes: Axes | canvas.AxesGrid) -> None:
     """Draw one legend for all playing fields of a figure, below them."""
-    legend_below(axes, n_columns=3, ground=_GROUND, ink="white")
+    canvas.legend_below(axes, n_columns=3, ground=_GROUND, ink="white")
 
 
 def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
@@ -146,17 +129,17 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
 
     The default is the paper's stopping rule: 4 mm, half the spacing of LEGO holes (section 3.2).
     """
-    ax = axes_or_new(ax, size_in=(6.4, 3.6))
-    for (name, sd), colour in zip(widths_mm.items(), itertools.cycle(CYCLE), strict=False):
+    ax = canvas.axes_or_new(ax, size_in=(6.4, 3.6))
+    for (name, sd), colour in zip(widths_mm.items(), itertools.cycle(canvas.CYCLE), strict=False):
         label = f"{name}: {count_with_noun(len(sd), 'reading')}"
         ax.plot(np.arange(1, len(sd) + 1), sd, marker="o", markersize=3.5, color=colour, label=label)
-    legend_above(ax)
+    canvas.legend_above(ax)
     return set_up_width_axes(ax, target_mm)
 
 
 def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
     """Label axes of posterior sds (log scale, mm) by number of readings, draw the target's line; return the axes."""
-    ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
+    ax.axhline(target_mm, color=canvas.BLACK, linewidth=0.9, linestyle="--")
     ax.annotate(
         f"{target_mm:g} mm,\ntarget",
         (1.0, target_mm),
@@ -164,23 +147,23 @@ def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
         xytext=(4, 0),
         textcoords="offset points",
         va="center",
-        fontsize=SMALL_PT,
+        fontsize=canvas.SMALL_PT,
     )
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return label_axes(ax, x="number of readings", y="widest posterior sd (mm)")
+    return canvas.label_axes(ax, x="number of readings", y="widest posterior sd (mm)")
 
 
 def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None) -> Axes:
     """Draw prior minus posterior differential entropy (bits) after each reading, (n_readings,), of each run by name."""
-    ax = axes_or_new(ax, size_in=(6.4, 3.6))
-    for (name, gained), colour in zip(bits.items(), itertools.cycle(CYCLE), strict=False):
+    ax = canvas.axes_or_new(ax, size_in=(6.4, 3.6))
+    for (name, gained), colour in zip(bits.items(), itertools.cycle(canvas.CYCLE), strict=False):
         per_reading = gained[-1] / len(gained) if len(gained) else 0.0
         number, label = np.arange(len(gained) + 1), f"{name}: {per_reading:.2f} bits per reading"
         ax.plot(number, np.r_[0.0, gained], marker="o", markersize=3.5, color=colour, label=label)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    legend_above(ax)
-    return label_axes(ax, x="number of readings", y="information about the shape (bits)")
+    canvas.legend_above(ax)
+    return canvas.label_axes(ax, x="number of readings", y="information about the shape (bits)")

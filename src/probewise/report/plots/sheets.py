@@ -89,9 +89,10 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
         last = first + len(tiles) - 1
         pages, grid = f"page {first}", []
         if len(tiles) > 1:
-            columns, rows = tiles[-1].column + 1, tiles[-1].row + 1
+            columns, rows = (1 + max(getattr(tile, name) for tile in tiles) for name in ("column", "row"))
             pages = f"pages {first} to {last}"
             grid = [f"{columns} side by side, {rows} one above the other, from the lower left"]
+            grid += ["blank ones are left out"] if len(tiles) < columns * rows else []
         width, height = sheet.size_mm
         said = [line for text in sheet.lines for line in textwrap.wrap(text, _COVER_LETTERS)]
         lines = [f"{width:g} x {height:g} mm; {pages}", *grid, *said, f"origin: {sheet.frame}"]
@@ -202,7 +203,7 @@ def _draw_sheet_part(
     """Draw the part of a sheet between two corners: pattern, lines, crosses and texts.
 
     `place` maps points, (n, 2), from the sheet to the page; nothing is drawn beyond the patch `clip`; without `named`,
-    crosses have their numbers only, and other texts are left out.
+    crosses have their numbers only.
     """
     for corners, albedo in _outlines_with_albedo(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))

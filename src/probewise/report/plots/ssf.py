@@ -11,15 +11,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
 from probewise._words import count_with_noun
-from probewise.report.plots.canvas import (
-    AxesGrid,
-    add_colour_bar,
-    axes_or_grid,
-    axes_or_new,
-    draw_map,
-    hide_unused,
-    label_axes,
-)
+from probewise.report.plots import canvas
 from probewise.report.words import value_with_error
 from probewise.sensor import SSFField
 
@@ -30,17 +22,17 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     ParameterError if `field` is no SSFField.
     """
     require_kind("field", field, SSFField, "an SSFField: the .field of a FittedSensor")
-    ax = axes_or_new(ax, size_in=(4.8, 4.0))
+    ax = canvas.axes_or_new(ax, size_in=(4.8, 4.0))
     values, x, y = np.asarray(field.values), field.u_mm, field.v_mm
     peak = float(values.max())
     ax.set_facecolor(colormaps["cividis"](0.0))  # beyond the field's pixels the SSF is zero
-    image = draw_map(ax, values / peak, x, y, cmap="cividis", vmin=0.0, vmax=1.0)
-    add_colour_bar(ax, image, "sensitivity (share of its peak)")
+    image = canvas.draw_map(ax, values / peak, x, y, cmap="cividis", vmin=0.0, vmax=1.0)
+    canvas.add_colour_bar(ax, image, "sensitivity (share of its peak)")
     ax.contour(x, y, values, levels=[0.1 * peak, 0.5 * peak], colors="white", linewidths=[0.8, 1.4])
     ax.plot([0], [0], marker="+", color="white", markersize=10, markeredgewidth=1.5)
     _set_half_width(ax, _visible_half_width(values, x, y, field.pixel_mm))
     ax.set_aspect("equal")
-    return label_axes(ax, x="x' (mm)", y="y' (mm)", title=title)
+    return canvas.label_axes(ax, x="x' (mm)", y="y' (mm)", title=title)
 
 
 def _set_half_width(ax: Axes, reach_mm: float) -> None:
@@ -63,8 +55,8 @@ def ssf_by_n_gaussians(
     log_z: Mapping[int, float],
     log_z_error: Mapping[int, float],
     *,
-    axes: AxesGrid | None = None,
-) -> AxesGrid:
+    axes: canvas.AxesGrid | None = None,
+) -> canvas.AxesGrid:
     """Draw the mean SSF of each number of Gaussians with its log evidence and standard error (paper, figure 6).
 
     Return the axes, (n_rows, 2), or (1, 1) for a single number of Gaussians.
@@ -72,13 +64,13 @@ def ssf_by_n_gaussians(
     orders = sorted(fields)
     n_columns = min(len(orders), 2)
     n_rows = -(-len(orders) // n_columns)
-    axes = axes_or_grid(axes, n_rows, n_columns, size_in=(4.6 * n_columns, 3.9 * n_rows))
+    axes = canvas.axes_or_grid(axes, n_rows, n_columns, size_in=(4.6 * n_columns, 3.9 * n_rows))
     best = max(orders, key=lambda n: log_z[n])
     drawn = list(axes.flat)[: len(orders)]
     for ax, n in zip(drawn, orders, strict=True):
         name = count_with_noun(n, "Gaussian") + (", most probable" if n == best and len(orders) > 1 else "")
         spatial_sensitivity(fields[n], ax=ax, title=f"{name}\nln Z = {value_with_error(log_z[n], log_z_error[n])}")
-    hide_unused(axes, len(orders))
+    canvas.hide_unused(axes, len(orders))
     widest = max(ax.get_xlim()[1] for ax in drawn)
     for ax in drawn:
         _set_half_width(ax, widest)

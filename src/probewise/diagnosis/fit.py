@@ -54,8 +54,8 @@ class Predictor(Protocol):
 class Null(Protocol):
     """A model to be diagnosed, in coordinates in which its prior is a standard normal.
 
-    The sensor of the paper (`GaussianMixtureSensor`), one with a free-form SSF (`FreeFormSensor`), a sensor over an
-    unknown shape (`SensorAndShape`), or a simulator of a table (`systems.System`).
+    A sensor over known patterns (`CalibratedSensor`) or over an unknown shape (`SensorAndShape`), or a simulator of a
+    table (`systems.System`).
     """
 
     @property

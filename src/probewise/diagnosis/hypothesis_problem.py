@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, read_only_floats
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Model
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.sensors import GaussianMixtureSensor
+from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.recordings.plan import Recording
 
 _HELD = 0.999  # share of the evidence in the noise nodes that are kept; the likelihood is rescaled for the rest
@@ -129,7 +129,7 @@ class FoldedNormal(StandardNormal):
     the point, (n_params,).
     """
 
-    sensor: GaussianMixtureSensor
+    sensor: CalibratedSensor
     near: FloatArray
 
     def __post_init__(self) -> None:
@@ -186,6 +186,6 @@ def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProb
     exchangeable Gaussians.
     """
     sensor = problem.model.sensor
-    if not (isinstance(sensor, GaussianMixtureSensor) and sensor.has_exchangeable_gaussians and sensor.n_gaussians > 1):
+    if not (isinstance(sensor, CalibratedSensor) and sensor.has_exchangeable_gaussians and sensor.n_gaussians > 1):
         return problem
     return FoldedProblem(problem, FoldedNormal(problem.model.n_params, sensor, near))

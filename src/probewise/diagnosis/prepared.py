@@ -21,10 +21,11 @@ from probewise.diagnosis.outlying import LostReadings, find_lost_readings
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,
     SensorPrior,
-    SsfForms,
+    default_sensor,
     require_same_unit,
     require_sensor_prior,
     sensor_from_samples,
+    starts_of_one_gaussian,
 )
 from probewise.effects import Extent, NamedEffect, NoiseEffect
 from probewise.effects.noise import LARGEST_SIZE
@@ -374,7 +375,8 @@ def _lost_readings(recording: Recording, null: Null | None, apparatus: Apparatus
     wild = np.flatnonzero(recording.usable & (np.abs(readings - middle) > _WILD * (high - low)))
     if null is None:
         kept = replace(recording, left_out=(*recording.left_out, *wild.tolist()))
-        null, starts = SsfForms(Extent.of(kept)).one_gaussian_and_starts()
+        null = default_sensor(Extent.of(kept), 1)
+        starts = starts_of_one_gaussian(null)
     else:
         starts = null.starts
     model = Model(null, (), recording.plan)

@@ -21,7 +21,7 @@ from probewise.diagnosis.evidence import (
     block_log_bayes_factors,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
-from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_new_scan
+from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
 from probewise.diagnosis.noise_law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
 from probewise.diagnosis.noise_models import NoiseModel
@@ -505,7 +505,7 @@ def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tm
     assert ("s0 (2)", "s1 (2)") in groups
     assert candidate_scan_groups(back.plan) == groups
     assert candidate_scan_groups(replace(joined.plan, sessions=())) != groups
-    more = rows_as_new_scan(joined.plan, np.arange(24, 36), 100.0, 1.0, "more")
+    more = rows_as_next_scan(joined.plan, np.arange(24, 36), "more")
     assert more.sessions == ()
     assert join_plans([joined.plan, more]).sessions == (0, 0, 1, 1, 2)
     assert join_plans([more, more]).sessions == ()

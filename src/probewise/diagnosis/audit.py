@@ -21,13 +21,12 @@ from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.aliases import LAMBDA, LEAST_SHARE
-from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.apparatus import Command, Words
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import orthonormalise_groups
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
 from probewise.diagnosis.light_sensor import (
     LightSensorApparatus,
-    Scan,
     candidate_scans,
     scan_started_after,
     target_swaps,
@@ -545,14 +544,14 @@ def choose_cure_scans(
     effects: Mapping[str, EffectKind],
     ailing: Sequence[str],
     progress: Progress = silent,
-) -> list[Scan]:
+) -> list[Command]:
     """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
 
     They are timed one after another, in the order chosen. The deficit of an effect is 0 if it is detected and told from
     others, up to 1 if aliased, 1 to 2 if invisible.
     """
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
-    chosen: list[Scan] = []
+    chosen: list[Command] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
         progress("looking for readings that cure", len(chosen), _MOST_SCANS)

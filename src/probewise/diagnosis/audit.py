@@ -471,7 +471,6 @@ def audit_plan_of_diagnosis(
 
 
 def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
-    """Return the two levels in rising order, apart by a little at least if they are equal."""
     low, high = sorted(float(theta[list(names).index(name)]) for name in ("I_min", "I_max"))
     return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
 

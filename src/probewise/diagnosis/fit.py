@@ -166,7 +166,6 @@ def difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Convert predictions at these points, (n_params + 1, n_points), to that at z and slopes (n_points, n_params)."""
     with np.errstate(invalid="ignore", over="ignore"):  # at a start from which the model diverges, which is not taken
         return batch[0], (batch[1:] - batch[0]).T / steps
 
@@ -423,7 +422,6 @@ def _fit_coroutine(
 
 
 def _points_after_steps(z: FloatArray, steps: FloatArray) -> FloatArray:
-    """Return the points after steps from z, each coordinate by 2 at most and within the bounds, (n_steps, n_params)."""
     return np.clip(z + np.clip(steps, -2.0, 2.0), -FARTHEST, FARTHEST)
 
 

@@ -96,7 +96,6 @@ class HypothesisProblem:
 
     @cached_property
     def _kept_node_indices(self) -> list[int]:
-        """Indices of the fewest noise nodes that hold 99.9 % of the evidence."""
         order = np.argsort(-self.noise.weights)
         n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1
         kept: list[int] = order[:n_kept].tolist()
@@ -137,7 +136,6 @@ class FoldedNormal(StandardNormal):
 
     @cached_property
     def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:
-        """Maps z @ turn + shift to every other order: turn (n_others, n_own, n_own), shift (n_others, 1, n_own)."""
         n_own = self.sensor.n_params
         orders = list(itertools.permutations(range(self.sensor.n_gaussians)))[1:]
         shift = np.stack([self.sensor.permuted(np.zeros((1, n_own)), order) for order in orders])

@@ -278,7 +278,6 @@ def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:
 
 
 def _rotated_scan(scan: Plan) -> Plan:
-    """Rotate a scan's places by 90 degrees about their middle, anticlockwise."""
     x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()
     return replace(scan, x_mm=x_mm - (scan.y_mm - y_mm), y_mm=y_mm + (scan.x_mm - x_mm))
 
@@ -295,7 +294,6 @@ def _rotated_scan_and_edge(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane
 
 
 def _distance_inside_edge_mm(plan: Plan, edge: HalfPlane) -> FloatArray:
-    """Return the signed distance of each row from an edge, along its normal, in mm."""
     return plan.x_mm * math.cos(edge.normal_rad) + plan.y_mm * math.sin(edge.normal_rad) - edge.offset_mm
 
 
@@ -411,7 +409,6 @@ def covariate_of_effect(
 
 
 def _varies(values: FloatArray, size: float = 0.0) -> bool:
-    """Return whether values differ by more than 1e-9 of the largest, or of `size` if that is larger."""
     return values.size > 1 and float(np.ptp(values)) > 1e-9 * max(size, float(np.abs(values).max()))
 
 

@@ -124,7 +124,6 @@ def _smoothed_and_variance(
 
 
 def _log_density(apart: FloatArray, variance: FloatArray) -> FloatArray:
-    """Return the normal log density, without its constant."""
     return np.asarray(-0.5 * np.log(variance) - 0.5 * apart**2 / variance)
 
 
@@ -290,12 +289,10 @@ class NoiseModel:
 
     @cached_property
     def _lost_value_resolution(self) -> float:
-        """Width of a cell, in reading units: lost readings have one value to within it."""
         return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
     def _rounding_step(self) -> float:
-        """Rounding step of all readings, 0 if there is none."""
         return lattice_step(self._usable_readings)
 
 

@@ -122,7 +122,6 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
 
 
 def _unused_scan_names(names: Sequence[str], taken: Sequence[str]) -> list[str]:
-    """Return a plan's scan names, those that are taken renamed; names that differ stay different."""
     new: dict[str, str] = {}
     for name in dict.fromkeys(names):
         new[name] = unused_name(name, {*taken, *new.values(), *({*names} - {name})})
@@ -187,7 +186,6 @@ def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str
 
 
 def _is_same_pattern(one: Pattern, other: Pattern) -> bool:
-    """Return whether two patterns have the same kind and values; of an image, the name of its file too."""
     return have_same_albedo(one, other) and getattr(one, "file", None) == getattr(other, "file", None)
 
 

@@ -122,7 +122,6 @@ def _variations_of_run(
 
 
 def _rounded_to_range(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Round values to a thousandth of a range or finer, so that they can be set; those at its ends stay."""
     if not low < high:
         return values
     decimals = int(np.ceil(3 - np.log10(high - low)))
@@ -201,7 +200,6 @@ def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
 
 
 def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
-    """Return how many minutes a unit of a table's time has; None without a time, or in an unknown unit."""
     return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
 
 

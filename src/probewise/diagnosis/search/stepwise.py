@@ -612,7 +612,6 @@ def _with_larger_pair_scores(state: SearchState, proposals: Mapping[Names, Propo
 
 
 def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
-    """Return the largest log evidence of each combination by screening about a null, over the noise models."""
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():
         best[names] = max(value, best.get(names, value))
